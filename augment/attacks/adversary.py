@@ -105,16 +105,20 @@ class Adversary:
         images: Tensor,
         row: int | None = None,
     ) -> Adversary:
-        """Return an example of a scene with its images.
+        """Create the adversary of one example of a scene.
 
         Args:
             scene: The attacked scene.
-            example: The number of the example.
+            example: Index of the example.
             after: Conditions after the attack.
-            before: Images before the attack, shape (V, 3, size, size).
-            images: Images after it, of the same shape.
-            row: Row of the example in the conditions. None for the number of
-                the example.
+            before: Images of the V views before the attack, shape
+                (V, 3, size, size).
+            images: Images after the attack, of the same shape.
+            row: Row of the example in the conditions. None if the row is the
+                index of the example.
+
+        Returns:
+            The adversary.
         """
         row = example if row is None else row
         described = scene.examples[example]
@@ -132,11 +136,14 @@ class Adversary:
         )
 
     def scene(self, rasterizer: Rasterizer, device: torch.device | str = "cpu") -> Scene:
-        """Return a scene of this one example.
+        """Return a scene with this example only, as it is after the attack.
 
         Args:
             rasterizer: The rasterizer of the scene.
             device: The device of the scene.
+
+        Returns:
+            The scene.
         """
         return Scene(
             objects=[self.shown],
@@ -155,8 +162,8 @@ class Adversary:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1], shape (V, 3, size, size), or (3, size, size) of
-            one view.
+            Images in [0, 1] of the V views, shape (V, 3, size, size). If there
+            is one view, the shape is (3, size, size).
         """
         return self.render_views(rasterizer).squeeze(0)
 
@@ -168,7 +175,7 @@ class Adversary:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1], shape (V, 3, size, size), also of one view.
+            Images in [0, 1] of the V views, shape (V, 3, size, size), also if V is 1.
         """
         if not isinstance(rasterizer, Rasterizer):
             rasterizer = choose(rasterizer or "auto")
@@ -178,13 +185,24 @@ class Adversary:
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
-    """Return an object with the colors, shape and gloss of a row of conditions."""
+    """Return a copy of an object after an attack.
+
+    Args:
+        item: Object before the attack. Its mesh has V vertices and F faces.
+        changed: Conditions of one example after the attack, without their first dimension:
+            vertices (V, 3), gloss (F, 3), and added albedo (F, 3) with angles of the hue (F,).
+            What is None keeps its value.
+        encoding: Encoding of the images, in which textures are written.
+
+    Returns:
+        The copy.
+    """
     mesh = item.mesh
     albedo_scale = item.albedo_scale
     if changed.albedo is not None:
-        added = _as_numpy(changed.albedo)
+        added_albedo = _as_numpy(changed.albedo)
         hue = None if changed.hue is None else _as_numpy(changed.hue)
-        mesh, albedo_scale = with_added_albedo(mesh, added, encoding, albedo_scale, hue)
+        mesh, albedo_scale = with_added_albedo(mesh, added_albedo, encoding, albedo_scale, hue)
     if changed.vertices is not None:
         mesh = replace(mesh, vertices=_as_numpy(changed.vertices), skin=None)
     if changed.gloss is not None:
@@ -269,15 +287,25 @@ def save_lights(
     Returns:
         Basis and coefficients of each light, the environment light first.
     """
-    sky, *local = [(part, light[rows]) for rows, part in parts_of(basis)]
-    names = [Path(LIGHT).stem, *(part.name for part, _ in local)]
-    for name, (part, coefficients) in zip(names, [sky, *local], strict=True):
+    # Each light is a pair of its basis and its coefficients. The environment light is the first.
+    environment, *local_lights = [(part, light[rows]) for rows, part in parts_of(basis)]
+    lights = [environment, *local_lights]
+    names = [Path(LIGHT).stem, *(part.name for part, _ in local_lights)]
+    for name, (part, coefficients) in zip(names, lights, strict=True):
         save_light(folder / f"{name}{when}.json", coefficients, part)
-    return [sky, *local]
+    return lights
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:
-    """Return the gray value of a background, or write it and return the name of its file."""
+    """Write a background to a file, unless all of it has one gray value.
+
+    Args:
+        background: Image in [0, 1], shape (3 or 1, size, size).
+        folder: Folder of the adversary.
+
+    Returns:
+        The gray value, or the name of the written file.
+    """
     gray = float(background.flatten()[0])
     if (background == gray).all():
         return gray
@@ -287,7 +315,16 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
 
 
 def _write_views(images: Tensor, folder: Path, name: str) -> None:
-    """Write images (V, 3, size, size) exactly to one file, and with 8 bits to a file each."""
+    """Write the images of the V views of an adversary.
+
+    One file NAME.npy has the exact values. Files NAME_0.png, NAME_1.png and so on have one
+    view each, with 8 bits per channel.
+
+    Args:
+        images: Images in [0, 1], shape (V, 3, size, size).
+        folder: Folder of the adversary.
+        name: Beginning of the names of the files.
+    """
     write_numbers(folder / f"{name}.npy", images.numpy())
     for view, image in enumerate(to_bytes(images)):
         pixels = image.permute(1, 2, 0).numpy()
@@ -393,7 +430,18 @@ def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
-    """Return the images of a file, which must have the given shape."""
+    """Read images from a file.
+
+    Args:
+        path: File of a NumPy array.
+        shape: Shape that the array must have.
+
+    Returns:
+        Images of this shape.
+
+    Raises:
+        InputError: If the file is missing or damaged, or has another shape.
+    """
     require_file(path, "write the adversary again")
     try:
         images = torch.from_numpy(read_numbers(path))

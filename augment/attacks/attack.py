@@ -55,11 +55,12 @@ from renderer.validation import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Value of `target` for the class with the lowest confidence.
+# Value of the argument `target` of `attack` that stands for the class with the lowest
+# confidence before the attack.
 LEAST_LIKELY = "least_likely"
-# Pixels per side of the ball that shows the light.
+# Pixels per side of the white ball with which `AttackResult.plot` shows the light.
 BALL_SIZE = 96
-# File formats of animations, and the largest number of frames of an animation.
+# `AttackResult.save_animation` writes files of these formats with at most this many frames.
 ANIMATION_SUFFIXES = (".gif", ".webp")
 MAX_FRAME_COUNT = 1000
 
@@ -87,9 +88,9 @@ class AttackResult:
             (E, V, C).
         success_in_views: Whether each view counts as a success, as
             `fooled_in_views` decides, shape (E, V), bool.
-        descent: Where the descent ended. Its own success is that of its images
-            alone. While shape and colors change, it holds shadows and bounces
-            fixed.
+        descent: Values and images at the end of the descent. `descent.success`
+            judges the images of the descent without noise. A descent that
+            changes shape or colors keeps shadows and bounces fixed in its images.
         queries: Number of forward passes for each example, (E,) int64: images
             that the search showed to the classifier, and those with the noise
             of a sensor by which its success is counted. An image that is shown
@@ -272,23 +273,50 @@ class AttackResult:
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
     def _values_between(self, fraction: float) -> Tensor:
-        """Return values (E, D) at a fraction of the way from before the attack to after it."""
+        """Interpolate between the attack values before and after the attack.
+
+        Args:
+            fraction: 0 for the values before the attack, 1 for those after it.
+
+        Returns:
+            Values of all examples, shape (E, D).
+        """
         start = self.problem.start
         return start + fraction * (self.descent.values.to(start) - start)
 
     def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
-        """Render the image (3, size, size) of the values at a fraction of the way."""
+        """Render an image between those before and after the attack.
+
+        Args:
+            fraction: 0 for the image before the attack, 1 for the image after it.
+            example: Index of the example.
+            view: Index of the view.
+
+        Returns:
+            Image, shape (3, size, size).
+        """
         if fraction == 0:
             return self.images_in_views_before[example, view]
         if fraction == 1:
             return self.images_in_views[example, view]
-        row = self.problem.all_examples[[example]]
-        return self.problem.images(self._values_between(fraction), row)[0, view]
+        examples = self.problem.all_examples[[example]]
+        # Shape (1, V, 3, size, size).
+        images = self.problem.images(self._values_between(fraction), examples)
+        return images[0, view]
 
     def _ball_between(self, fraction: float, example: int) -> Tensor:
-        """Render a white ball in the light of the values at a fraction of the way."""
-        row = self.problem.all_examples[[example]]
-        conditions = self.problem.conditions(self._values_between(fraction)[row], row)
+        """Render a white ball in a light between those before and after the attack.
+
+        Args:
+            fraction: 0 for the light before the attack, 1 for the light after it.
+            example: Index of the example.
+
+        Returns:
+            Image of the ball, shape (3, size, size).
+        """
+        examples = self.problem.all_examples[[example]]
+        conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
+        # The conditions have a single row, which is row 0.
         basis = self.problem.scene.basis_under(conditions, 0)
         return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
 
@@ -423,11 +451,12 @@ def _attack(
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Attack a `Classifier`, see `attack`."""
+    """Attack a `Classifier`. The arguments and the result are those of `attack`."""
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     settings = with_optimizer(settings, classifier)
     if not classifier.has_gradients:
+        # An image that was classified before is not classified again.
         classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
@@ -507,9 +536,21 @@ def _count_queries(
     criterion: Criterion,
     settings: AttackSettings,
 ) -> Tensor:
-    """Count the different images of each example that an attack classified, shape (E,)."""
+    """Count the different images of each example that an attack classified.
+
+    Args:
+        descent: Result of the descent, with its queries.
+        images: Images after the attack, shape (E, V, 3, size, size).
+        predicted: Classes of these images, shape (E, V).
+        criterion: Source and target class of each view.
+        settings: Settings of the attack.
+
+    Returns:
+        Number of images, shape (E,), int64.
+    """
     view_count = images.shape[1]
     queries = descent.queries.clone()
+    # `final_images` has rendered other images than the descent, which were classified, too.
     if images is not descent.images:
         queries += view_count
     if settings.sensor_noise:
@@ -687,8 +728,9 @@ def final_images(
 ) -> Tensor:
     """Return the images after a descent, with the shadows and bounces of the attacked shape.
 
-    During a descent that changes shape, colors or gloss, shadows and bounces
-    stay fixed. This function then renders the images again.
+    A descent that changes shape, colors or gloss keeps shadows and bounces
+    fixed. This function renders the images of such a descent again. It returns
+    all other images as they are.
 
     Args:
         problem: The attacked scene and the parameters that were changed.
@@ -702,8 +744,8 @@ def final_images(
     """
     scene = problem.scene
     conditions = problem.conditions(values, examples)
-    changed = (conditions.vertices, conditions.albedo, conditions.gloss)
-    has_fixed_bounces = any(part is not None for part in changed)
+    surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+    has_fixed_bounces = any(values is not None for values in surface_changes)
     if not has_fixed_bounces or not len(examples) or not scene.settings.global_illumination:
         return images
     rendered = []
@@ -747,10 +789,12 @@ def fooled_in_views(
         Mask of the views that are a success, shape (A, V), on the device of
         `predicted`.
     """
-    fooled = criterion.reached_in_views(predicted)
-    rows = torch.nonzero(fooled.any(1)).squeeze(1)
+    is_fooled = criterion.reached_in_views(predicted)
+    # Only the B examples with a success without noise are tested with noise. Their indices
+    # among the A examples have shape (B,).
+    rows = torch.nonzero(is_fooled.any(1)).squeeze(1)
     if not settings.sensor_noise or not len(rows):
-        return fooled
+        return is_fooled
     images_of_rows = images[rows.to(images.device)]
     examples_of_rows = examples.to(rows.device)[rows]
     criterion_of_rows = criterion.select(rows)
@@ -763,9 +807,10 @@ def fooled_in_views(
     )
     for noisy_images in noisy_versions:
         logits = logits_of(model, noisy_images, settings.batch_size)
-        noisy_predicted = logits.argmax(2).to(fooled.device)
-        fooled[rows] &= criterion_of_rows.reached_in_views(noisy_predicted)
-    return fooled
+        noisy_predicted = logits.argmax(2).to(is_fooled.device)
+        # A view must be fooled in every draw of the noise.
+        is_fooled[rows] &= criterion_of_rows.reached_in_views(noisy_predicted)
+    return is_fooled
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:

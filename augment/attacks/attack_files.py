@@ -30,13 +30,16 @@ from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind
 from renderer.visibility.rasterizers import Rasterizer
 
-# A line for each example, and a last one with the checks.
+# Name of the file that `save` writes in addition to the examples. It has one JSON line for each
+# example, and a last line with the checks.
 LINES = "attack.jsonl"
+# Quality of the JPEG version of the images that `save` classifies.
 JPEG_QUALITY = 90
+# Values of the argument `verify` of `save`.
 RENDERERS = ("reload", MITSUBA)
 
-# Least width in pixels of an image in a figure. Smaller images are enlarged by a
-# whole factor.
+# Least width in pixels of an image in the figure of an example. Smaller images are enlarged by
+# a whole factor.
 SIDE = 192
 
 
@@ -122,7 +125,15 @@ def require_renderers(names: Sequence[str]) -> None:
 
 
 def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """Write the figure and the folder of each example, and return its numbers."""
+    """Write the figure and the folder of each example.
+
+    Args:
+        result: The attack on E examples.
+        paths: Folder of each of the E examples. Its figure has the same name with ".png".
+
+    Returns:
+        Line of each example in attack.jsonl, without the key "versions".
+    """
     problem = result.problem
     scene = problem.scene
     conditions_before = problem.conditions(problem.start, problem.all_examples)
@@ -141,12 +152,19 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
 
 
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
-    """Return the numbers of an example for attack.jsonl."""
+    """Return the successes, costs and predictions of one example for attack.jsonl.
+
+    Args:
+        result: The attack.
+        example: Index of the example.
+    """
     descent = result.descent
     classes = result.classifier.classes
     before = predictions(result.logits_in_views_before[example], classes)
+    # Change of the attack values of this example, shape (1, D).
     change = descent.values[[example]] - result.problem.start[[example]]
     changes = result.problem.split_by_parameter(change)
+    # By the name of the parameter.
     largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
     return {
         "clean_correct": bool(result.clean_correct[example]),
@@ -173,14 +191,22 @@ def _versions(
     paths: Sequence[Path],
     renderers: Sequence[str],
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the numbers of each example by version of its images after the attack.
+    """Evaluate several versions of the images after an attack.
+
+    The versions are the images as floats, with 8 bits, as JPEG, and as each
+    renderer renders them from the saved files.
 
     Args:
         result: The attack.
-        paths: Folder of each example.
+        paths: Folder of each of the E examples.
         renderers: Names of the renderers that render the examples again from
             these folders.
+
+    Returns:
+        For each name of a version, the numbers of the E examples (see
+        `_numbers_of_version`).
     """
+    # Each version has shape (E, V, 3, size, size).
     images = result.images_in_views.cpu()
     versions = {
         "float": images,
@@ -300,12 +326,22 @@ def figure(result: AttackResult, example: int) -> Image.Image:
 
 
 def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
-    """Return tiles of the light before and after an attack; none if it did not change."""
+    """Draw a white ball in the light before and after an attack, as each view sees it.
+
+    Args:
+        result: The attack.
+        example: Index of the example.
+
+    Returns:
+        Two columns of the figure by their titles, with a tile for each view. Without a change
+        of the light, there are no columns.
+    """
     problem = result.problem
     scene = problem.scene
-    row = problem.all_examples[[example]]
-    conditions_before = problem.conditions(problem.start[row], row)
-    conditions_after = problem.conditions(result.descent.values[row], row)
+    examples = problem.all_examples[[example]]
+    conditions_before = problem.conditions(problem.start[examples], examples)
+    conditions_after = problem.conditions(result.descent.values[examples], examples)
+    # The conditions have a single row, which is row 0.
     basis_before = scene.basis_under(conditions_before, 0)
     basis_after = scene.basis_under(conditions_after, 0)
     is_same_light = torch.equal(conditions_before.light, conditions_after.light)
@@ -325,14 +361,22 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
 
 
 def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[str, ...]]:
-    """Return the predicted class of each view and its confidence.
+    """Write the captions of the views of an example.
 
-    If the class is wrong, the right class and its confidence follow.
+    Args:
+        result: The attack.
+        logits: Logits of all examples, shape (E, V, C).
+        example: Index of the example.
+
+    Returns:
+        The lines of each view: confidence and name of the predicted class. If this class is
+        wrong, a second line has confidence and name of the right class.
     """
     classes = result.classifier.classes
     labels = result.criterion.source[example].tolist()
     captions = []
     for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
+        # A dictionary names each class once, in this order.
         shown = dict.fromkeys([int(probabilities.argmax()), label])
         captions.append(tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown))
     return captions

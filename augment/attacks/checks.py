@@ -43,7 +43,7 @@ from renderer.validation import as_list, require_number
 # `check` repeats the attack with these multiples of its number of steps.
 GROWTH = (3, 10)
 
-# Keys of the result of `check` that `warnings` needs.
+# Keys of the result of `check` that `warnings` reads. `nb.save` refuses a result without them.
 CHECKED = {
     "success",
     "success_without_noise",
@@ -85,22 +85,29 @@ def check(result: AttackResult) -> dict[str, Any]:
     """
     require_result(result)
     descent = result.descent
+    # Each of these masks has shape (E,) for E examples.
     is_clean = result.clean_correct
-    is_open = ~result.success_before
-    cost_fell = (descent.cost < descent.cost_before) | result.success_without_noise
+    is_no_success_before = ~result.success_before
+    # A success counts as a lower cost, whatever its cost is.
+    has_lower_cost = (descent.cost < descent.cost_before) | result.success_without_noise
+
+    cost_fell = 1.0
+    if is_no_success_before.any():
+        cost_fell = _fraction(has_lower_cost[is_no_success_before])
 
     draws = generator(result.seed, "random search")
     draw = partial(result.problem.sample, draws, descent.values)
     random = _success_by_draws(result, Successes.before(result), draw)
+    # Fractions of the clean-correct examples, by number of steps or queries.
     counted_by_steps = {}
     without_noise_by_steps = {}
-    for steps, found in _success_by_steps(result).items():
-        counted_by_steps[steps] = _fraction(found.counted[is_clean])
-        without_noise_by_steps[steps] = _fraction(found.without_noise[is_clean])
+    for steps, successes in _success_by_steps(result).items():
+        counted_by_steps[steps] = _fraction(successes.counted[is_clean])
+        without_noise_by_steps[steps] = _fraction(successes.without_noise[is_clean])
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
-        "cost_fell": _fraction(cost_fell[is_open]) if is_open.any() else 1.0,
+        "cost_fell": cost_fell,
         "zero_gradient": _fraction(descent.zero_gradient),
         "success": _fraction(result.success[is_clean]),
         "success_without_noise": _fraction(result.success_without_noise[is_clean]),
@@ -170,6 +177,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     require_result(result)
     scales = _as_scales(scales)
     draws = generator(result.seed, "sweep")
+    # `_descend_further` moves these values (E, D) and adds to `adversarial` in place.
     values = result.problem.start.clone()
     adversarial = Successes.before(result)
     random = adversarial.clone()
@@ -278,7 +286,19 @@ def _as_classifier(
     value_range: tuple[float, float],
     argument: str,
 ) -> Classifier:
-    """Give a plain network the size and the classes of the attacked classifier."""
+    """Convert a plain network to a classifier. A classifier is returned as it is.
+
+    Args:
+        network: Classifier or plain network.
+        result: Result of an attack. The plain network has the image size, the classes and the
+            device of the attacked classifier.
+        normalization: Normalization of images for a plain network, as `attack` takes it.
+        value_range: Values of black and white that a plain network takes.
+        argument: Name of the network in error messages.
+
+    Returns:
+        The classifier.
+    """
     if isinstance(network, Classifier):
         return network
     attacked = result.classifier
@@ -302,14 +322,14 @@ def require_transferable(
     Raises:
         InputError: If a parameter belongs to its view or its mesh alone.
     """
-    of_view = [name for name in parameters if not parameter_class(name).fits_other_views]
-    of_mesh = [name for name in parameters if not parameter_class(name).fits_other_meshes]
-    for argument, elsewhere, bound in (
-        ("azimuths", azimuths, of_view),
-        ("meshes", objects, of_mesh),
+    bound_to_view = [name for name in parameters if not parameter_class(name).fits_other_views]
+    bound_to_mesh = [name for name in parameters if not parameter_class(name).fits_other_meshes]
+    for argument, requested, bound_parameters in (
+        ("azimuths", azimuths, bound_to_view),
+        ("meshes", objects, bound_to_mesh),
     ):
-        if elsewhere and bound:
-            problem = f"attacked {bound[0]} cannot be transferred to others"
+        if requested and bound_parameters:
+            problem = f"attacked {bound_parameters[0]} cannot be transferred to others"
             raise InputError(f"{argument}: {problem}, leave one of them out")
 
 
@@ -328,10 +348,13 @@ class Successes:
 
     @staticmethod
     def before(result: AttackResult) -> Successes:
-        """Return the examples that the classifier misclassifies before any step of an attack.
+        """Return the examples that meet the criterion before an attack.
 
         Args:
-            result: The result of an attack.
+            result: The result of the attack.
+
+        Returns:
+            Masks that `add` may change.
         """
         return Successes(result.success_before.clone(), result.success_before.clone())
 
@@ -341,7 +364,7 @@ class Successes:
 
     @property
     def left(self) -> Tensor:
-        """Return the indices of the A examples without a counted success, shape (A,)."""
+        """Return the indices of the A examples that are no success with noise, shape (A,)."""
         return torch.nonzero(~self.counted).squeeze(1)
 
     def add(
@@ -352,18 +375,18 @@ class Successes:
         examples: Tensor,
         images: Tensor,
     ) -> None:
-        """Count the examples that are a success under some values.
+        """Mark the examples that are a success under some values.
 
-        Where the images of the problem show a success, the final images decide
-        (see `final_images`).
+        An example is tested further if its images are a success. The images of
+        `final_images` then decide, whose shadows and bounces fit the values.
 
         Args:
             result: The attack, with its criterion and classifier.
-            problem: What the values are of.
+            problem: Scene and parameters to which the values belong.
             values: Values of the A examples, shape (A, D).
-            examples: Indices of the examples, shape (A,).
-            images: Images that the problem rendered of them,
-                shape (A, V, 3, H, W).
+            examples: Indices of the A examples among all E, shape (A,).
+            images: Images of these examples that the problem rendered under
+                the values, shape (A, V, 3, H, W).
         """
         is_reached = result.criterion.select(examples).reached(_predicted(result, images))
         rows = torch.nonzero(is_reached).squeeze(1)
@@ -397,25 +420,42 @@ def _success_by_draws(
     found: Successes,
     draw: Callable[[], Tensor],
 ) -> Successes:
-    """Add the successes of random draws (E, D), one draw for each step or query of the attack."""
+    """Search for successes by random draws of the attack values.
+
+    Args:
+        result: The attack. There is one draw for each of its steps, or as many as its queries
+            allow if the classifier has no gradients.
+        found: Successes so far. Examples with a success are not searched.
+        draw: Function that draws values of all E examples, shape (E, D).
+
+    Returns:
+        A copy of the successes, with those of the draws.
+    """
     found = found.clone()
     for _ in progress(range(_count_draws(result)), "random search"):
+        # Indices of the examples without a success so far.
         left = found.left
         if not len(left):
             break
         values = draw()[left]
         with torch.no_grad():
             images = result.problem.render(values, left)
-        found.add(result, result.problem, values, left, images)
+        found.add(result, result.problem, values=values, examples=left, images=images)
     return found
 
 
 def _count_draws(result: AttackResult) -> int:
-    """Return the number of random draws that need as many passes as the attack."""
+    """Return the number of random draws with which the attack is compared.
+
+    With gradients, it is the number of steps. Without, the draws need as many forward passes
+    as the attack may use.
+    """
     settings = result.settings
     if settings.uses_gradients:
         return settings.max_steps
-    passes_per_draw = result.images_in_views.shape[1] * (1 + settings.eot.draws)
+    # A draw needs passes of the image of each view and of its transformations.
+    view_count = result.images_in_views.shape[1]
+    passes_per_draw = view_count * (1 + settings.eot.draws)
     return max(1, settings.step_limit // passes_per_draw)
 
 
@@ -477,7 +517,16 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
 
 
 def _scaled(settings: StepSettings, scale: float) -> StepSettings:
-    """Return settings with a scaled norm-ball and steps, or with the scale as their radius."""
+    """Return settings of a parameter with a scaled norm-ball.
+
+    Args:
+        settings: Norm-ball and steps of the parameter.
+        scale: Factor of the radius and of the step size. If there is no radius, the scale
+            becomes the radius, and the step size stays as it is.
+
+    Returns:
+        Changed copy of the settings.
+    """
     if settings.radius is None:
         return replace(settings, radius=scale)
     return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
@@ -489,7 +538,16 @@ def _descend_further(
     values: Tensor,
     found: Successes,
 ) -> None:
-    """Attack the examples without success further. This changes `found` and the values (E, D)."""
+    """Attack the examples without a success further, from the values that they have reached.
+
+    Args:
+        result: The attack, with its classifier and settings.
+        problem: The scene, and the parameters with their present norm-balls.
+        values: Values of all E examples, shape (E, D). Those of the attacked examples are
+            replaced by the values at the end of the descent.
+        found: Successes so far, to which the new ones are added.
+    """
+    # Indices of the examples without a success so far.
     left = found.left
     if not len(left):
         return
@@ -503,11 +561,21 @@ def _descend_further(
         seed=result.seed,
     )
     values[left] = end.values
-    found.add(result, problem, end.values, left, end.images)
+    found.add(result, problem, values=end.values, examples=left, images=end.images)
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
-    """Return masks of the clean-correct examples with success, with noise and without."""
+    """Select the successes of the N clean-correct examples.
+
+    Args:
+        method: Key of the result: "adversarial" or "random".
+        found: Successes of all E examples.
+        result: The attack, which tells the clean-correct examples.
+
+    Returns:
+        Masks (N,) of the examples that are a success: with sensor noise under the key METHOD,
+        and without under the key METHOD_without_noise.
+    """
     is_clean = result.clean_correct
     return {
         method: found.counted[is_clean].cpu(),
@@ -517,13 +585,13 @@ def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> d
 
 @dataclass(frozen=True)
 class _Adversaries:
-    """Adversaries of an attack, with their examples before the attack.
+    """The A adversaries of an attack, and the same examples before the attack.
 
     Attributes:
         result: The attack.
-        examples: Number of each of the A adversaries among the examples.
-        before: What they were before the attack.
-        after: What they are after it.
+        examples: Index of each of the A adversaries among the examples.
+        before: The A examples before the attack.
+        after: The A examples after the attack.
     """
 
     result: AttackResult
@@ -533,7 +601,11 @@ class _Adversaries:
 
     @staticmethod
     def of(result: AttackResult) -> _Adversaries:
-        """Return the clean-correct examples with success."""
+        """Collect the clean-correct examples for which an attack succeeded.
+
+        Args:
+            result: The attack.
+        """
         problem = result.problem
         chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
         conditions_before = problem.conditions(problem.start, problem.all_examples)
@@ -547,13 +619,24 @@ class _Adversaries:
         return _Adversaries(result, chosen, before, after)
 
     def changed(self, change: Callable[[Adversary], Adversary]) -> _Adversaries:
-        """Return the same adversaries after a change of where they are shown."""
+        """Return a copy in which a function has changed each example before and after the attack.
+
+        Args:
+            change: Function that changes the cameras, the object or the image size.
+        """
         before = [change(adversary) for adversary in self.before]
         after = [change(adversary) for adversary in self.after]
         return replace(self, before=before, after=after)
 
     def shown_to(self, classifier: Classifier) -> dict[str, Any]:
-        """Return what a classifier predicts for the adversaries; see `transfer`."""
+        """Render the adversaries and classify them.
+
+        Args:
+            classifier: Classifier, which has the classes of the adversaries.
+
+        Returns:
+            Predictions and successes by name, as `transfer` describes them.
+        """
         settings = self.result.settings
         criterion = self._criterion_in(classifier)
         logits_before = self._logits(self._rendered(self.before, classifier), classifier)
@@ -579,7 +662,11 @@ class _Adversaries:
         }
 
     def _criterion_in(self, classifier: Classifier) -> Criterion:
-        """Return the criterion of the adversaries in the classes of a classifier."""
+        """Return the criterion of the adversaries with class indices of another classifier.
+
+        The attacked classifier may have the same classes in another order, so class names are
+        compared.
+        """
         view_count = self.result.problem.scene.views
         sources = [[adversary.shown.label] * view_count for adversary in self.after]
         source = self._labels(sources, classifier)
@@ -593,12 +680,28 @@ class _Adversaries:
         return Criterion(source, self._labels(targets, classifier))
 
     def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
-        """Convert A lists of V class names to indices (A, V)."""
+        """Convert class names to indices.
+
+        Args:
+            names: V class names for each of the A adversaries.
+            classifier: Classifier whose indices are returned.
+
+        Returns:
+            Indices, shape (A, V).
+        """
         indices = [classifier.label(name) for views in names for name in views]
         return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
 
     def _rendered(self, adversaries: list[Adversary], classifier: Classifier) -> Tensor:
-        """Render adversaries at the size of a classifier, (A, V, 3, size, size)."""
+        """Render adversaries.
+
+        Args:
+            adversaries: A adversaries, whose images have the size of the classifier.
+            classifier: Classifier that gets the images.
+
+        Returns:
+            Images in [0, 1], shape (A, V, 3, size, size).
+        """
         scene = self.result.problem.scene
         size = classifier.size
         if not adversaries:

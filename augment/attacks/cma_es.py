@@ -38,10 +38,10 @@ class Population:
     Its points are offsets from the start in units of `Parameter.search_scale`.
 
     Attributes:
-        strategy: `cma.CMAEvolutionStrategy`.
-        start: Values at which it began, shape (D,).
+        strategy: Evolution strategy, a `cma.CMAEvolutionStrategy`.
+        start: The D attack values at which the strategy began, shape (D,).
         scale: Unit of each value, shape (D,). It is 0 for values without effect.
-        drawn: Points of the present generation, shape (P, D).
+        drawn: The P points of the present generation, shape (P, D).
     """
 
     strategy: Any
@@ -50,20 +50,34 @@ class Population:
     drawn: np.ndarray = field(init=False)
 
     def ask(self) -> Tensor:
-        """Draw the values of a generation, shape (P, D)."""
+        """Draw a new generation of P points.
+
+        Returns:
+            Attack values of the points, which may be outside of the norm-ball, shape (P, D).
+        """
         self.drawn = np.stack(self.strategy.ask())
         return self._unprojected()
 
     def _unprojected(self) -> Tensor:
-        """Return the values of the points of the generation, shape (P, D)."""
+        """Convert the points of the generation to attack values, shape (P, D)."""
         return self.start + self.scale * torch.from_numpy(self.drawn).to(self.scale)
 
     def tell(self, values: Tensor, costs: Tensor) -> None:
-        """Adapt to the costs (P,) of the projected values (P, D) of the generation."""
-        outside = self._unprojected() - values
-        distances = torch.where(self.scale > 0, outside / self.scale, 0.0)
+        """Adapt the strategy to the costs of its generation.
+
+        The penalty that the module describes is added to each cost.
+
+        Args:
+            values: Feasible attack values in the norm-ball that are nearest to the P points of
+                the generation, shape (P, D).
+            costs: Cost of each of these values, shape (P,).
+        """
+        offsets = self._unprojected() - values
+        # Offsets in units of the first standard deviations, shape (P, D).
+        relative_offsets = torch.where(self.scale > 0, offsets / self.scale, 0.0)
         lower, upper = costs.double().quantile(costs.new_tensor([0.25, 0.75]).double())
-        penalties = (upper - lower) * distances.double().square().mean(1)
+        interquartile_range = upper - lower
+        penalties = interquartile_range * relative_offsets.double().square().mean(1)
         self.strategy.tell(list(self.drawn), (costs.double() + penalties).tolist())
 
 
@@ -72,9 +86,10 @@ class CMAES(GradientFree):
     """CMA-ES against one classifier, see the module.
 
     Attributes:
-        populations: Evolution strategies, by the row of the example.
-        generations: Projected values of the present generation, shape (P, D),
-            by the row of the example.
+        populations: Evolution strategy of each example. The key is the row of the
+            example in the state of the search.
+        generations: Projected values of the present generation of each example, P points of
+            D values, shape (P, D). The key is the same.
     """
 
     populations: dict[int, Population] = field(default_factory=dict, init=False)
@@ -87,7 +102,7 @@ class CMAES(GradientFree):
         return super().run(criterion, examples, start)
 
     def _candidates_per_step(self, state: State) -> int:
-        """Return the number of candidates in a generation, the default of the library."""
+        """Return the number P of candidates in a generation, which is the default of `cma`."""
         return 4 + int(3 * math.log(state.values.shape[1]))
 
     def _step(self, state: State) -> None:
@@ -96,8 +111,9 @@ class CMAES(GradientFree):
             if row not in self.populations:
                 self.populations[row] = self._begin(state, row)
             values = self.populations[row].ask()
-            example = state.examples[row].expand(len(values))
-            self.generations[row] = self.problem.project(values, example)
+            # All P candidates belong to the same example, shape (P,).
+            examples = state.examples[row].expand(len(values))
+            self.generations[row] = self.problem.project(values, examples)
         state.result.steps[state.active_rows] += 1
 
     def _begin(self, state: State, row: int) -> Population:
@@ -113,13 +129,25 @@ class CMAES(GradientFree):
         return Population(strategy, state.values[row].clone(), scale)
 
     def _candidates(self, state: State) -> Tensor:
-        """Return the generation of each active example, shape (N, P, D), or its initial values."""
+        """Return the candidates that are evaluated next for each of the N active examples.
+
+        Returns:
+            Projected values of the present generation, shape (N, P, D). Before the first
+            generation, they are the initial values, and P is 1.
+        """
         if not self.generations:
             return super()._candidates(state)
         return torch.stack([self.generations[row] for row in state.active_rows.tolist()])
 
     def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Tell the evolution strategies the costs (N, P) of their generations (N, P, D)."""
+        """Adapt the evolution strategies of the N active examples to their generations.
+
+        Args:
+            state: State of the search.
+            candidates: Projected values of each generation, shape (N, P, D).
+            costs: Cost of each candidate, shape (N, P).
+        """
+        # The initial values do not belong to a generation.
         if not self.generations:
             return
         for index, row in enumerate(state.active_rows.tolist()):

@@ -13,7 +13,8 @@ from augment.attack_settings import AttackSettings, EOTSettings
 from augment.random_streams import generator
 from renderer.image import clamp, to_bytes, to_unit
 
-# Draws of the noise of a sensor, all of which an adversary must survive.
+# Number of images with sensor noise that `stored` yields for each image. An attack counts as a
+# success only if the classifier is wrong in all of them.
 NOISE_DRAWS = 3
 
 
@@ -39,11 +40,15 @@ def _round_to_bytes(images: Tensor) -> Tensor:
 
 
 def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
-    """Return the classifier, which first rounds its images to 8 bits if the settings say so.
+    """Put the rounding of images to 8 bits before a classifier, if the settings ask for it.
 
     Args:
         settings: Settings of the attack.
         classifier: A model from images in [0, 1] to logits.
+
+    Returns:
+        A model from images in [0, 1] to logits. It is the classifier itself
+        without `settings.quantized`.
     """
     return Quantized(classifier) if settings.quantized else classifier
 
@@ -110,14 +115,23 @@ class ExpectationOverTransformations:
         return torch.stack(log_probabilities).mean(0)
 
     def _transformed(self, images: Tensor) -> Tensor:
-        """Return images (N, 3, H, W), each after a transformation of its own.
+        """Transform each image at random.
 
-        The camera moves, the exposure changes, noise is added, and the images
-        are compressed, all with the same quality.
+        A transformation shifts, rotates and scales the image, changes the
+        exposure, adds noise and compresses the image as JPEG. All images are
+        compressed with the same quality. The rest is drawn for each image.
+
+        Args:
+            images: Images in [0, 1], shape (N, 3, H, W).
+
+        Returns:
+            Transformed images in [0, 1], shape (N, 3, H, W).
         """
         settings = self.settings
+        # Two shifts, an angle and a growth for each image, shape (N, 4).
         movements = settings.jitter * self._uniform(len(images), 4)
         moved = _moved(images, movements.to(images))
+        # One stop is a factor of 2.
         stops = settings.exposure * self._uniform(len(images), 1, 1, 1)
         exposed = clamp(moved * (2**stops).to(images))
         noise = settings.noise * torch.randn(images.shape, generator=self._draws)
@@ -126,18 +140,22 @@ class ExpectationOverTransformations:
         return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), quality).to(exact))
 
     def _uniform(self, *shape: int) -> Tensor:
-        """Draw numbers uniformly from -1 to 1."""
+        """Draw a tensor of the given shape with numbers that are uniform in [-1, 1]."""
         return 2 * torch.rand(*shape, generator=self._draws) - 1
 
 
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return changed images whose derivative is that of the images as they are.
+    """Change images, but compute gradients as if the images had not been changed.
 
     Args:
         images: Images, of any shape.
-        change: A function of images to images of the same shape. It need not be
+        change: A function from images to images of the same shape. It need not be
             differentiable.
+
+    Returns:
+        Changed images. Their derivative with respect to `images` is the identity.
     """
+    # The difference has no gradient, because it is computed from detached images.
     exact = images.detach()
     return images + (change(exact) - exact)
 
@@ -162,12 +180,17 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
 
 
 def _moved(images: Tensor, movements: Tensor) -> Tensor:
-    """Shift, rotate and scale images. Pixels beyond the border repeat it.
+    """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
     Args:
         images: Images, shape (N, 3, H, W).
         movements: Shift across and down as fractions of the width, angle in
-            radians, and growth as a fraction of the size, shape (N, 4).
+            radians, and growth as a fraction of the size, shape (N, 4). They
+            describe where the new pixels lie in the given image, so the content
+            of the image moves in the opposite direction.
+
+    Returns:
+        Moved images, shape (N, 3, H, W).
     """
     across, down, angle, growth = movements.unbind(1)
     cos = (1 + growth) * angle.cos()

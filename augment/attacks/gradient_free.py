@@ -35,7 +35,15 @@ class GradientFree(Descent):
         return super().run(criterion, examples, start)
 
     def _draw_normal(self, state: State, count: int) -> Tensor:
-        """Draw normal numbers for the N active examples, shape (N, count, D)."""
+        """Draw normal numbers, each example with a generator of its own.
+
+        Args:
+            state: State of the search, with N active examples of D values.
+            count: Number of vectors for each example.
+
+        Returns:
+            Numbers with mean 0 and standard deviation 1, shape (N, count, D).
+        """
         shape = (count, state.values.shape[1])
         numbers = []
         for example in state.examples[state.active_rows].tolist():
@@ -45,7 +53,16 @@ class GradientFree(Descent):
         return torch.stack(numbers).to(state.values)
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify the candidates of the N active examples, and return the best ones."""
+        """Render and classify the candidates of the active examples.
+
+        Args:
+            state: State of the search, with N active examples.
+
+        Returns:
+            The best candidate of each of the N examples, as `_best_rows` chooses it.
+        """
+        # Shape (N, P, D): P candidates of D values for each example. Below, they are one list of
+        # N · P candidates.
         candidates = self._candidates(state)
         count = candidates.shape[1]
         criterion = state.criterion.select(state.active_rows.repeat_interleave(count))
@@ -63,16 +80,41 @@ class GradientFree(Descent):
         )
 
     def _candidates(self, state: State) -> Tensor:
-        """Return the candidates of the N active examples to evaluate next, shape (N, P, D)."""
+        """Return the P candidates that are evaluated next for each of the N active examples.
+
+        By default, P is 1.
+
+        Args:
+            state: State of the search.
+
+        Returns:
+            Attack values, shape (N, P, D).
+        """
         return state.candidate[state.active_rows][:, None]
 
     def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Use the costs (N, P) of candidates (N, P, D) for later steps. By default, do nothing."""
+        """Use the costs of the candidates for later steps. By default, do nothing.
+
+        Args:
+            state: State of the search.
+            candidates: P candidates of each of the N active examples, shape (N, P, D).
+            costs: Cost of each candidate, shape (N, P).
+        """
 
     def _score_values(
         self, values: Tensor, examples: Tensor, criterion: Criterion, state: State
     ) -> tuple[Tensor, Score]:
-        """Render and classify values (A, D), as many at a time as memory permits."""
+        """Render and classify candidates, as many at a time as memory permits.
+
+        Args:
+            values: Attack values of A candidates, shape (A, D).
+            examples: Index of the example of each candidate, shape (A,).
+            criterion: Source and target classes of the A candidates.
+            state: State of the search, which has the batch size.
+
+        Returns:
+            Images of the V views, shape (A, V, 3, H, W), and the scores of the A candidates.
+        """
         images = []
         scores = []
         for rows in torch.arange(len(values)).split(self.problem.group_size):
@@ -86,13 +128,31 @@ class GradientFree(Descent):
     def _score_images(
         self, images: Tensor, criterion: Criterion, batch_size: BatchSize
     ) -> list[Score]:
-        """Compute the scores of the single images of examples (A, V, 3, H, W), batch by batch."""
+        """Classify images batch by batch.
+
+        Args:
+            images: Images of V views of A candidates, shape (A, V, 3, H, W).
+            criterion: Source and target classes of the A candidates.
+            batch_size: Number of images of a batch.
+
+        Returns:
+            Scores of the images of each batch. The images are in the order of their candidates.
+        """
         all_images = images.flatten(0, 1)
         score_part = partial(self._score_part, all_images, criterion.flatten())
         return list(batch_size.map(score_part, len(all_images)))
 
     def _score_part(self, all_images: Tensor, criterion: Criterion, rows: slice) -> Score:
-        """Compute the cost, logit gap and prediction of each image of a batch."""
+        """Compute the cost, the logit gap and the prediction of each image of a batch.
+
+        Args:
+            all_images: All images, shape (N, 3, H, W).
+            criterion: Source and target class of each of the N images.
+            rows: The images of the batch among the N images.
+
+        Returns:
+            Scores of the images of the batch.
+        """
         batch = all_images[rows]
         classes = criterion.select(rows)
         logits = self.model(batch)
@@ -112,18 +172,23 @@ class GradientFree(Descent):
 
 
 def _best_rows(cost: Tensor, is_met: Tensor, count: int) -> Tensor:
-    """Return the row of the best of `count` candidates of each example, shape (N,).
+    """Choose the best candidate of each of N examples.
 
-    It has the lowest cost of those that reach the criterion or, if none does,
-    of all.
+    If some candidates of an example reach the criterion, the best is the one
+    with the lowest cost among these. Otherwise it is the one with the lowest
+    cost of all candidates of the example.
 
     Args:
         cost: Cost of each candidate, shape (N · count,).
-        is_met: Whether each candidate reaches the criterion, shape (N · count,).
+        is_met: Mask of the candidates that reach the criterion, shape (N · count,).
         count: Number of candidates of each example.
+
+    Returns:
+        Index of the best candidate of each example among all N · count, shape (N,).
     """
     costs = cost.unflatten(0, (-1, count))
     is_met = is_met.unflatten(0, (-1, count))
     is_excluded = is_met.any(1, keepdim=True) & ~is_met
+    # Index among the candidates of the same example, shape (N,).
     chosen = costs.masked_fill(is_excluded, torch.inf).argmin(1)
     return torch.arange(len(costs), device=cost.device) * count + chosen

@@ -114,11 +114,13 @@ class AttackProblem:
             Values after the step, which are feasible and lie in the
             norm-balls, shape (A, D).
         """
-        parts = zip(self.split_by_parameter(values), self.split_by_parameter(gradient), strict=True)
-        moved = [
-            parameter.take_step(part, gradient_part, examples, length)
-            for (parameter, part), (_, gradient_part) in parts
-        ]
+        value_parts = self.split_by_parameter(values)
+        gradient_parts = self.split_by_parameter(gradient)
+        moved = []
+        for (parameter, value_part), (_, gradient_part) in zip(
+            value_parts, gradient_parts, strict=True
+        ):
+            moved.append(parameter.take_step(value_part, gradient_part, examples, length))
         return torch.cat(moved, dim=1)
 
     def search_scale(self, examples: Tensor) -> Tensor:
@@ -171,21 +173,28 @@ class AttackProblem:
         return torch.cat([sample.to(self.start) for sample in samples], dim=1)
 
     def split_by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
-        """Split values of shape (A, D) into pairs of a parameter and its values."""
+        """Split the values of examples into those of each parameter.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+
+        Returns:
+            Pairs of a parameter and its d of the D values, shape (A, d).
+        """
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
-    """Return what an attack with these settings changes of a scene.
+    """Create the parameters that an attack changes of a scene.
 
     Args:
         settings: Settings of the attack.
         scene: The scene to attack.
 
     Returns:
-        The scene and its parameters. Unless light may be negative, the
-        light of the scene is first made physically possible.
+        The scene and its parameters. Without `settings.allow_negative`, negative radiance is
+        first removed from the light of the scene.
     """
     if not settings.allow_negative:
         scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))

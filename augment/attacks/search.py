@@ -19,12 +19,13 @@ from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
-# Range of the polar angle of random cameras, in degrees, and of the width of their
-# view, in world units.
+# `_with_random_camera` draws the polar angle of a camera from the first range, in degrees, and
+# the visible width from the second range, in world units.
 POLAR = (20.0, 100.0)
 WIDTH = (1.8, 3.5)
 
-# A normalized mesh lies within this distance of the origin, in world units.
+# Smallest distance of a random perspective camera from the origin, in world units. A
+# normalized mesh lies within this distance, so the camera is outside of the mesh.
 CLOSEST = 2.0
 
 # Field of view in degrees. If the camera of the scene is orthographic, every
@@ -70,32 +71,43 @@ def find_scene(
         if all images are correct with them, or if no candidate is better.
     """
     [confidence] = _confidences(build(settings), attack, classifier)
+    # The confidence is 0 if an image is misclassified.
     if confidence > 0:
         return settings
     highest = 0.0
-    chosen = settings
+    best_settings = settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
-        confidence, lit = _best_light(build(candidate), candidate, attack, classifier)
+        confidence, lit_candidate = _best_light(build(candidate), candidate, attack, classifier)
         if confidence > highest:
             highest = confidence
-            chosen = lit
+            best_settings = lit_candidate
         if highest >= CONFIDENCE_TO_STOP:
             break
-    return chosen
+    return best_settings
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """Yield settings of the scene with several cameras. The first has the camera of the scene.
+    """Yield settings of a scene with different cameras.
 
     If the only background is a gray value, each candidate is followed by the
     same candidate in front of light gray.
+
+    Args:
+        settings: Settings of the scene.
+        cameras: Number of cameras. The first is the camera of the scene, and the
+            others are random.
+        draws: CPU generator of the random cameras.
+
+    Yields:
+        Settings of the next candidate.
     """
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
         candidate = settings
         if index > 0:
-            is_orthographic_turn = settings.fov is None and index % 2 == 1
-            fov = FOV if is_orthographic_turn else settings.fov
+            # A field of view of None stands for an orthographic camera.
+            becomes_perspective = settings.fov is None and index % 2 == 1
+            fov = FOV if becomes_perspective else settings.fov
             candidate = _with_random_camera(replace(settings, fov=fov), draws)
         yield candidate
         if has_one_gray:
@@ -108,6 +120,8 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
     lowest_polar, highest_polar = POLAR
     narrowest, widest = WIDTH
     if settings.fov is not None:
+        # The visible width and the field of view determine the distance of a perspective
+        # camera. At the distance `CLOSEST`, it sees this width at the origin.
         closest_width = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
         narrowest = max(narrowest, closest_width)
         widest = max(widest, 2 * closest_width)
@@ -122,7 +136,18 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
 def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """Try lights and exposures, and return the highest confidence and its settings."""
+    """Find the light and the exposure in which a classifier recognizes a scene best.
+
+    Args:
+        scene: Scene of the settings.
+        settings: Settings of the scene.
+        attack: Settings of the attack.
+        classifier: Classifier to attack.
+
+    Returns:
+        The highest confidence, as `_confidences` defines it, and the settings with the light
+        and the exposure that give it.
+    """
     names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
     degree = harmonics_of(scene.basis).degree
     candidates = []
@@ -133,21 +158,30 @@ def _best_light(
             exposure = settings.exposure * factor
             candidates.append(replace(settings, light=name, exposure=exposure))
             coefficients.append(light * exposure)
-    lit = _under_lights(scene, torch.stack(coefficients))
-    confidences = _confidences(lit, attack, classifier, groups=len(candidates))
+    # One scene shows all candidates, so that they are rendered and classified in large batches.
+    scene_of_candidates = _under_lights(scene, torch.stack(coefficients))
+    confidences = _confidences(scene_of_candidates, attack, classifier, groups=len(candidates))
     highest, index = confidences.max(0)
     return float(highest), candidates[index]
 
 
 def _under_lights(scene: Scene, skies: Tensor) -> Scene:
-    """Return a scene with N copies of the examples, one for each environment light.
+    """Return a scene with N copies of the examples, one copy for each environment light.
 
-    The lights have shape (N, K, 3). Projector and lamps do not change.
+    Args:
+        scene: Scene of E examples.
+        skies: N environment lights, each with K coefficients, shape (N, K, 3).
+
+    Returns:
+        Scene of N · E examples. Example n · E + e is example e in light n. Projector and lamps
+        are those of the given scene.
     """
     count = len(skies)
-    sky = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
-    local_lights = scene.lights.repeat(count, 1, 1)[:, sky.shape[1] :]
-    lights = torch.cat([sky, local_lights], dim=1)
+    # Shape (N · E, K, 3).
+    environment = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
+    # The environment has the first K coefficients of a light. Local lights have the others.
+    local_lights = scene.lights.repeat(count, 1, 1)[:, environment.shape[1] :]
+    lights = torch.cat([environment, local_lights], dim=1)
     return scene.changed(examples=[*scene.examples] * count, lights=lights)
 
 
@@ -158,15 +192,24 @@ def _confidences(
     classifier: Classifier,
     groups: int = 1,
 ) -> Tensor:
-    """Return the lowest confidence in the true class among the images of each group.
+    """Compute the lowest confidence in the true class among the images of each group.
 
-    The images are rendered with the initial attack values. The examples are
-    divided into groups of equal size. A misclassified image counts as a
-    confidence of 0. The result has shape (groups,).
+    The confidence of an image is the probability of its true class. A misclassified image has
+    a confidence of 0.
+
+    Args:
+        scene: Scene of E examples with V views, rendered as before an attack.
+        attack: Settings of the attack.
+        classifier: Classifier to attack.
+        groups: Number of groups of E / groups successive examples.
+
+    Returns:
+        Lowest confidence, shape (groups,).
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)
     logits = logits_of(preprocessed_model(attack, classifier), images, attack.batch_size)
+    # Shape (E, V, C) for C classes.
     probabilities = logits.softmax(2)
     labels = source_labels(scene, logits, classifier)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]

@@ -11,9 +11,10 @@ from augment.settings import CameraEffectSettings
 from renderer.image import clamp, decode, encode
 from renderer.settings import ImageSettings
 
-# The blur of a pixel averages over this number of pixels to each side.
+# `_blur` averages each pixel with this number of neighbors on each side.
 BLUR_RADIUS = 3
-# The smallest standard deviation of the blur, in pixels. It leaves images as they are.
+# Smallest standard deviation of the Gaussian in `_blur`, in pixels. A blur of this width leaves
+# images as they are. It replaces 0, by which `_blur` cannot divide.
 MIN_BLUR = 1e-3
 
 
@@ -51,17 +52,21 @@ def draw_camera_effects(
         >>> effects(torch.rand(2, 1, 3, 8, 8), torch.tensor([0, 4])).shape
         torch.Size([2, 1, 3, 8, 8])
     """
+    # The pattern multiplies the linear light, shape (count, 3, size, size). `fill` is the
+    # fraction of the light that does not come from the projector.
     patterns = draw_patterns(count, image.size, draws, points)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
+    # Mask of the examples without a pattern, shape (count, 1, 1, 1).
     is_plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
-    projected = torch.where(is_plain, 1.0, fill + (1 - fill) * patterns)
+    pattern_gains = torch.where(is_plain, 1.0, fill + (1 - fill) * patterns)
+    # White balance in stops of each color channel. One stop is a factor of 2.
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     blurs = settings.blur * torch.rand(count, generator=draws)
-    deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noises = deviations * torch.randn(count, 3, image.size, image.size, generator=draws)
+    noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
+    noises = noise_deviations * torch.randn(count, 3, image.size, image.size, generator=draws)
     return _CameraEffects(
-        gains=(projected * 2**stops).to(device),
+        gains=(pattern_gains * 2**stops).to(device),
         blurs=blurs.to(device),
         noises=noises.to(device),
         encoding=image.encoding,
@@ -86,7 +91,15 @@ class _CameraEffects:
     encoding: str
 
     def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
-        """Change images (A, V, 3, size, size) of the examples with these indices (A,)."""
+        """Apply the effects to images.
+
+        Args:
+            images: Image values of V views of A examples, shape (A, V, 3, size, size).
+            examples: Indices of the A examples, shape (A,).
+
+        Returns:
+            Changed images in [0, 1], shape (A, V, 3, size, size).
+        """
         gained = decode(images, self.encoding) * self.gains[examples, None]
         blurred = _blur(gained, self.blurs[examples])
         encoded = encode(clamp(blurred), self.encoding)
@@ -94,21 +107,34 @@ class _CameraEffects:
 
 
 def _blur(images: Tensor, deviations: Tensor) -> Tensor:
-    """Convolve images (A, V, 3, size, size) with Gaussians of A standard deviations in pixels.
+    """Convolve images with Gaussians.
 
-    The pixels of the border are repeated beyond the border.
+    The pixels at the border of an image are repeated beyond the border.
+
+    Args:
+        images: V images of each of A examples, shape (A, V, 3, size, size).
+        deviations: Standard deviation of the Gaussian of each example in pixels, shape (A,).
+
+    Returns:
+        Blurred images, shape (A, V, 3, size, size).
     """
     size = images.shape[-1]
+    # Below, N = 2 · BLUR_RADIUS + 1 is the number of pixels over which a pixel is averaged.
     offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
+    # Shape (A, N).
     weights = torch.exp(-0.5 * (offsets / deviations.clamp(min=MIN_BLUR)[:, None]) ** 2)
     weights = (weights / weights.sum(1, keepdim=True)).to(images)
     pixels = torch.arange(size, device=images.device)
+    # Index along one axis of the N pixels around each pixel, shape (size, N).
     neighbors = (pixels[:, None] + offsets).clamp(0, size - 1)
-    # The matrix (size, size) of an example blurs along one axis of its images.
+    # The matrix (size, size) of an example blurs its images along one axis. Row i has the
+    # weights with which the pixels contribute to pixel i.
     matrices = images.new_zeros(len(images), size, size)
     matrices.scatter_add_(
         2,
         neighbors.expand(len(images), -1, -1),
         weights[:, None].expand(-1, size, -1),
     )
+    # A Gaussian blur is separable. The first matrix blurs each image vertically (j to i), and
+    # the second horizontally (k to l).
     return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)

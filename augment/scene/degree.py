@@ -30,15 +30,17 @@ from renderer.shading.gloss import Gloss, smoothest
 if TYPE_CHECKING:
     from augment.settings import SpecularLayerSettings
 
-# A warning reports errors of the irradiance above this fraction of the rms irradiance.
+# `warn_of_cut_light` warns of an rms error of the irradiance above this fraction of the rms
+# irradiance.
 NOTICED = 0.05
-# The lowest degree that shades the sides of an object about right. The irradiance of a point
-# source is off by 0.09 for this degree, and by 0.42 or more for lower degrees.
+# `degree_of_scene` warns if the user gives a lower degree than this. It is the lowest that
+# shades the sides of an object about right. The irradiance of a point source is off by 0.09
+# at this degree, and by 0.42 or more at lower degrees.
 SHADED = 2
-# Degree of the reference for irradiance errors. At higher degrees, the irradiance of
-# every lighting differs from it by less than `NOTICED`.
+# Degree of the light whose irradiance `warn_of_cut_light` takes as exact. The irradiance of
+# every lighting of a higher degree differs from it by less than `NOTICED`.
 COMPARED = 8
-# The roughness that stands for surfaces without gloss.
+# Roughness in `Smoothest` of surfaces without gloss.
 MATTE = 1.0
 
 
@@ -98,20 +100,31 @@ def reached_gloss(
     Returns:
         The lowest roughness and the object that has or reaches it.
     """
+    # `min` compares the roughness first, which is the first field of `Smoothest`.
     least = Smoothest(MATTE, "")
     for item in objects:
-        initial = smoothest(item.mesh)
-        least = min(least, Smoothest(initial, item.name))
-        reached = _reached_roughness(item, material, varnish)
-        if reached < initial:
-            least = min(least, Smoothest(reached, item.name, "can reach"))
+        initial_roughness = smoothest(item.mesh)
+        least = min(least, Smoothest(initial_roughness, item.name))
+        reached_roughness = _reached_roughness(item, material, varnish)
+        if reached_roughness < initial_roughness:
+            least = min(least, Smoothest(reached_roughness, item.name, "can reach"))
     return least
 
 
 def _reached_roughness(
     item: SceneObject, material: MaterialSettings | None, varnish: SpecularLayerSettings | None
 ) -> float:
-    """Return the lowest roughness that a variation and an attack give to an object's own faces."""
+    """Compute the lowest roughness that an attack and a variation can give to an object.
+
+    Args:
+        item: Object. Its props and its table keep their gloss and do not count.
+        material: Settings of an attack on the material, or None.
+        varnish: Settings from which the gloss of the object is drawn, or None.
+
+    Returns:
+        The lowest roughness. It is `MATTE` if neither an attack nor a variation changes the
+        gloss.
+    """
     has_specular_layer = varnish is not None and any(varnish.specular_factor)
     is_attacked = material is not None and any(
         (material.roughness, material.metallic, material.specular_factor)
@@ -119,15 +132,19 @@ def _reached_roughness(
     if not has_specular_layer and not is_attacked:
         return MATTE
     materials = initial_materials(item)
+    # Roughness of each face of the object itself.
     roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
     if varnish is not None and has_specular_layer:
-        roughness = torch.full_like(roughness, varnish.roughness[0])
+        lowest_drawn = varnish.roughness[0]
+        roughness = torch.full_like(roughness, lowest_drawn)
     if material is not None and is_attacked and material.roughness:
+        # An attack changes the mean and adds the change of the mean to each face. Its radius
+        # is in multiples of the unit `material.roughness`. No radius means no limit.
         mean = float(roughness.mean())
-        radius = math.inf
+        largest_change = math.inf
         if material.radius is not None:
-            radius = material.radius * material.roughness
-        change = max(mean - radius, MIN_ROUGHNESS) - mean
+            largest_change = material.radius * material.roughness
+        change = max(mean - largest_change, MIN_ROUGHNESS) - mean
         roughness = (roughness + min(change, 0.0)).clamp(min=0)
     # The strength of this gloss is 1, because attacks and variations can raise it to 1.
     gloss = Gloss(roughness, textured=not has_specular_layer)
@@ -172,7 +189,16 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
 
 
 def _affordable_degree(reached: Smoothest, pixels: int) -> int:
-    """Return the degree that the gloss needs, or else the highest one that fits in memory."""
+    """Find the degree of light for the smoothest gloss of a run, as far as memory allows.
+
+    Args:
+        reached: The smoothest surface of the run.
+        pixels: Number of pixels of the views of all objects.
+
+    Returns:
+        The degree that the gloss needs. If its operators do not fit in memory, the highest
+        degree whose operators fit. It is at least `DEGREE`.
+    """
     degree = max(DEGREE, reached.degree)
     cpu = torch.device("cpu")
     while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
@@ -227,15 +253,16 @@ def with_needed_degree(
     if needed <= degree:
         return scene
     if scene.lights_of_degree is not None:
+        # The lights that `build_scene` made. If the lights of the scene differ from them, they
+        # were changed later and are known to their present degree only.
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
         has_same_shape = scene.lights.shape[1:] == built.shape
-        # Lights that were changed after `build_scene` are known to this degree only.
         if has_same_shape and (scene.lights == built.to(scene.lights)).all():
             reached.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, reached.gloss)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    # If the coefficients of the highest degree are zero, the lighting has no detail
-    # that a higher degree could add.
+    # Coefficients of the harmonics of exactly this degree. If they are zero, the lighting has
+    # no detail that a higher degree could add, and needs no warning.
     highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
     if highest_band.any():
         reached.warn(f"degree={degree}", degree)

@@ -34,8 +34,8 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from augment.scene.conditions import Conditions
 
-# Shadows and bounces of a deformed mesh are kept from the previous call while each
-# coordinate of each vertex has moved by at most this distance, in world units.
+# `FrozenTransport.is_near` allows this change of each coordinate of each vertex, in world
+# units. Shadows and bounces are computed again if a vertex has moved further.
 NEAR = 0.001
 
 
@@ -97,9 +97,11 @@ class FrozenTransport:
         change = self._transport.change(surface, albedo.cpu().double())
         if change is None:
             return
-        canvas = change.new_zeros(*change.shape[:2], fragments.size**2)
-        canvas[..., surface.fragments.pixels] = change
-        self.views[camera] = FrozenView(canvas.to(albedo), _sum_by_pixel(fragments, albedo))
+        # `change` has the covered pixels only. All pixels of the image are kept, because
+        # a shape nearby may cover other pixels. Shape (3, K, size²).
+        all_pixels = change.new_zeros(*change.shape[:2], fragments.size**2)
+        all_pixels[..., surface.fragments.pixels] = change
+        self.views[camera] = FrozenView(all_pixels.to(albedo), _sum_by_pixel(fragments, albedo))
 
     def radiance(
         self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
@@ -122,14 +124,25 @@ class FrozenTransport:
         change = view.change[..., fragments.pixels]
         old_sums = view.albedo_sums[..., fragments.pixels]
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
+        # Shape (3, P).
         added = torch.einsum("ckp,kc->cp", change.to(light), light)
-        # Pixels without any albedo before are left as they are.
+        # The added radiance is proportional to the albedo of the pixel. If the albedo of
+        # the mesh is 0 there, no ratio exists, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)
         return added * torch.where(old_sums > 0, ratios, 1).to(light)
 
 
 def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
-    """Sum the albedo (S, 3) of the samples in each pixel of the image, to shape (3, size²)."""
+    """Sum the albedo of the samples in each pixel of an image.
+
+    Args:
+        fragments: The S samples, in P of the size² pixels of the image.
+        albedo: Albedo at the samples, shape (S, 3).
+
+    Returns:
+        Sum of each channel in each pixel, shape (3, size²). It is 0 in pixels without samples.
+    """
+    # Row-major index in the image of the pixel of each sample, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
     sums = albedo.new_zeros(3, fragments.size**2)
     return sums.index_add(1, pixel_of_sample, albedo.T)
@@ -157,10 +170,13 @@ class DirectRenderer:
 
     def __post_init__(self) -> None:
         """Create empty caches."""
+        # The keys of these two caches are the index of an object, and a camera.
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
+        # The keys are indices of objects.
         self._rays: dict[int, Rays] = {}
         self._transport_of_object: dict[int, FrozenTransport] = {}
+        # The keys are indices of examples whose shape has moved away from the object's mesh.
         self._transport_of_example: dict[int, FrozenTransport] = {}
 
     @cached_property
@@ -234,6 +250,7 @@ class DirectRenderer:
         item = self.objects[number]
         fixed_camera = camera.fixed()
         is_moved = changed.vertices is not None
+        # Below, `vertices` is a tensor with a gradient, and `positions` the same as an array.
         if changed.vertices is None:
             vertices = self.vertices[number]
             positions = item.mesh.vertices
@@ -249,6 +266,8 @@ class DirectRenderer:
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
         split = split_light(self.basis, light)
+        # Local lights need rays for their shadows. The view of an unmoved object in local
+        # light is prepared once. An unmoved object with another gloss cannot use this view.
         rays = None
         lamp_view = None
         if split.local_lights:
@@ -258,7 +277,9 @@ class DirectRenderer:
                 lamp_view = self.local_view(number, fixed_camera)
         indirect = None
         if self.settings.global_illumination:
-            # A camera that is being attacked changes in every call.
+            # `camera.fixed()` returns the camera itself if none of its fields is a tensor. A
+            # field is a tensor if the camera is attacked. Such a camera changes in every call,
+            # so its views are not kept.
             is_kept = camera is fixed_camera
             indirect = _IndirectLight(
                 self, example, number, fixed_camera, fragments, positions, is_kept
@@ -310,6 +331,8 @@ class DirectRenderer:
         if frozen is None:
             frozen = self._freeze(number, self.objects[number].mesh)
             self._transport_of_object[number] = frozen
+        # The unmoved mesh is tried first, then the shape that was kept for the example, and
+        # otherwise the transport of the new shape is computed.
         if not frozen.is_near(vertices):
             frozen = self._transport_of_example.get(example, frozen)
             if not frozen.is_near(vertices):
@@ -327,7 +350,16 @@ class DirectRenderer:
     def _rasterize(
         self, number: int, camera: Camera, vertices: np.ndarray
     ) -> tuple[Fragments, Tensor]:
-        """Return the samples of an object with these vertices, and their albedo (S, 3)."""
+        """Rasterize an object with given vertices.
+
+        Args:
+            number: Index of the object.
+            camera: The camera.
+            vertices: Vertices of the object's mesh, which may be moved, shape (V, 3).
+
+        Returns:
+            The S samples of the object, and the albedo at the samples, shape (S, 3).
+        """
         item = self.objects[number]
         [fragments] = build_fragments(
             vertices,

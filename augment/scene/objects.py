@@ -23,9 +23,11 @@ from renderer.geometry.mesh import (
 from renderer.geometry.shapes import solid
 from renderer.shading.gloss import Gloss
 
-# The smallest distance from the middle of a table to its sides, in world units.
+# `add_table` makes each side of a table at least this far from the vertical axis through the
+# origin, in world units.
 MIN_TABLE_REACH = 1.2
-# The distance that a table reaches beyond object and props, in world units.
+# `add_table` makes a table reach at least this far beyond the object and its props, in world
+# units.
 TABLE_MARGIN = 0.2
 
 
@@ -81,27 +83,35 @@ class SceneObject:
 
     @property
     def own_faces(self) -> np.ndarray:
-        """Return a mask of the faces (F,) of the object itself, without props and table."""
+        """Return a mask of the faces of the object itself, shape (F,).
+
+        It is False for the faces of props and table.
+        """
         face_count = len(self.mesh.faces)
         own_count = face_count if self.own is None else self.own
         return np.arange(face_count) < own_count
 
     @property
     def own_vertices(self) -> np.ndarray:
-        """Return a mask of the vertices (V,) that no face of props and table uses."""
-        other_vertices = self.mesh.faces[~self.own_faces]
-        return ~np.isin(np.arange(len(self.mesh.vertices)), other_vertices)
+        """Return a mask of the vertices of the object itself, shape (V,).
+
+        It is False for the vertices that a face of a prop or of the table uses.
+        """
+        corners_of_others = self.mesh.faces[~self.own_faces]
+        return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
 
     @cached_property
     def radius(self) -> float:
         """Return the largest distance of a vertex from the origin, including props and table."""
         distances = np.linalg.norm(self.mesh.vertices, axis=1)
+        # A mesh may have vertices that no face uses. These do not count.
         return float(distances[self.mesh.faces].max())
 
     @property
     def lowest(self) -> float:
         """Return the height z of the lowest vertex, at which a table is placed."""
         heights = self.mesh.vertices[:, 2]
+        # A mesh may have vertices that no face uses. These do not count.
         return float(heights[self.mesh.faces].min())
 
     def move_cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -195,6 +205,7 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
         return item
     require_color("ground", color)
     used_vertices = np.unique(item.mesh.faces)
+    # x and y of each vertex that a face uses.
     horizontal = item.mesh.vertices[used_vertices, :2]
     left, near = np.minimum(horizontal.min(0) - TABLE_MARGIN, -MIN_TABLE_REACH)
     right, far = np.maximum(horizontal.max(0) + TABLE_MARGIN, MIN_TABLE_REACH)
@@ -209,10 +220,11 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
 
 
 def resample_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Replace a solid by another instance of its class.
+    """Replace a solid by another random shape of the same kind, such as another orange.
 
     Args:
-        item: The object. Only a solid whose name has no seed is replaced.
+        item: The object. Only a solid whose name has no seed, such as "solid:orange" and not
+            "solid:orange:3", is replaced.
         seed: Seed of the instance.
 
     Returns:
@@ -241,6 +253,7 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
         The rotated object. The same props and table are at the height of its
         new lowest vertex.
     """
+    # The faces of the object itself come first. `item.own` is their number, or None for all.
     mesh = select_faces(item.mesh, slice(item.own))
     # `normalize` rounds vertices to float32. Rotated vertices are rounded again.
     vertices = (mesh.vertices @ rotation.T).astype(np.float32)
@@ -257,14 +270,23 @@ def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
     Returns:
         The copy.
     """
+    # The faces of the object itself come first. `item.own` is their number, or None for all.
     own_mesh = select_faces(item.mesh, slice(item.own))
     return _with_mesh(item, gloss.on(own_mesh))
 
 
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
-    """Replace the object's own mesh, and keep its props and its table."""
-    alone = replace(item, mesh=mesh, own=None)
-    return add_table(with_props(alone, item.props), item.ground)
+    """Return a copy of an object with another mesh.
+
+    Args:
+        item: Object, which may have props and a table.
+        mesh: New mesh of the object itself, without props and table.
+
+    Returns:
+        The copy. Its props and its table stand at the height of the new lowest vertex.
+    """
+    without_props = replace(item, mesh=mesh, own=None)
+    return add_table(with_props(without_props, item.props), item.ground)
 
 
 def _load_prop(item: PropSettings) -> Mesh:
@@ -282,12 +304,18 @@ def _load_prop(item: PropSettings) -> Mesh:
 
 
 def _load(item: MeshSettings) -> Mesh:
-    """Load a mesh with the color and the gloss of its settings."""
+    """Load a mesh with the color and the gloss of its settings.
+
+    Raises:
+        InputError: If the mesh is metallic and has no colors.
+    """
     mesh = _load_with_color(item)
     if item.gloss is None:
         return mesh
+    # With "file", the gloss of the file has been loaded with the mesh.
     if item.gloss != "file":
         mesh = _as_gloss(item.gloss).on(mesh)
+    # Column 1 of the gloss is the metallic factor of each face.
     is_metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
     if is_metal and item.color is None and not _has_colors(mesh):
         remedy = "give color=[red,green,blue], or a metallic of 0"
@@ -315,7 +343,16 @@ def _load_with_color(item: MeshSettings) -> Mesh:
 
 
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
-    """Build a solid, such as orange:3, whose seed is 0 by default."""
+    """Build a solid.
+
+    Args:
+        mesh_name: Full name for error messages, such as "solid:orange:3".
+        name_and_seed: Name and seed of the solid, such as "orange:3". The seed is 0 if it is
+            left out.
+
+    Returns:
+        The mesh.
+    """
     name, _, seed = name_and_seed.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"{mesh_name}: its seed is {seed!r}, give a whole number")
@@ -332,6 +369,14 @@ def _has_colors(mesh: Mesh) -> bool:
 
 
 def _as_gloss(values: Sequence[float]) -> Gloss:
-    """Convert [roughness, metallic, specular factor], or the first of them, to a gloss."""
+    """Convert the values of the setting `gloss` to a gloss.
+
+    Args:
+        values: Roughness, metallic and specular factor. The last value, or the last two, may be
+            left out.
+
+    Returns:
+        The gloss. Values that are left out have the defaults of `Gloss`.
+    """
     roughness, *others = [float(value) for value in values]
     return Gloss(roughness, *others)

@@ -23,7 +23,7 @@ MAX_PERIOD = 1.0
 
 
 def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tensor:
-    """Return where stripes of period 1 are bright.
+    """Find the points on the bright parts of vertical stripes with period 1.
 
     Args:
         points: Points, shape (2, ...).
@@ -32,41 +32,44 @@ def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tenso
         bright: Fraction of a period that is bright.
 
     Returns:
-        A mask of the points, shape (...).
+        Mask of the points on bright stripes, shape (...).
     """
+    # Row 0 of the comparison is about x. The stripes do not depend on y.
     return ((points + shift) % 1 < bright)[0]
 
 
 def checkers(points: Tensor, shift: Tensor) -> Tensor:
-    """Return which squares of a chessboard of period 1 are bright.
+    """Find the points on the bright squares of a chessboard with period 1.
 
     Args:
         points: Points, shape (2, ...).
         shift: Shift of the chessboard along x and y, shape (2, ...).
 
     Returns:
-        A mask of the points, shape (...).
+        Mask of the points on bright squares, shape (...).
     """
+    # A square is bright if exactly one of x and y is in the first half of its period.
     is_in_first_half = (points + shift) % 1 < 0.5
     return is_in_first_half.sum(0) == 1
 
 
 def spots(points: Tensor, shift: Tensor) -> Tensor:
-    """Return which points are in the discs of a grid of period 1.
+    """Find the points in the discs of a grid with period 1.
 
     Args:
         points: Points, shape (2, ...).
         shift: Shift of the grid along x and y, shape (2, ...).
 
     Returns:
-        A mask of the points, shape (...).
+        Mask of the points in discs, shape (...).
     """
+    # Offset of each point from the center of its disc, shape (2, ...).
     from_center = (points + shift) % 1 - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
 def half(points: Tensor, shift: Tensor | float) -> Tensor:
-    """Return which points are to the right of a line at x = shift - 0.5.
+    """Find the points to the right of the line x = shift - 0.5.
 
     Args:
         points: Points, shape (2, ...).
@@ -74,8 +77,9 @@ def half(points: Tensor, shift: Tensor | float) -> Tensor:
             along x, is used.
 
     Returns:
-        A mask of the points, shape (...).
+        Mask of the points to the right, shape (...).
     """
+    # Row 0 of the comparison is about x. The line does not depend on y.
     return (points > shift - 0.5)[0]
 
 
@@ -92,11 +96,19 @@ def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
     return torch.ones_like(points[0])
 
 
+# Shapes of which `draw_patterns` chooses one for each pattern.
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 
 
 def pixel_centers(size: int) -> Tensor:
-    """Return the centers of the pixels of an image as points, shape (2, 1, size, size)."""
+    """Return the centers of the pixels of an image as points.
+
+    Args:
+        size: Pixels per side.
+
+    Returns:
+        x (to the right) and y (down) of each center in [-1, 1], shape (2, 1, size, size).
+    """
     centers = (torch.arange(size) + 0.5) / size * 2 - 1
     return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
 
@@ -179,20 +191,24 @@ def draw_patterns(
         position_draws.append(torch.rand(4, generator=draws))
         family_draws.append(torch.randint(len(FAMILIES), (), generator=draws))
         color_draws.append(torch.rand(5, generator=draws))
-    # Each of the four position draws has shape (count, 1, 1).
+    # Angle as a fraction of a full turn, period as a fraction of its range, and shifts along x
+    # and y. Each of these four numbers in [0, 1] has shape (count, 1, 1).
     turn, relative_period, *shift = torch.stack(position_draws).T[:, :, None, None]
     period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
+    # Shape (2, count, size, size).
     rotated = turned(points / period, angle.cos(), angle.sin())
     shifts = torch.stack(shift)
+    # Index in `FAMILIES` of each pattern, shape (count,).
     family_of_pattern = torch.stack(family_draws)
     weight = torch.empty(count, 1, *points.shape[2:])
     for index, shape in enumerate(FAMILIES):
         patterns = torch.nonzero(family_of_pattern == index).squeeze(1)
         weight[patterns, 0] = shape(rotated[:, patterns], shifts[:, patterns]).float()
+    # The five numbers of a pattern are hue and saturation of its first color, hue and
+    # saturation of its second color, and the brightness of the second color.
     colors = torch.stack(color_draws)
     first = random_colors(colors[:, :2])
-    # The brightness of the second color is between 0 and 1.
     brightness = colors[:, 4:, None, None]
     second = random_colors(colors[:, 2:4]) * brightness
     return two_colors(weight, first, second)

@@ -24,10 +24,12 @@ from renderer.transport.operators import TransferOperator
 
 
 class Layer(NamedTuple):
-    """Radiance of B images at P pixels. The objects of the images cover only these pixels.
+    """Radiance of B images of a batch at P pixels.
+
+    The objects of these images cover no other pixels.
 
     Attributes:
-        rows: Which rows of the batch the images are: a slice, or indices (B,)
+        rows: Indices of the B images in the batch: a slice, or indices (B,)
             on the device of the radiance.
         pixels: Indices of the pixels in an image, shape (P,).
         composite: Linear radiance of object and background, shape (B, 3, P).
@@ -39,18 +41,20 @@ class Layer(NamedTuple):
 
 
 class _BuiltStack(NamedTuple):
-    """A stack of operators and the images that it renders.
+    """A stack of operators and the M images of `Relighting` that it renders.
 
     Attributes:
         operators: The operators.
-        rank: For each of all N images, its position among the A images of
-            this stack, shape (N,). Values of other images have no meaning.
-        background_terms: What the backgrounds add to the A images at the P
-            pixels of the stack, shape (A, C, P).
+        image_to_stack_image: For each of all N images, its index among the M
+            images of this stack, shape (N,). Values of images that are not in
+            this stack have no meaning.
+        background_terms: Linear radiance that the backgrounds add to the M
+            images at the P pixels of the stack, in C = 1 or 3 channels, shape
+            (M, C, P).
     """
 
     operators: OperatorStack
-    rank: Tensor
+    image_to_stack_image: Tensor
     background_terms: Tensor
 
 
@@ -87,13 +91,17 @@ class Relighting:
         Images of the same view share an operator. Each stack has as many
         operators as fit into `STACKED`.
         """
-        # The operators of an object are neighbors, so that a stack has few objects.
+        # The view of each operator: index of the object, and camera. Sorting by the object puts
+        # the operators of one object into few stacks.
         self._views_of_operators = sorted(dict.fromkeys(self.views), key=itemgetter(0))
         operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
+        # Index in `_views_of_operators` of the operator of each image, shape (N,).
         self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
         self._operators_per_stack = max(1, STACKED // self.settings.size**2)
+        # Index of the stack of each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
         self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
+        # The keys are indices of stacks.
         self._built: dict[int, _BuiltStack] = {}
 
     @property
@@ -113,33 +121,39 @@ class Relighting:
         Yields:
             The radiance of those images of the batch that share a stack.
         """
-        # The host waits here for a GPU. It does so once for all stacks.
+        # The CPU waits here for a GPU. It waits once for all stacks.
         images = images.cpu()
-        stack_of_row = self._stack_of_image[images]
-        needed = stack_of_row.unique().tolist()
-        self._build_missing(needed)
-        for index in needed:
+        # A row is the position of an image in the batch. Shape (A,).
+        row_to_stack = self._stack_of_image[images]
+        needed_stacks = row_to_stack.unique().tolist()
+        self._build_missing(needed_stacks)
+        for index in needed_stacks:
             built = self._built[index]
-            row_indices = torch.nonzero(stack_of_row == index).squeeze(1)
+            row_indices = torch.nonzero(row_to_stack == index).squeeze(1)
             rows = _as_rows(row_indices, light.device)
-            ranks = built.rank[images[row_indices]]
-            ranks_on_device = ranks.to(light.device, non_blocking=True)
-            radiance = built.operators.radiance(light[rows], ranks)
-            composite = radiance + built.background_terms[ranks_on_device]
+            # Where these images of the batch are among the images of the stack.
+            stack_images = built.image_to_stack_image[images[row_indices]]
+            stack_images_on_device = stack_images.to(light.device, non_blocking=True)
+            radiance = built.operators.radiance(light[rows], stack_images)
+            composite = radiance + built.background_terms[stack_images_on_device]
             yield Layer(rows, built.operators.pixels, composite)
 
     def _build_missing(self, indices: Iterable[int]) -> None:
-        """Build those of the given stacks that do not exist."""
+        """Build those of the stacks with the given indices that do not exist yet."""
         missing = [index for index in indices if index not in self._built]
         if not missing:
             return
         for index in progress(missing, "rendering views"):
             self._built[index] = self._build_stack(index)
+            # After the first stack, the memory of all others is known.
             if len(self._built) == 1:
                 self._require_memory_for_others(self._built[index])
 
     def _require_memory_for_others(self, first: _BuiltStack) -> None:
-        """Check that there is memory for all other stacks, which are as large as the first."""
+        """Raise InputError unless there is memory for all stacks that are not built yet.
+
+        All stacks are taken to be as large as the first one.
+        """
         operators = first.operators
         stack_bytes = (
             operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
@@ -150,28 +164,42 @@ class Relighting:
         require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
-        """Build a stack of operators, and the background terms of its images."""
-        first = index * self._operators_per_stack
-        views = self._views_of_operators[first : first + self._operators_per_stack]
+        """Build the stack of operators with an index, and the background terms of its images."""
+        first_operator = index * self._operators_per_stack
+        end = first_operator + self._operators_per_stack
+        views = self._views_of_operators[first_operator:end]
         operators: list[TransferOperator] = []
-        for number, views_of_object in groupby(views, key=itemgetter(0)):
-            item = self.objects[number]
+        for object_index, views_of_object in groupby(views, key=itemgetter(0)):
+            item = self.objects[object_index]
             cameras = [camera for _, camera in views_of_object]
             operators += self.build(item.mesh, cameras, albedo_scale=item.albedo_scale)
+        # Mask of the M images whose operators are in the stack, shape (N,).
         is_in_stack = self._stack_of_image == index
-        operator_of_image = (self._operator_of_image[is_in_stack] - first).cpu()
+        # Index in the stack of the operator of each of the M images, shape (M,).
+        operator_of_image = (self._operator_of_image[is_in_stack] - first_operator).cpu()
         stack = OperatorStack(operators, operator_of_image, self.backgrounds.device)
-        pixels = self.backgrounds.index_select(2, stack.pixels)
+        background_pixels = self.backgrounds.index_select(2, stack.pixels)
         background_terms = background_term(
             stack.coverage[stack.shown],
-            pixels[self.behind[is_in_stack]],
+            background_pixels[self.behind[is_in_stack]],
             self.settings.encoding,
         )
-        return _BuiltStack(stack, is_in_stack.cumsum(0) - 1, background_terms)
+        # The images of the stack are numbered in the order of all N images. The cumulative sum
+        # of the mask counts them.
+        image_to_stack_image = is_in_stack.cumsum(0) - 1
+        return _BuiltStack(stack, image_to_stack_image, background_terms)
 
 
 def _as_rows(indices: Tensor, device: torch.device) -> Rows:
-    """Return increasing indices as a slice if they are consecutive, or else on a device."""
+    """Convert increasing row indices to a faster form.
+
+    Args:
+        indices: Row indices in increasing order, shape (B,), on the CPU.
+        device: Device of the tensor whose rows are selected.
+
+    Returns:
+        A slice if the indices are consecutive numbers, or else the indices on the device.
+    """
     first = int(indices[0])
     end = int(indices[-1]) + 1
     if end - first == len(indices):

@@ -32,19 +32,20 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# The pixels of the images that are rendered at a time.
+# Number of pixels, over all views, of the images that are rendered at a time. It decides
+# `Scene.group_size`.
 AT_ONCE = 2**24
-# Progress is shown while more views than this are rendered. For fewer views, showing
-# it would make a step 4 % slower.
+# Direct rendering shows its progress if it renders more views than this. For fewer views,
+# showing the progress would make a step of an attack 4 % slower.
 UNCOUNTED_VIEWS = 8
 
 
 class Scene:
-    """E examples of V views each, over B backgrounds.
+    """E examples with V views each, in front of B backgrounds.
 
-    While the light alone changes, nothing is rasterized after the first time: the transfer
-    operators of many views are stacked (see `Relighting`). A view whose vertices move is
-    rasterized each time (see `DirectRenderer`).
+    While only the light changes, each view is rasterized once. After that, its transfer operator
+    gives the image under each light (see `Relighting`). A view whose vertices move is rasterized
+    each time (see `DirectRenderer`).
 
     Args:
         objects: The objects.
@@ -52,15 +53,19 @@ class Scene:
         backgrounds: The backgrounds, with values in [0, 1], shape (B, 3, size, size) or
             (B, 1, size, size).
         lights: The lights where attacks begin, shape (E, coefficients, 3), or (coefficients, 3)
-            for all examples. Images have their dtype and device.
+            for all examples. Images have the dtype and the device of the lights.
         settings: The settings of the images.
         rasterizer: The rasterizer.
         basis: The basis of the lights' coefficients, by default 49 harmonics.
         camera_effects: A differentiable function of rendered images (A, V, 3, size, size) and
-            their examples (A,). See `draw_camera_effects`.
-        one_light: Whether the views are shown once, so that no operators are built.
-        lights_of_degree: Returns the basis and the lights (coefficients, 3) of another degree,
-            for gloss of a roughness. None if the lights are known by their coefficients alone.
+            of the indices of these A examples, shape (A,). It returns the changed images. See
+            `draw_camera_effects`.
+        one_light: Whether each view is rendered under one light only. No transfer operators are
+            built then, because direct rendering takes less time.
+        lights_of_degree: A function of a degree and of the roughness of the smoothest gloss,
+            which is None without gloss. It returns the basis of this degree, and the scene's
+            lighting as coefficients (coefficients, 3) of this basis. None if only the
+            coefficients `lights` are known.
 
     Attributes:
         views: The number of views of an example.
@@ -148,8 +153,16 @@ class Scene:
         )
 
     def _build_relighting(self) -> Relighting:
-        """Prepare the operators of all views, which are built when they are first needed."""
-        views = [(row.object, camera) for row in self.examples for camera in row.cameras]
+        """Prepare rendering with transfer operators of all views of all examples.
+
+        The operators themselves are built when an image first needs them.
+
+        Returns:
+            The renderer of E · V images. Image e · V + v is view v of example e.
+        """
+        views = [
+            (example.object, camera) for example in self.examples for camera in example.cameras
+        ]
         # `build` must not refer to `self`. Python would otherwise free the scenes of earlier
         # epochs late, because of the circular reference.
         build = partial(
@@ -159,11 +172,12 @@ class Scene:
             basis=self.basis,
             dtype=self.lights.dtype,
         )
-        behind = self._background.repeat_interleave(self.views)
+        # Index of the background of each image, shape (E · V,).
+        image_to_background = self._background.repeat_interleave(self.views)
         return Relighting(
             self.objects,
             views,
-            behind,
+            image_to_background,
             self.backgrounds.flatten(2),
             self.settings,
             build,
@@ -181,7 +195,9 @@ class Scene:
         placed: bool = False,
         **options: Any,
     ) -> Scene:
-        """Build a scene of every object from every camera over every background, in that order.
+        """Build a scene of every object from every camera in front of every background.
+
+        The backgrounds change fastest from example to example, and the objects slowest.
 
         Args:
             objects: The objects.
@@ -197,13 +213,16 @@ class Scene:
         Returns:
             The scene.
         """
-        views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
+        # The cameras of each example that shows the same object and background.
+        camera_groups = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = []
-        for number, view, background in product(
-            range(len(objects)), views, range(len(backgrounds))
+        for object_index, given_cameras, background_index in product(
+            range(len(objects)), camera_groups, range(len(backgrounds))
         ):
-            seen = objects[number].move_cameras(view) if placed else view
-            examples.append(Example(number, seen, background))
+            moved_cameras = given_cameras
+            if placed:
+                moved_cameras = objects[object_index].move_cameras(given_cameras)
+            examples.append(Example(object_index, moved_cameras, background_index))
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:
@@ -215,8 +234,8 @@ class Scene:
         Returns:
             The scene.
         """
-        own = {name: getattr(self, name) for name in _ARGUMENTS}
-        return Scene(**own | arguments)
+        arguments_of_self = {name: getattr(self, name) for name in _ARGUMENTS}
+        return Scene(**arguments_of_self | arguments)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -233,7 +252,10 @@ class Scene:
 
     @cached_property
     def vertices(self) -> Tensor:
-        """Return the vertices of the M objects, shape (M, N, 3), padded with zeros."""
+        """Return the vertices of the M objects, shape (M, N, 3).
+
+        N is the number of vertices of the largest mesh. Smaller meshes are padded with zeros.
+        """
         return torch.nn.utils.rnn.pad_sequence(self._direct_renderer.vertices, batch_first=True)
 
     @property
@@ -273,11 +295,13 @@ class Scene:
         cameras = self.cameras[example]
         if conditions.cameras is None:
             return cameras
+        # The depth range of the cameras must hold vertices that have moved away from the origin.
         radius = 0.0
         if conditions.vertices is not None:
             radius = float(conditions.vertices[row].detach().norm(dim=1).max())
-        moves = conditions.cameras[row]
-        return tuple(camera.moved(*moves).with_clip_range(radius) for camera in cameras)
+        # Changes of the polar angle, the azimuth and the logarithm of the distance.
+        camera_changes = conditions.cameras[row]
+        return tuple(camera.moved(*camera_changes).with_clip_range(radius) for camera in cameras)
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """Return the conditions of some examples before any attack.
@@ -317,11 +341,13 @@ class Scene:
             raise InputError(f"{fault}: {remedy}")
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
-        behind = self._background[examples].repeat_interleave(self.views)
-        canvas = self.backgrounds.flatten(2).index_select(0, behind)
-        covered = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
+        # The images are the backgrounds, in which the pixels of the layers are overwritten.
+        image_to_background = self._background[examples].repeat_interleave(self.views)
+        # Shape (A · V, 3 or 1, size²).
+        canvas = self.backgrounds.flatten(2).index_select(0, image_to_background)
+        new_values = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
-        images = ScatterLayers.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
+        images = ScatterLayers.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *new_values)
         size = self.settings.size
         images = images.view(len(examples), self.views, 3, size, size)
         if self.camera_effects:
@@ -331,9 +357,19 @@ class Scene:
         return images
 
     def _as_examples(self, examples: object, count: int | None = None) -> Tensor:
-        """Convert `count` indices of examples to a tensor, or raise InputError.
+        """Convert indices of examples to an integer tensor on the device of the lights.
 
-        On a GPU, the range of the indices is not checked, because the CPU would wait for the GPU.
+        The range of indices on a GPU is not checked, because the CPU would wait for the GPU.
+
+        Args:
+            examples: The indices, as a list, an array or a tensor, shape (A,).
+            count: The number A of indices that the caller needs. None for any number.
+
+        Returns:
+            The indices, shape (A,).
+
+        Raises:
+            InputError: If the indices have another shape or are out of range.
         """
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
@@ -350,76 +386,120 @@ class Scene:
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         """Render the covered pixels of all images, by the fastest method that is exact.
 
-        - If the shape, the albedo or the gloss changed, or if each operator would
-          be used for one light only, images are rendered without operators.
-        - If lamps moved, transfer operators render all other light, and the light
-          of the lamps is computed for each image.
-        - If only the light changed, transfer operators render it.
+        - If the shape, the albedo or the gloss changed, the images are rendered without
+          transfer operators. So are the images of a scene with `one_light`.
+        - If lamps moved, transfer operators render all other light. The light of the lamps
+          is computed for each image and added.
+        - If only the light changed, transfer operators render all of it.
+
+        Args:
+            conditions: Light, shape and colors of A examples.
+            examples: Indices of the A examples, shape (A,).
+
+        Yields:
+            Layers of the A · V images. Image a · V + v is view v of example `examples[a]`.
         """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        surface = (conditions.vertices, conditions.albedo, conditions.gloss)
-        if self.one_light or any(values is not None for values in surface):
+        surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+        is_surface_changed = any(values is not None for values in surface_changes)
+        if self.one_light or is_surface_changed:
             return self._reshaded(light, conditions, examples)
         if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)
         return self._relit(light, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """Render images with transfer operators, one matrix product for each stack of operators."""
+        """Render images with transfer operators, one matrix product for each stack of operators.
+
+        Args:
+            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
+            examples: Indices of the A examples, shape (A,).
+
+        Yields:
+            One layer for each stack. A layer has those of the A · V images whose operators are
+            in the stack.
+        """
         views = torch.arange(self.views, device=examples.device)
+        # `Relighting` has an index for each view of each example of the scene, shape (A · V,).
         images = (examples[:, None] * self.views + views).flatten()
         if self.views > 1:
+            # All views of an example have the same light, shape (A · V, K, 3).
             light = light.repeat_interleave(self.views, dim=0)
         return self._relighting.layers(light, images)
 
     def _under_moved_lamps(
         self, light: Tensor, positions: Tensor, examples: Tensor
     ) -> Iterator[Layer]:
-        """Render images with transfer operators, and add the light of moved lamps to each."""
+        """Render images with transfer operators, and add the light of moved lamps to each image.
+
+        Args:
+            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
+            positions: Positions of the L lamps, shape (A, L, 3).
+            examples: Indices of the A examples, shape (A,).
+
+        Yields:
+            One layer for each stack of operators.
+        """
         movable_light = self.basis.movable_light
         assert movable_light is not None
-        where, lamps = movable_light
+        # Rows of the lamps among the K coefficients, and the basis of the lamps.
+        lamp_rows, lamps = movable_light
         other_light = light.clone()
-        other_light[:, where] = 0
-        numbers = torch.arange(len(light) * self.views, device=light.device)
+        other_light[:, lamp_rows] = 0
+        batch_images = torch.arange(len(light) * self.views, device=light.device)
         for rows, pixels, composite in self._relit(other_light, examples):
-            added = []
-            for image in numbers[rows].tolist():
+            lamp_radiances = []
+            for image in batch_images[rows].tolist():
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 camera = example.cameras[view]
                 view_in_lamps = self._direct_renderer.local_view(example.object, camera)
                 fragments, albedo = self._direct_renderer.view(example.object, camera)
-                radiance = view_in_lamps.radiance(lamps, albedo, light[row, where], positions[row])
+                radiance = view_in_lamps.radiance(
+                    lamps, albedo, light[row, lamp_rows], positions[row]
+                )
+                # Where the pixels that the object covers are among the layer's pixels.
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))
-                added.append(canvas.index_copy(1, covered, radiance))
-            yield Layer(rows, pixels, composite + torch.stack(added))
+                lamp_radiances.append(canvas.index_copy(1, covered, radiance))
+            yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Render each view directly."""
-        views = [*product(range(len(examples)), range(self.views))]
-        counted = progress(views, "rendering views") if len(views) > UNCOUNTED_VIEWS else views
+        """Render each view without transfer operators.
+
+        Args:
+            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
+            conditions: Conditions of the A examples. Their light is not used.
+            examples: Indices of the A examples, shape (A,).
+
+        Yields:
+            One layer for each of the A · V images.
+        """
+        row_and_view = [*product(range(len(examples)), range(self.views))]
+        counted = row_and_view
+        if len(row_and_view) > UNCOUNTED_VIEWS:
+            counted = progress(row_and_view, "rendering views")
         for image, (row, view) in enumerate(counted):
-            number = int(examples[row])
-            example = self.examples[number]
-            camera = self.cameras_under(conditions, row, number)[view]
+            example_index = int(examples[row])
+            example = self.examples[example_index]
+            camera = self.cameras_under(conditions, row, example_index)[view]
             background = self.backgrounds[example.background].flatten(1)
             pixels, coverage, radiance = self._direct_renderer.radiance(
-                number,
+                example_index,
                 example.object,
                 camera,
                 light[row],
-                conditions.row(row, self.mesh(number)),
+                conditions.row(row, self.mesh(example_index)),
                 background,
             )
-            behind = background.index_select(1, pixels)
-            term = background_term(coverage[None], behind, self.settings.encoding)
+            background_pixels = background.index_select(1, pixels)
+            term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
 
 
-# The arguments of `Scene`, which are its attributes, too.
+# Names of the arguments of `Scene`. A scene keeps each argument in the attribute of this name,
+# from which `Scene.changed` reads it.
 _ARGUMENTS = tuple(name for name in signature(Scene).parameters)
 
 
@@ -432,14 +512,14 @@ def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject
 
 
 def _require_lights(lights: Tensor, basis: Basis) -> None:
-    """Raise InputError unless lights are finite coefficients of the basis."""
+    """Raise InputError unless lights (..., coefficients, 3) are finite and fit the basis."""
     require_bounded(lights=lights)
     if lights.shape[-2:] != (basis.size, 3):
         raise InputError(f"lights has shape {tuple(lights.shape)}: give {basis.size} rows")
 
 
 def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
-    """Raise InputError unless backgrounds are images of a size with values in [0, 1]."""
+    """Raise InputError unless backgrounds have shape (B, 3 or 1, size, size), values in [0, 1]."""
     is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
     if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
         raise InputError(f"backgrounds: give (B, 3, {size}, {size}) of values in [0, 1]")

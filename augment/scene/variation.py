@@ -30,13 +30,14 @@ from renderer.shading.gloss import Gloss
 from renderer.transport.rays import Rays
 from renderer.vectors import rotation_matrices
 
-# The elevation of a camera above a table, in degrees.
+# `_raise_above_table` limits the elevation of a camera above a table to this range, in degrees.
 MIN_ELEVATION = 15.0
 MAX_ELEVATION = 75.0
-# The smallest and the largest distance of a wall behind the object, in world units.
+# `_vary_lighting` draws the distance of a wall behind an object between these two distances, in
+# world units.
 WALL_DISTANCES = (1.8, 8.0)
-# The largest angle from the camera to a directional light, around the object and up or down,
-# in degrees.
+# The polar angle and the azimuth of a drawn directional light differ from those of the camera
+# by at most this angle, in degrees.
 MAX_LIGHT_ANGLE = 70.0
 
 
@@ -93,8 +94,20 @@ def _vary_geometry(
     once: bool,
     is_on_table: Tensor,
 ) -> Scene:
-    """Draw the cameras, the backgrounds and the objects of all examples."""
+    """Return a scene with drawn cameras, backgrounds and objects.
+
+    Args:
+        scene: Scene of E examples.
+        settings: Ranges of the random changes.
+        draws: Generator of the random numbers.
+        once: Whether the new examples are rendered in one lighting only.
+        is_on_table: Mask of the examples with a table, shape (E,).
+
+    Returns:
+        The new scene, whose lighting is that of the given scene.
+    """
     examples = _draw_cameras(scene, settings, draws, is_on_table)
+    # Arguments of `Scene` that the new scene does not take from the given scene.
     changed: dict[str, Any] = {}
     if settings.backgrounds is not None:
         folder = Path(settings.backgrounds)
@@ -102,14 +115,15 @@ def _vary_geometry(
         changed["backgrounds"] = _draw_background_files(folder, len(scene), size, draws)
         examples = _number_backgrounds(examples)
     if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
-        # The views that show the same object from the same cameras share a drawn object.
-        views = [(example.object, example.cameras) for example in scene.examples]
-        index_of_view = {view: index for index, view in enumerate(dict.fromkeys(views))}
-        objects = [scene.objects[number] for number, _ in index_of_view]
+        # One object is drawn for each pair of an object and its cameras in the given scene.
+        # Examples that differ in their backgrounds only show the same drawn object.
+        pairs = [(example.object, example.cameras) for example in scene.examples]
+        pair_to_drawn_object = {pair: index for index, pair in enumerate(dict.fromkeys(pairs))}
+        objects = [scene.objects[object_index] for object_index, _ in pair_to_drawn_object]
         changed["objects"] = _draw_objects(objects, settings, draws)
         examples = [
-            replace(example, object=index_of_view[view])
-            for example, view in zip(examples, views, strict=True)
+            replace(example, object=pair_to_drawn_object[pair])
+            for example, pair in zip(examples, pairs, strict=True)
         ]
     # If a view is rendered in one lighting only, a transfer operator costs more than direct
     # rendering, except if direct rendering would trace rays.
@@ -121,7 +135,20 @@ def _vary_geometry(
 def _draw_cameras(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> list[Example]:
-    """Draw the position and the size of each object in the image, and the direction of the view."""
+    """Return the examples of a scene with randomly changed cameras.
+
+    The changes are a shift and a zoom of the image, and a rotation around the object. A
+    field of view is also drawn if the settings give one.
+
+    Args:
+        scene: Scene of E examples.
+        settings: Ranges of the random changes.
+        draws: Generator of the random numbers.
+        is_on_table: Mask of the examples whose cameras must be above a table, shape (E,).
+
+    Returns:
+        The E changed examples. All cameras of one example get the same changes.
+    """
     count = len(scene)
     shifts = _draw_pairs(settings.shift, count, draws)
     scales = _draw_log_uniform(settings.scale, count, draws)
@@ -148,7 +175,18 @@ def _draw_cameras(
 def _move_camera(
     camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
 ) -> Camera:
-    """Zoom by a factor, shift by (right, up) in image widths, and turn by (polar, azimuth)."""
+    """Return a copy of a camera that is zoomed, shifted and turned.
+
+    Args:
+        camera: Camera to change.
+        shift: Shift of the object in the image to the right and up, as fractions of the
+            width of the image.
+        scale: Factor of the size of the object in the image.
+        angles: Change of the polar angle and of the azimuth, in degrees.
+
+    Returns:
+        The changed copy.
+    """
     width = camera.width / scale
     right, up = shift
     turned = _turn_camera(camera, *angles)
@@ -161,28 +199,54 @@ def _move_camera(
 
 
 def _turn_camera(camera: Camera, polar: float, azimuth: float) -> Camera:
-    """Add angles in degrees to the direction of a camera."""
+    """Return a copy of a camera with angles in degrees added to its polar angle and azimuth."""
     return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
 
 def _raise_above_table(camera: Camera) -> Camera:
-    """Mirror a camera to above a table and limit its elevation."""
+    """Return a copy of a camera whose elevation is from `MIN_ELEVATION` to `MAX_ELEVATION`.
+
+    A camera below the horizon is first mirrored at the horizon.
+    """
+    # The polar angle, from +z, may have any value. Its cosine is the sine of the elevation.
     elevation = abs(math.degrees(math.asin(math.cos(math.radians(camera.polar)))))
     elevation = min(max(elevation, MIN_ELEVATION), MAX_ELEVATION)
     return replace(camera, polar=90 - elevation)
 
 
 def _to_perspective(camera: Camera, fov: float) -> Camera:
-    """Return a perspective camera that sees the same width at the origin, for a fov in degrees."""
+    """Return a perspective camera with a field of view.
+
+    Args:
+        camera: Orthographic or perspective camera.
+        fov: Field of view in degrees.
+
+    Returns:
+        Perspective camera in the same direction. Its distance is such that it sees the same
+        width at the origin as the given camera.
+    """
     distance = camera.width / 2 / math.tan(math.radians(fov) / 2)
     if isinstance(camera, PerspectiveCamera):
         return replace(camera, distance=distance)
-    shared = {item.name: getattr(camera, item.name) for item in fields(Camera)}
-    return PerspectiveCamera(**shared, distance=distance)
+    fields_of_camera = {item.name: getattr(camera, item.name) for item in fields(Camera)}
+    return PerspectiveCamera(**fields_of_camera, distance=distance)
 
 
 def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Read images (count, 3, size, size), drawn with repetition from all files below a folder."""
+    """Read randomly chosen background images. A file may be chosen several times.
+
+    Args:
+        folder: Folder of the image files. Its sub-folders are searched, too.
+        count: Number of images.
+        size: Pixels per side to which each image is scaled.
+        draws: Generator of the random numbers.
+
+    Returns:
+        Image values, shape (count, 3, size, size).
+
+    Raises:
+        InputError: If the folder has no images.
+    """
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(
@@ -201,7 +265,11 @@ def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
 def _draw_objects(
     objects: Sequence[SceneObject], settings: VariationSettings, draws: torch.Generator
 ) -> list[SceneObject]:
-    """Draw the instance, the rotation and the gloss of each object."""
+    """Draw the instance, the rotation and the gloss of each object.
+
+    An instance is one of the random shapes of a solid, such as another orange. What the
+    settings do not vary is kept.
+    """
     drawn = list(objects)
     if settings.instances:
         seeds = torch.randint(2**31, (len(drawn),), generator=draws).tolist()
@@ -219,18 +287,40 @@ def _draw_objects(
 
 
 def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.ndarray:
-    """Draw matrices (count, 3, 3) of rotations by up to max_angle degrees about random axes."""
+    """Draw rotations about random axes by random angles.
+
+    Args:
+        max_angle: Largest angle in degrees.
+        count: Number of rotations.
+        draws: Generator of the random numbers.
+
+    Returns:
+        Rotation matrices, shape (count, 3, 3).
+    """
     axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
     angles = max_angle * torch.rand(count, 1, generator=draws, dtype=torch.float64)
-    return rotation_matrices(angles * axes / axes.norm(dim=1, keepdim=True)).numpy()
+    # A rotation vector points along the axis, and its length is the angle.
+    rotation_vectors = angles * axes / axes.norm(dim=1, keepdim=True)
+    return rotation_matrices(rotation_vectors).numpy()
 
 
 def _draw_glosses(
     settings: SpecularLayerSettings, count: int, draws: torch.Generator
 ) -> list[Gloss]:
-    """Draw the roughness and the specular factor of each gloss uniformly from their ranges."""
+    """Draw glosses with a uniformly distributed roughness and specular factor.
+
+    Args:
+        settings: Lowest and highest roughness and specular factor.
+        count: Number of glosses.
+        draws: Generator of the random numbers.
+
+    Returns:
+        The glosses.
+    """
+    # The rows are roughness and specular factor, the columns are lowest and highest value.
     ranges = torch.tensor([settings.roughness, settings.specular_factor], dtype=torch.float64)
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
+    # Shape (count, 2).
     values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions)
     return [
         Gloss(roughness, specular_factor=specular_factor)
@@ -243,10 +333,10 @@ class _DrawnLights:
     """The lighting of E examples.
 
     Attributes:
-        environment: Coefficients of the environment lighting, shape (E, K, 3).
+        environment: K coefficients of the environment lighting, shape (E, K, 3).
         directions: Unit vectors from the objects towards directional lights,
             shape (E, 3). Zero stands for no directional light.
-        local: Coefficients of the local lights, shape (E, L, 3).
+        local: L coefficients of all local lights, shape (E, L, 3).
     """
 
     environment: Tensor
@@ -254,13 +344,19 @@ class _DrawnLights:
     local: Tensor
 
     def coefficients(self) -> Tensor:
-        """Return the lights (E, K + L, 3), in which directional lights have irradiance 1."""
+        """Combine environment, directional and local light of each example.
+
+        Returns:
+            Coefficients in the basis of the scene, shape (E, K + L, 3). Directional lights are
+            white and give a surface that faces them an irradiance of 1.
+        """
         environment = self.environment
         is_directional = self.directions.any(1)
         if is_directional.any():
             added = directional(self.directions, torch.ones(3), degree_of(environment[0]))
-            where = is_directional[:, None, None].to(environment.device)
-            environment = torch.where(where, added.to(environment) + environment, environment)
+            # `added` has no meaning for examples without a directional light.
+            mask = is_directional[:, None, None].to(environment.device)
+            environment = torch.where(mask, added.to(environment) + environment, environment)
         return torch.cat([environment, self.local], dim=1)
 
     def without_ground(self, is_on_table: Tensor, albedo: Tensor) -> "_DrawnLights":
@@ -286,31 +382,49 @@ class _DrawnLights:
 def _vary_lighting(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> Scene:
-    """Draw the lighting of all examples, light their backgrounds, and draw the camera effects."""
+    """Return a scene with drawn lighting, lit backgrounds and drawn camera effects.
+
+    Args:
+        scene: Scene of E examples.
+        settings: Ranges of the random changes.
+        draws: Generator of the random numbers.
+        is_on_table: Mask of the examples whose background becomes a table with a wall,
+            shape (E,).
+
+    Returns:
+        The new scene, with the objects and the cameras of the given scene.
+    """
     exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
     examples = [
         replace(example, exposure=example.exposure * factor)
         for example, factor in zip(scene.examples, exposures, strict=True)
     ]
     lights = _draw_lights(scene, settings, draws, is_on_table)
+    # Arguments of `Scene` that the new scene does not take from the given scene.
     changed: dict[str, Any] = {}
-    points = None
+    # Point of a projected pattern that each pixel shows. None if the pattern fills the image.
+    pattern_points = None
     if settings.lit_background or settings.tables or settings.background_saturation:
         albedo = _draw_background_albedo(scene, settings, draws)
         if settings.tables:
             lights = lights.without_ground(is_on_table, albedo)
-        lit = scene.changed(examples=examples, lights=lights.coefficients())
-        white = albedo.new_ones(3, 1, 1)
-        values = albedo * (_facing_irradiance(lit) if settings.lit_background else white)
+        lit_scene = scene.changed(examples=examples, lights=lights.coefficients())
+        # Without `lit_background`, an albedo is shown as under an irradiance of 1.
+        background_irradiance = albedo.new_ones(3, 1, 1)
+        if settings.lit_background:
+            background_irradiance = _facing_irradiance(lit_scene)
+        # Linear values of the backgrounds, shape (E, 3, size, size).
+        values = albedo * background_irradiance
         if settings.tables:
-            walls = _draw_log_uniform(WALL_DISTANCES, len(scene), draws)
-            arriving, points = _light_rooms(lit, lights, walls, is_on_table)
+            wall_distances = _draw_log_uniform(WALL_DISTANCES, len(scene), draws)
+            arriving, pattern_points = _light_rooms(lit_scene, lights, wall_distances, is_on_table)
             values[is_on_table] = albedo[is_on_table] * arriving.to(albedo)
         changed["backgrounds"] = encode(clamp(values), scene.settings.encoding)
+        # Each example now has a background of its own.
         examples = _number_backgrounds(examples)
     if settings.camera != CameraEffectSettings():
         changed["camera_effects"] = draw_camera_effects(
-            settings.camera, len(scene), scene.settings, draws, scene.lights.device, points
+            settings.camera, len(scene), scene.settings, draws, scene.lights.device, pattern_points
         )
     return scene.changed(examples=examples, lights=lights.coefficients(), **changed)
 
@@ -318,8 +432,20 @@ def _vary_lighting(
 def _draw_lights(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> _DrawnLights:
-    """Draw environment and directional lighting. The local lights stay those of the scene."""
+    """Draw the environment and the directional lighting of all examples.
+
+    Args:
+        scene: Scene of E examples. The drawn examples keep its local lights, and also its
+            environment lighting if the settings name no environments.
+        settings: Environments, and ranges of the random changes.
+        draws: Generator of the random numbers.
+        is_on_table: Mask of the examples with a table, shape (E,).
+
+    Returns:
+        Lighting of the E examples.
+    """
     harmonics = harmonics_of(scene.basis)
+    # The first coefficients of the basis are those of the environment.
     environment, local = scene.lights.tensor_split([harmonics.size], dim=1)
     directions = torch.zeros(len(scene), 3, dtype=torch.float64)
     if settings.environments:
@@ -339,17 +465,31 @@ def _draw_directional(
     draws: torch.Generator,
     is_on_table: Tensor,
 ) -> _DrawnLights:
-    """Choose a fraction of the examples, dim their environment and draw a directional light."""
+    """Add a directional light to some examples and dim their environment lighting.
+
+    Args:
+        lights: Lighting of the E examples.
+        scene: Scene of the E examples.
+        settings: Fraction of the examples that get a directional light, and range of the
+            factor by which their environment is dimmed.
+        draws: Generator of the random numbers.
+        is_on_table: Mask of the examples with a table, shape (E,).
+
+    Returns:
+        Lighting with directional lights from near the camera's direction.
+    """
     low, high = settings.fill_light
     shape = (len(scene), 1, 1)
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     is_chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     angles = _draw_pairs(MAX_LIGHT_ANGLE, len(scene), draws)
-    cameras = [
+    # The direction of a light is that of a camera that is turned from the example's camera.
+    turned_cameras = [
         _turn_camera(example.cameras[0], *turn)
         for example, turn in zip(scene.examples, angles, strict=True)
     ]
-    directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
+    # The third axis of a camera points from the origin to the camera.
+    directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in turned_cameras]))
     # A table blocks light from below, so directions from below are mirrored.
     grounds = [scene.objects[example.object].ground for example in scene.examples]
     has_table = is_on_table | torch.tensor([ground is not None for ground in grounds])
@@ -366,7 +506,17 @@ def _draw_directional(
 def _draw_background_albedo(
     scene: Scene, settings: VariationSettings, draws: torch.Generator
 ) -> Tensor:
-    """Return the linear albedo (E, 1 or 3, size, size) of all backgrounds, in random colors."""
+    """Compute the albedo of the background of each example.
+
+    Args:
+        scene: Scene of E examples. Its backgrounds are taken as images of the albedo.
+        settings: `background_saturation` is the largest saturation of a random color by which
+            an albedo is multiplied. With 0, the albedo keeps its color.
+        draws: Generator of the random numbers.
+
+    Returns:
+        Linear albedo, shape (E, 1 or 3, size, size).
+    """
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]
     if settings.background_saturation:
@@ -377,7 +527,15 @@ def _draw_background_albedo(
 
 
 def _facing_irradiance(scene: Scene) -> Tensor:
-    """Return the irradiance (E, 3, 1, 1) of surfaces that face the first camera of each example."""
+    """Compute the irradiance of a surface that faces the first camera of each example.
+
+    Args:
+        scene: Scene of E examples. Only its environment light counts.
+
+    Returns:
+        Irradiance times the exposure of each example, shape (E, 3, 1, 1).
+    """
+    # The normal of the surface points to the camera.
     directions = [example.cameras[0].axes()[2] for example in scene.examples]
     normals = torch.from_numpy(np.stack(directions))
     exposures = torch.tensor([example.exposure for example in scene.examples])[:, None]
@@ -388,7 +546,7 @@ def _facing_irradiance(scene: Scene) -> Tensor:
 
 
 def _light_rooms(
-    scene: Scene, lights: _DrawnLights, walls: Sequence[float], is_on_table: Tensor
+    scene: Scene, lights: _DrawnLights, wall_distances: Sequence[float], is_on_table: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Compute the irradiance of the rooms, and the points of projected patterns.
 
@@ -398,47 +556,48 @@ def _light_rooms(
     Args:
         scene: The scene of E examples, in the drawn lighting.
         lights: The drawn lighting.
-        walls: Distance of the wall behind each object, in world units.
-        is_on_table: Which N of the examples are in rooms, shape (E,).
+        wall_distances: Distance of the wall behind each object, in world units, E numbers.
+        is_on_table: Mask of the N examples in rooms, shape (E,).
 
     Returns:
         The irradiance of table and wall in the N rooms, shape
         (N, 3, size, size), and the point of the pattern that reaches each
         pixel of each example, shape (2, E, size, size).
     """
-    rows = torch.nonzero(is_on_table).squeeze(1).tolist()
+    room_examples = torch.nonzero(is_on_table).squeeze(1).tolist()
     environments = lights.environment.cpu().double()
     settings = scene.settings
-    images = []
+    irradiance_images = []
+    # Examples without a room keep the pixel centers: their pattern fills the image.
     points = pixel_centers(settings.size).repeat(1, len(scene), 1, 1)
-    # The room of every example of an object has the same rays.
-    groups = groupby(progress(rows, "tables"), lambda row: scene.examples[row].object)
-    for number, rows_of_object in groups:
-        item = scene.objects[number]
+    # Neighboring examples of the same object share its ray tracer.
+    groups = groupby(progress(room_examples, "tables"), lambda index: scene.examples[index].object)
+    for object_index, examples_of_object in groups:
+        item = scene.objects[object_index]
         rays = Rays(item.mesh)
-        for row in rows_of_object:
-            example = scene.examples[row]
+        for index in examples_of_object:
+            example = scene.examples[index]
             camera = example.cameras[0]
-            room = Room(rays, item.radius, item.lowest, walls[row])
-            direction = lights.directions[row]
-            local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
-            arriving = irradiance(room, camera, settings, environments[row], direction, local)
-            images.append(example.exposure * arriving)
+            room = Room(rays, item.radius, item.lowest, wall_distances[index])
+            direction = lights.directions[index]
+            local = split_light(scene.basis, scene.lights[index].cpu().double()).local_lights
+            arriving = irradiance(room, camera, settings, environments[index], direction, local)
+            irradiance_images.append(example.exposure * arriving)
             if not direction.any():
                 direction = torch.from_numpy(camera.axes()[2])
-            points[:, row] = project_along_light(
+            points[:, index] = project_along_light(
                 room, item.mesh, camera, settings, direction
             ).float()
-    if not images:
+    if not irradiance_images:
         return torch.zeros(0, 3, settings.size, settings.size), points
-    return torch.stack(images), points
+    return torch.stack(irradiance_images), points
 
 
 # Random numbers.
 
 
 def _draw_log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
-    """Draw numbers between two limits, with uniformly distributed logarithms."""
+    """Draw `count` numbers between two limits, with uniformly distributed logarithms."""
     low, high = (math.log(limit) for limit in limits)
     fractions = torch.rand(count, generator=draws, dtype=torch.float64)
     return (low + (high - low) * fractions).exp().tolist()

@@ -27,4 +27,14 @@ class Albedo(MeshParameter):
         super().__init__(scene, settings, [item.own_faces for item in scene.objects])
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with a color offset for each face.
+
+        Args:
+            values: Linear RGB offsets of the F faces of the largest mesh, shape (A, 3 F).
+            conditions: Conditions of the A examples.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions with the offsets, differentiable with respect to the values.
+        """
         return replace(conditions, albedo=self.offsets(values, examples))

@@ -31,5 +31,17 @@ class Geometry(MeshParameter):
         super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with displaced vertices.
+
+        Args:
+            values: Displacements of the N vertices of the largest mesh in world units, shape
+                (A, 3 N).
+            conditions: Conditions of the A examples.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions with the vertices, differentiable with respect to the values.
+        """
+        # Vertices before the attack, shape (A, N, 3).
         vertices = self._vertices[self._object_of[examples]]
         return replace(conditions, vertices=vertices + self.offsets(values, examples))

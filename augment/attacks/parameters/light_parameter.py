@@ -50,11 +50,32 @@ class LightParameter(Parameter):
         super().__init__(settings, start=initial_light.flatten(1))
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with other coefficients of this light.
+
+        Args:
+            values: Red, green and blue of the K coefficients of this light, shape (A, 3 K).
+            conditions: Conditions of the A examples.
+            examples: Not used. All parameters have this argument.
+
+        Returns:
+            Conditions with the light, differentiable with respect to the values.
+        """
         return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
 
     def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Find the nearest coefficients whose radiance is not negative.
+
+        Args:
+            values: Red, green and blue of the K coefficients, shape (A, 3 K).
+            within: Norm-ball that must contain the result, or None.
+
+        Returns:
+            Feasible values, shape (A, 3 K). If radiance may be negative, all values are
+            feasible.
+        """
         if not self._nonnegative:
             return super().project_feasible(values, within)
+        # Shape (A, K, 3).
         coefficients = values.unflatten(1, (-1, 3))
         ball = None if within is None else within.unflatten(-1, 3)
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
@@ -68,11 +89,11 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
 
     Returns:
         Rows of the environment lighting among the coefficients of all lights,
-        and its basis.
+        and the basis of the environment lighting.
     """
-    # The environment lighting is the first light of a basis.
-    lights = parts_of(scene.basis)
-    return lights[0]
+    # The environment lighting is the first part of the basis of all lights.
+    parts = parts_of(scene.basis)
+    return parts[0]
 
 
 def replace_light(conditions: Conditions, rows: slice, coefficients: Tensor) -> Conditions:

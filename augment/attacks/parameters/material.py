@@ -109,7 +109,8 @@ class Material(Parameter):
             with respect to the values.
         """
         if self.used_mask is not None:
-            # Values that are not attacked keep their start.
+            # `used_mask` and `start` have a row of four values for each example of the scene.
+            # Values that the mask excludes are not attacked and keep their start.
             values = torch.where(self.used_mask[examples], values, self.start[examples])
         material = values * self._unit
         objects = self._object_of[examples]
@@ -133,8 +134,10 @@ class Material(Parameter):
                 shape (A, 3).
             objects: Index of the object of each example, shape (A,).
         """
+        # Change of each example's average from that of the mesh, shape (A, 3).
         change = average_gloss - self._average_gloss[objects]
-        # Shape (A, F, 3). Faces of props and table do not change.
+        # `_object_mask` is 1 for faces of the object itself and 0 for faces of props and table,
+        # which do not change. Shape (A, F, 3).
         face_change = change[:, None] * self._object_mask[objects][..., None]
         return replace(conditions, gloss=(self._face_gloss[objects] + face_change).clamp(0, 1))
 
@@ -155,6 +158,15 @@ class Material(Parameter):
         return replace(conditions, hue=hue, albedo=albedo_offset)
 
     def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Find the nearest values whose gloss the renderer can show.
+
+        Args:
+            values: Attack values, shape (A, 4), as in `apply`.
+            within: Norm-ball that must contain the result, or None.
+
+        Returns:
+            Feasible values, shape (A, 4).
+        """
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
 
 

@@ -35,4 +35,15 @@ class Pixels(Parameter):
         super().__init__(settings, start)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with an offset for each pixel value.
+
+        Args:
+            values: Offsets of all pixel values of the V images of each example, shape
+                (A, V · 3 · size²).
+            conditions: Conditions of the A examples.
+            examples: Not used. All parameters have this argument.
+
+        Returns:
+            Conditions with the offsets, differentiable with respect to the values.
+        """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))

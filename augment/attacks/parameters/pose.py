@@ -136,11 +136,24 @@ class Pose(Parameter):
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
     def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Find the nearest values whose magnitudes are at most `_limit`.
+
+        Args:
+            values: Pose of the A examples divided by the units of the settings, shape (A, D).
+            within: Norm-ball that must contain the result, or None.
+
+        Returns:
+            Feasible values, shape (A, D).
+        """
         return nearest_in_box(values, -self._limit, self._limit, within)
 
 
 def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
-    """Return how far the pose of an object and its cameras changes per attack value of 1.
+    """Compute the changes of an object and its cameras that attack values of 1 stand for.
+
+    Args:
+        settings: Settings of the attack.
+        item: Object, whose skin tells its joints.
 
     Returns:
         Rotation vector in degrees (3 values), shift in world units (2),
@@ -234,7 +247,9 @@ class _MovableObject:
         """
         if self.skin is None or not self.rotated_joint_count:
             return vertices
+        # Shape (J, 3, 3).
         rotations = rotation_matrices(joint_rotations.view(-1, 3))
+        # Displacement of each vertex of this object's mesh.
         displacement = self.skin.displacements(rotations)
         # All meshes of a scene have as many rows of vertices as its largest mesh. A
         # smaller mesh ends with rows that no face uses.
@@ -250,7 +265,7 @@ def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
         item: Object with a skin.
 
     Returns:
-        Rotation of each joint in degrees; none if no joint is to move.
+        Rotation of each joint of the skin in degrees. The list is empty if no joint is to move.
 
     Raises:
         InputError: If the object has no skin, or lacks a joint that the settings name.

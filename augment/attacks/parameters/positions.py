@@ -40,4 +40,14 @@ class Positions(Parameter):
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with moved lamps.
+
+        Args:
+            values: x, y and z of the L lamps in world units, shape (A, 3 L).
+            conditions: Conditions of the A examples.
+            examples: Not used. All parameters have this argument.
+
+        Returns:
+            Conditions with the positions, differentiable with respect to the values.
+        """
         return replace(conditions, positions=values.unflatten(1, (-1, 3)))

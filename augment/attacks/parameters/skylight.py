@@ -86,6 +86,15 @@ class Skylight(Parameter):
         return replace_light(conditions, self._rows, sky.to(conditions.light))
 
     def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Find the nearest values for which the sky model is defined.
+
+        Args:
+            values: Zenith angle, azimuth and turbidity, divided by their units, shape (A, 3).
+            within: Norm-ball that must contain the result, or None.
+
+        Returns:
+            Feasible values, shape (A, 3).
+        """
         # The sky model is defined for these ranges, and for any azimuth.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY
