@@ -47,10 +47,11 @@ from renderer.validation import (
     require_whole,
 )
 
-# The number of attacked examples that are kept for figures.
+# Largest number of successful examples of a regeneration that `select_examples_to_log` keeps for
+# figures.
 SHOWN_EXAMPLES = 4
-# The number of random renders that are classified for diagnostics. The standard error of a success
-# rate is then at most 0.032.
+# Largest number of random renders of a regeneration that are classified for diagnostics. With this
+# number, the standard error of a success rate is at most 0.032.
 CLASSIFIED = 250
 
 
@@ -187,7 +188,17 @@ class AugmentationService:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 
     def _checked_images(self, images: Tensor) -> Tensor:
-        """Return images as a tensor, and check that there is one of bytes for each label."""
+        """Convert the images of a folder to a tensor, and check dtype and shape.
+
+        Args:
+            images: Tensor or array, which must be uint8 of shape (E, 3, H, W) for E labels.
+
+        Returns:
+            The images.
+
+        Raises:
+            InputError: If the images have another dtype or shape.
+        """
         if not isinstance(images, Tensor):
             images = torch.from_numpy(as_array("images", images))
         if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
@@ -358,16 +369,30 @@ class AugmentationService:
         return torch.tensor(list(digest), dtype=torch.uint8)
 
     def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
-        """Return the next images in passes over the folder, each pass in its own random order."""
-        total = len(images)
+        """Select and classify the images of a regeneration from the images of a folder.
+
+        The regenerations go through the folder in passes. A pass shows each image once, in a
+        random order of its own. A regeneration may begin and end within a pass.
+
+        Args:
+            model: The network.
+            images: All images of the folder, uint8, shape (F, 3, H, W).
+            number: Index of the regeneration.
+
+        Returns:
+            The selected images.
+        """
+        image_count = len(images)
+        # Positions of the first and the last selected image in the sequence of all passes.
         first = number * len(self)
         last = first + len(self) - 1
-        first_pass = first // total
+        first_pass = first // image_count
+        last_pass = last // image_count
         orders = []
-        for index in range(first_pass, last // total + 1):
+        for index in range(first_pass, last_pass + 1):
             draws = generator(self.seed, index, "folder")
-            orders.append(torch.randperm(total, generator=draws))
-        offset = first - first_pass * total
+            orders.append(torch.randperm(image_count, generator=draws))
+        offset = first - first_pass * image_count
         rows = torch.cat(orders)[offset : offset + len(self)].to(images.device)
         selected = to_unit(images[rows])
         labels = self.labels[rows]
@@ -377,7 +402,18 @@ class AugmentationService:
     def _random(
         self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
     ) -> Renders:
-        """Render random conditions. This process renders the examples with the indices in shard."""
+        """Render all examples with random attack values.
+
+        Args:
+            model: The network, which classifies some of the images.
+            problem: The scene of E examples, and the parameters that are drawn.
+            number: Index of the regeneration.
+            shard: Indices of the examples that this process renders. The other processes
+                render the other examples.
+
+        Returns:
+            The images of all E examples.
+        """
         values = self._random_values(problem, number)
         images = self._gather(problem.images(values, shard)[:, 0], shard)
         is_error, diagnostics = self._classify(model, images, self.labels)
@@ -396,8 +432,10 @@ class AugmentationService:
             labels: Their labels, shape (E,).
 
         Returns:
-            Whether each image is classified and misclassified, shape (E,), and
-            diagnostics: the fraction of misclassified images and the mean loss.
+            Mask of the images that were classified and are misclassified,
+            shape (E,). Also the diagnostics "attack_success", the fraction of
+            the classified images that are misclassified, and "loss", their
+            mean loss.
         """
         count = min(CLASSIFIED, len(labels))
         rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
@@ -415,7 +453,18 @@ class AugmentationService:
     def _adversarial(
         self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
     ) -> Renders:
-        """Attack the examples. This process attacks the examples with the indices in shard."""
+        """Attack all examples.
+
+        Args:
+            model: The network to attack.
+            problem: The scene of E examples, and the parameters that the attack changes.
+            number: Index of the regeneration.
+            shard: Indices of the examples that this process attacks. The other processes
+                attack the other examples.
+
+        Returns:
+            The attacked images of all E examples.
+        """
         attack = self.settings.attack
         criterion = self._attack_criterion().select(shard)
         attacked_model = preprocessed_model(attack, model)
@@ -446,6 +495,7 @@ class AugmentationService:
             )
         # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, shard)
+        # From here on, the result has the examples of all processes.
         parts = [getattr(result, item.name) for item in fields(result)]
         result = DescentResult(*[self._gather(part, shard) for part in parts])
         if self.settings.warm_start:
@@ -470,11 +520,24 @@ class AugmentationService:
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(self, part: Tensor, shard: Tensor) -> Tensor:
-        """Join the rows of all processes, where this process has those of the shard."""
+        """Join rows of examples that several processes have computed.
+
+        Args:
+            part: Rows of this process, one for each example of its shard, shape (A, ...).
+            shard: Indices of the A examples of this process among all E, shape (A,).
+
+        Returns:
+            Rows of all E examples, shape (E, ...).
+        """
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
-        """Return the source and the target class of each example."""
+        """Return the source and the target class of each example.
+
+        Without positive classes, an attack leads away from the label. With positive classes, an
+        example of a positive class has no target, and the targets of the other examples are the
+        positive classes in turn.
+        """
         if not self.positive_classes:
             return Criterion(self.labels[:, None])
         positive_classes = torch.tensor(self.positive_classes, device=self.labels.device)
@@ -488,7 +551,16 @@ class AugmentationService:
         return Criterion(source[:, None], target[:, None])
 
     def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
-        """Return the values (E, D) with which the attack of a regeneration begins."""
+        """Return the attack values with which a regeneration begins.
+
+        Args:
+            problem: The scene of E examples and the attacked parameters.
+            number: Index of the regeneration.
+
+        Returns:
+            The last values of the previous attack with `warm_start`, random values with
+            `init="random"`, or else the start of the problem, shape (E, D).
+        """
         if self._last_values is not None:
             return self._last_values
         if self.settings.init == "random":
@@ -496,14 +568,24 @@ class AugmentationService:
         return problem.start
 
     def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        """Draw the values (E, D) of all attacked parameters of a regeneration."""
+        """Draw values of all attacked parameters of a regeneration.
+
+        Args:
+            problem: The scene of E examples and the attacked parameters.
+            number: Index of the regeneration.
+
+        Returns:
+            Feasible values in the norm-balls, shape (E, D).
+        """
         settings = self.settings.random_light
         parts = []
         for parameter, start in problem.split_by_parameter(problem.start):
             if parameter.name == "lighting":
-                zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
+                # `perturb` adds random changes to a light. Of a light that is zero, only these
+                # changes remain.
+                no_light = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
-                offsets = perturb(zero, len(start), settings.amplitude, settings.radius, draws)
+                offsets = perturb(no_light, len(start), settings.amplitude, settings.radius, draws)
                 parts.append(start + offsets.flatten(1).to(start))
             else:
                 draws = generator(self.seed, number, parameter.name)
@@ -608,14 +690,23 @@ def select_examples_to_log(
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """Return the mean L2 norm of the change of each condition, as diagnostics."""
+    """Compute how much each condition of the examples changed from before an attack.
+
+    Args:
+        problem: The attack on E examples.
+        values: Attack values after the attack, shape (E, D).
+
+    Returns:
+        Diagnostics such as "light_change": the L2 norm of the change of an example, averaged
+        over the examples. Conditions that are None are left out.
+    """
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}
     for condition in fields(Conditions):
-        new = getattr(after, condition.name)
-        if new is not None:
-            difference = new - getattr(before, condition.name)
+        new_values = getattr(after, condition.name)
+        if new_values is not None:
+            difference = new_values - getattr(before, condition.name)
             changes[f"{condition.name}_change"] = _mean(difference.flatten(1).norm(dim=1))
     return changes
 

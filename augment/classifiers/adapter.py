@@ -30,14 +30,15 @@ from renderer.validation import as_list, as_tensor, require_kind, require_whole
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-Label = str | Sequence[str]  # One positive class, or several.
-# Values of images may exceed [0, 1] by this much, since interpolation and noise
-# can do that.
+# Name of one positive class, or names of several.
+Label = str | Sequence[str]
+# `require_unit_range` accepts image values that exceed [0, 1] by at most this much.
+# Interpolation and noise can produce such values.
 OVERSHOOT = 0.1
-# A network is refused after it returned probabilities for this many images.
+# `NetworkCall` refuses a network that returned probabilities for this many images.
 # Logits of a single image may be in [0, 1] and sum to 1 by chance.
 MIN_PROBABILITY_ROWS = 2
-# Value of the pixels of an image that shows nothing.
+# Value of all pixels of the image with which `Classifier.has_gradients` calls a function.
 GRAY = 0.5
 
 
@@ -101,12 +102,15 @@ class NetworkCall:
         try:
             logits = network(images)
         except Exception as error:
+            # Callers of the library handle these two kinds of errors themselves.
             if isinstance(error, InputError) or is_out_of_memory(error):
                 raise
             raise InputError(self._failure(network, images, error)) from error
         expected = (len(images), "C" if classes is None else classes)
-        fits = isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
-        if not fits or classes not in (None, logits.shape[1]):
+        has_row_per_image = (
+            isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
+        )
+        if not has_row_per_image or classes not in (None, logits.shape[1]):
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
             remedy = f"it must return logits {expected}"
             if hasattr(logits, "logits") or (isinstance(logits, dict) and "logits" in logits):
@@ -118,7 +122,17 @@ class NetworkCall:
     def _failure(
         self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception
     ) -> str:
-        """Return an error message with the failure of a network and its remedy."""
+        """Write the error message for a network that raised an error.
+
+        Args:
+            network: The network.
+            images: Images with which the network was called, shape (N, 3, H, W).
+            error: Error that the network raised.
+
+        Returns:
+            A sentence with the error and a remedy. If no weight of the network has the dtype of
+            the images, the remedy is another dtype.
+        """
         weights = network.parameters() if isinstance(network, nn.Module) else iter(())
         dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
@@ -130,7 +144,11 @@ class NetworkCall:
         return f"{reason}: use a network that takes such images"
 
     def _require_no_probabilities(self, logits: Tensor) -> None:
-        """Raise InputError if the network's first outputs are probabilities."""
+        """Raise InputError if the network has returned probabilities so far.
+
+        Args:
+            logits: Outputs of the network for a batch, shape (N, C).
+        """
         if self.probability_rows is None or not len(logits):
             return
         if not are_probabilities(logits):
@@ -143,9 +161,14 @@ class NetworkCall:
 
 
 def are_probabilities(outputs: Tensor) -> bool:
-    """Return whether every row of outputs (N, C) is in [0, 1] and sums to 1 up to rounding.
+    """Return whether outputs of a network are probabilities.
 
-    Outputs with a single class do not count as probabilities.
+    Args:
+        outputs: Outputs for N images and C classes, shape (N, C).
+
+    Returns:
+        Whether all values are in [0, 1] and each row sums to 1 up to rounding.
+        Outputs with a single class do not count as probabilities.
     """
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
@@ -238,6 +261,7 @@ class Classifier(nn.Module):
             raise InputError(
                 f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}"
             )
+        # Lowest and highest value of all images.
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
         # The range is checked after the network was called: on a GPU, this check waits
@@ -291,8 +315,8 @@ class Classifier(nn.Module):
     def has_gradients(self) -> bool:
         """Whether the logits are differentiable in the pixels.
 
-        A network of torch with weights is taken to be. Any other function is
-        called on a gray image.
+        A network of torch with weights is assumed to have differentiable
+        logits. Any other function is called with a gray image to find out.
         """
         parameters = self.function.parameters() if isinstance(self.function, nn.Module) else ()
         weight = next(iter(parameters), None)
@@ -433,7 +457,7 @@ class Wrapper(nn.Module):
 
 
 def unwrapped(network: Any) -> Any:
-    """Return the network inside all wrappers."""
+    """Return the network that is inside of nested `Wrapper` modules, or the network itself."""
     while isinstance(network, Wrapper):
         network = network.network
     return network
@@ -461,13 +485,22 @@ class ArrayFunction(Wrapper):
         self.has_probabilities: bool | None = None
 
     def forward(self, images: Tensor) -> Tensor:
-        """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
-        given = images.detach()
-        scores = self.network(given if self.takes_tensors else given.cpu().float().numpy())
-        scores = torch.as_tensor(np.asarray(scores)).to(images)
+        """Compute the scores of images.
+
+        Args:
+            images: Images in [0, 1], shape (N, 3, H, W).
+
+        Returns:
+            Scores, or logarithms of probabilities, in the dtype and on the device of the
+            images, shape (N, C).
+        """
+        detached = images.detach()
+        given = detached if self.takes_tensors else detached.cpu().float().numpy()
+        scores = torch.as_tensor(np.asarray(self.network(given))).to(images)
         if self.has_probabilities is None and scores.ndim == 2:
             self.has_probabilities = are_probabilities(scores)
         if self.has_probabilities:
+            # The logarithm of 0 is infinite, so 0 is replaced by the smallest positive number.
             return scores.clamp(min=torch.finfo(scores.dtype).tiny).log()
         return scores
 
@@ -488,6 +521,7 @@ class AnyFunction(Wrapper):
 
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W)."""
+        # A former call has found out what the function takes.
         if self.call is not None:
             return self.call(images)
         failure = None
@@ -498,6 +532,8 @@ class AnyFunction(Wrapper):
                 return scores
         except Exception as error:  # Users' functions raise errors of many kinds.
             failure = error
+        # The function failed on a tensor with gradients, or returned no tensor. It may take
+        # arrays of NumPy, or take tensors without gradients and return arrays.
         for takes_tensors in (False, True):
             converted = ArrayFunction(self.network, takes_tensors)
             with suppress(Exception):
@@ -709,6 +745,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         reason = f"{kind}: {single_line(error)}, in {place}"  # type: ignore[arg-type]
         expected = "python:package.module:function, which returns (module, size, classes)"
         raise InputError(f"name=python:{name} fails ({reason}): use {expected}", "name") from error
+    # A string is a sequence of strings, too, but no list of names.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
     if not (callable(network) and type(size) is int and has_names):

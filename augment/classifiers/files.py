@@ -100,8 +100,13 @@ def build_file(name: str, size: int, facts: NetworkFacts = NO_FACTS) -> Classifi
 
 
 def _read(path: Path) -> Content:
-    """Read the network of a file, or raise InputError for a file of another kind."""
-    read = {EXPORTED: _read_exported, ONNX: read_onnx}.get(path.suffix.lower(), _read_torchscript)
+    """Read the network of a file. The ending of its name tells the format.
+
+    Raises:
+        InputError: If the file is damaged or has another format.
+    """
+    readers = {EXPORTED: _read_exported, ONNX: read_onnx}
+    read = readers.get(path.suffix.lower(), _read_torchscript)
     try:
         return read(path)
     except InputError:
@@ -153,6 +158,8 @@ class Scripted(Wrapper):
 def _read_exported(path: Path) -> Content:
     """Read a file that `torch.export.save` wrote."""
     program = torch.export.load(path)
+    # The network must have a single input, the images. Its node in the graph has an example
+    # value, `node.meta["val"]`, whose shape has symbols for dimensions of any size.
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
     sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
@@ -184,6 +191,7 @@ class InBatches(Wrapper):
 
     def forward(self, images: Tensor) -> Tensor:
         """Compute the logits (N, C) of images (N, 3, H, W)."""
+        # Number of images that fill up the last batch.
         missing_count = -len(images) % self.batch_size
         filled = torch.cat([images, images[:1].expand(missing_count, -1, -1, -1)])
         logits = [self.network(part) for part in filled.split(self.batch_size)]

@@ -57,7 +57,16 @@ def normalize_light(
 
 
 def _balance(linear: Tensor, degree: float) -> Tensor:
-    """Compute the factor of each channel of each image, shape (N, 3, 1, 1)."""
+    """Compute the factors of the white balance.
+
+    Args:
+        linear: Linear images, shape (N, 3, H, W).
+        degree: Exponent of the factors. 1 gives all channels the same mean, and 0 leaves the
+            channels as they are.
+
+    Returns:
+        Factor of each channel of each image, shape (N, 3, 1, 1).
+    """
     channel_means = linear.mean((2, 3), keepdim=True)
     mean = channel_means.mean(1, keepdim=True)
     ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
@@ -65,8 +74,17 @@ def _balance(linear: Tensor, degree: float) -> Tensor:
 
 
 def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
-    """Compute the factor of each image, shape (N, 1, 1, 1)."""
+    """Compute the factors of the exposure.
+
+    Args:
+        linear: Linear images, shape (N, 3, H, W).
+        settings: `percentile` of all values of an image is mapped to `level`.
+
+    Returns:
+        Factor of each image, shape (N, 1, 1, 1).
+    """
     values = linear.flatten(1)
+    # The percentile is the value at this position in ascending order, counted from 1.
     rank = math.ceil(settings.percentile / 100 * values.shape[1])
     bright = values.kthvalue(rank, dim=1).values
     factors = settings.level / bright.clamp(min=DARKEST)
@@ -74,9 +92,18 @@ def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
 
 
 def _apply_gamma(encoded: Tensor, gamma: float) -> Tensor:
-    """Raise encoded values to a power. Below DARKEST_ENCODED, the curve is a line through 0."""
+    """Raise values to a power. Below `DARKEST_ENCODED`, the curve is a line through 0.
+
+    Args:
+        encoded: sRGB-encoded images in [0, 1], shape (N, 3, H, W).
+        gamma: The exponent.
+
+    Returns:
+        Images of the same shape.
+    """
     if gamma == 1:
         return encoded
-    # The derivative of the power is infinite at 0 if gamma is less than 1.
+    # The derivative of a power is infinite at 0 if gamma is less than 1. The factor by which
+    # values are multiplied is therefore constant below `DARKEST_ENCODED`.
     factor = encoded.clamp(min=DARKEST_ENCODED) ** (gamma - 1)
     return encoded * factor

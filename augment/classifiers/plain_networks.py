@@ -26,20 +26,23 @@ from renderer.errors import InputError, as_device, describe, require_file, requi
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, require_kind, require_whole
 
-# Normalization of most networks that were trained on ImageNet.
+# Value of the argument `normalization` that stands for the mean and the standard deviation of
+# red, green and blue below. Most networks that were trained on ImageNet use these numbers.
 IMAGENET = "imagenet"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+# Number of color channels.
 COLORS = 3
+# Default of the argument `value_range`: the values of black and white.
 UNIT_RANGE = (0.0, 1.0)
 # Pixels per side of the images of most networks that were trained on ImageNet.
 USUAL_SIZE = 224
-# Number of images in the call that checks a network. A single row of logits may
+# Number of images with which `_count_outputs` calls a network. A single row of logits may
 # look like probabilities by chance, so there are two.
 CHECKED_COUNT = 2
-# Names of the modules of torchvision, kornia and this library that normalize.
+# Class names of the modules of torchvision, kornia and this library that normalize images.
 NORMALIZING = frozenset({"Normalize", "Normalized"})
-# Names of the buffers with which networks normalize images themselves.
+# Names of buffers in which networks that normalize images themselves keep the mean.
 MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
@@ -243,7 +246,20 @@ def _preprocessed(
     normalization: Normalization,
     value_range: tuple[float, float],
 ) -> nn.Module:
-    """Put the scaling and the normalization of images in front of a network."""
+    """Put the scaling and the normalization of images in front of a network.
+
+    Args:
+        network: The network.
+        normalization: "imagenet", or mean and standard deviation. None for no normalization.
+        value_range: Values of black and white that the network takes before normalization.
+
+    Returns:
+        A module in evaluation mode that takes images in [0, 1].
+
+    Raises:
+        InputError: If the range or the normalization is wrong, or if the network normalizes
+            images itself and a normalization is given.
+    """
     module = network if isinstance(network, nn.Module) else AnyFunction(network)
     mean, std = mean_and_std(normalization)
     black, white = as_list("value_range", value_range, float | int, "the values of black and white")
@@ -258,7 +274,8 @@ def _preprocessed(
             f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
             f"white, {white:g}: give it in these units, or the value_range of the network"
         )
-    # (black + (white - black) x - mean) / std in the form of `Normalized`.
+    # For a value x in [0, 1], the network takes (black + span · x - mean) / std. This is
+    # (x - scaled_mean) / scaled_std, which `Normalized` computes.
     span = white - black
     scaled_mean = [(value - black) / span for value in mean]
     scaled_std = [value / span for value in std]
@@ -292,7 +309,17 @@ def _require_no_normalization(network: nn.Module) -> None:
 
 @torch.no_grad()
 def _count_outputs(network: nn.Module, size: int, device: torch.device | str, argument: str) -> int:
-    """Call a network on gray images, and return the number of its outputs."""
+    """Call a network on gray images, and return the number of its outputs.
+
+    Args:
+        network: Network that takes images in [0, 1].
+        size: Pixels per side of the images.
+        device: Device of the images.
+        argument: Name of the network in error messages.
+
+    Returns:
+        Number of classes C of its logits (N, C).
+    """
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
     call = NetworkCall(argument)

@@ -17,6 +17,9 @@ class Remembered(Wrapper):
     An attack shows the same image to a classifier several times: before the
     search, in it and after it. That costs much if the function is slow or paid
     for. The outputs are kept without gradients.
+
+    Attributes:
+        scores: Scores (C,) of each image that was shown, by the hash of the image.
     """
 
     def __init__(self, network: Callable[[Tensor], Tensor]):
@@ -26,11 +29,13 @@ class Remembered(Wrapper):
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W)."""
         keys = [_digest(image) for image in images.detach().cpu()]
-        new_rows = {key: row for row, key in enumerate(keys) if key not in self.scores}
-        if new_rows:
-            rows = torch.tensor(list(new_rows.values()), device=images.device)
+        # Index in `images` of each new image, by its hash. If two images of the batch are the
+        # same, the function gets one of them.
+        row_of_key = {key: row for row, key in enumerate(keys) if key not in self.scores}
+        if row_of_key:
+            rows = torch.tensor(list(row_of_key.values()), device=images.device)
             scores = self.network(images.detach()[rows])
-            self.scores.update(zip(new_rows, scores.detach(), strict=True))
+            self.scores.update(zip(row_of_key, scores.detach(), strict=True))
         return torch.stack([self.scores[key] for key in keys]).to(images)
 
 
@@ -41,10 +46,13 @@ def _digest(image: Tensor) -> bytes:
 
 
 def remembering(classifier: Classifier) -> Classifier:
-    """Return a classifier that asks the function of another once for each different image.
+    """Return a copy of a classifier that remembers the logits of each image.
 
     Args:
         classifier: A classifier without gradients.
+
+    Returns:
+        A classifier that calls the same function once for each different image.
     """
     if isinstance(classifier.function, Remembered):
         return classifier

@@ -138,7 +138,16 @@ def _network(classifier: Classifier) -> nn.Module:
 def _normalization(
     facts: NetworkFacts, mean: Sequence[float], std: Sequence[float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and the standard deviation of the facts, or the given ones."""
+    """Choose the normalization of a network.
+
+    Args:
+        facts: Facts that the user gave. Their normalization takes precedence.
+        mean: Published mean of red, green and blue.
+        std: Published standard deviation of red, green and blue.
+
+    Returns:
+        Mean and standard deviation of red, green and blue.
+    """
     if facts.normalization is None:
         return mean, std
     return mean_and_std(facts.normalization)
@@ -151,11 +160,21 @@ def _fitting_facts(
     facts: NetworkFacts,
     source: str | Path,
 ) -> NetworkFacts | None:
-    """Return facts with the number of classes that the weights have, or None if it fits already.
+    """Return facts with as many classes as a file of weights.
 
-    Raises InputError if the facts name another number of classes than the
-    weights have. `head` is the name of a weight of the last layer. This weight
-    has one row for each class.
+    Args:
+        classifier: Classifier that was built from the facts.
+        state: Weights by their names.
+        head: Name of a weight of the last layer. This weight has one row for each class.
+        facts: Facts that the user gave.
+        source: File or address of the weights, for the error.
+
+    Returns:
+        Facts with the names "0", "1" and so on. None if the classifier has as many classes as
+        the weights, or if the weights belong to another network.
+
+    Raises:
+        InputError: If the facts name another number of classes than the weights have.
     """
     if head not in state:  # The weights belong to another network. `fill` raises the error.
         return None
@@ -430,20 +449,31 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
     """Return the state dict in the content of a file, or raise TypeError if there is none."""
+    # A mapping with other values than tensors is a checkpoint. The state dict, or another
+    # checkpoint, is under one of the usual keys.
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
     ):
-        inner = [content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)]
-        if not inner:
+        inner_mappings = [
+            content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)
+        ]
+        if not inner_mappings:
             raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
-        content = inner[0]
+        content = inner_mappings[0]
     if not isinstance(content, Mapping):
         raise TypeError(f"it contains a value of type {type(content).__name__}")
     return content
 
 
 def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Remove the prefixes of wrappers that all names of weights have."""
+    """Remove the prefixes that wrappers of a network put before the names of its weights.
+
+    Args:
+        state: Weights by their names.
+
+    Returns:
+        Weights by their names without the prefixes that all names have.
+    """
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
             return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})

@@ -32,7 +32,9 @@ def draw_log_gain(count: int, cells: int, radius: float, draws: torch.Generator)
 
 
 class Best:
-    """Factors so far that come nearest to another predicted class, for each photograph.
+    """Best factors so far of each of B photographs.
+
+    The best factors are those with the largest gap.
 
     Attributes:
         log_gain: Logarithms of the factors, shape (B, 3, cells, cells).
@@ -47,8 +49,9 @@ class Best:
         """Keep the factors of those photographs whose gap has grown.
 
         Args:
-            log_gain: Logarithms of new factors.
-            logits: Logits of the relit photographs, shape (B, classes).
+            log_gain: Logarithms of new factors, shape (B, 3, cells, cells).
+            logits: Logits of the photographs that are relit with these factors, shape
+                (B, classes).
             source: Classes of the unchanged photographs, shape (B,).
         """
         gap = logit_gap(logits.detach().float(), source)
@@ -94,7 +97,9 @@ def descend_gain(
     steps: int,
     best: Best | None = None,
 ) -> Tensor:
-    """Find factors by projected gradient descent on the confidence in the source class.
+    """Search for factors that change the class, by projected gradient descent.
+
+    The descent lowers the confidence in the source class.
 
     Args:
         model: Network from images in [0, 1] to logits, without gradients of its

@@ -37,7 +37,9 @@ from renderer.errors import InputError
 from renderer.image import decode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
-# Light on a photograph: the slide as it is, or with factors that a search finds.
+# Keys of the results: the light of the slide as it is, with the best of several random factors,
+# and with factors that the gradient finds. `UNCHANGED` names the photograph without a projector
+# in `PhotographAttackResult.image`.
 SLIDE = "slide"
 RANDOM = "random"
 ADVERSARIAL = "adversarial"
@@ -62,10 +64,10 @@ class PhotographAttackResult:
         source: Predicted classes of the unchanged photographs, shape (N,).
         predicted: Predicted classes of the relit photographs, shape (N, S), for
             each light.
-        changed: Whether the relit photograph has another predicted class,
-            without noise and with each draw of it, shape (N, S), bool, for each
-            light. A random slide that changes the class counts for the searches
-            too.
+        changed: Mask of the relit photographs with another predicted class,
+            without noise and with each draw of the noise, shape (N, S), bool,
+            for each light. If the slide as it is changes the class, the
+            searches count as successful, too.
         log_gain: Logarithms of the factors of each light, shape
             (N, S, 3, cells, cells).
     """
@@ -80,7 +82,7 @@ class PhotographAttackResult:
     log_gain: dict[str, Tensor]
 
     def kept(self, light: str = ADVERSARIAL) -> Tensor:
-        """Return which photographs keep their class under all of their slides.
+        """Return a mask of the photographs that keep their class under all of their slides.
 
         Args:
             light: "slide", "random" or "adversarial".
@@ -235,36 +237,59 @@ class _PhotographAttack:
         )
 
     def _load(self, rows: Tensor) -> Tensor:
-        """Return photographs as images in [0, 1] on the device of the network."""
+        """Return photographs with the given indices as images on the device of the network.
+
+        Args:
+            rows: Indices of the photographs, shape (A,).
+
+        Returns:
+            Images in [0, 1], shape (A, 3, size, size).
+        """
         return to_unit(self.photographs[rows]).to(self.device)
 
     def _attack_slide(self, rows: Tensor, slide: int) -> None:
-        """Show a slide on photographs, and search factors for those that keep their class."""
-        zero = self.log_gain[SLIDE][rows, slide]
+        """Show a slide on photographs, and search factors for those that keep their class.
+
+        Args:
+            rows: Indices of the photographs of a batch, shape (B,).
+            slide: Index of the slide of each photograph.
+        """
+        # The slide as it is has the factor 1, whose logarithm is 0. Its predictions are recorded
+        # for all lights, and replaced below for the photographs that are searched.
+        no_gain = self.log_gain[SLIDE][rows, slide]
         for light in self.lights:
-            self._count(light, rows, slide, zero)
+            self._count(light, rows, slide, no_gain)
         left = rows[~self.changed[SLIDE][rows, slide]]
         if not len(left):
             return
-        found = {RANDOM: self._search_randomly(left, slide)}
+        log_gain_of_light = {RANDOM: self._search_randomly(left, slide)}
         if ADVERSARIAL in self.lights:
-            found[ADVERSARIAL] = self._descend(left, slide)
-        for light, log_gain in found.items():
+            log_gain_of_light[ADVERSARIAL] = self._descend(left, slide)
+        for light, log_gain in log_gain_of_light.items():
             self._count(light, left, slide, log_gain)
 
     def _light(self, rows: Tensor, slide: int) -> ProjectedLight:
-        """Draw the light of a slide on photographs."""
+        """Draw the light of a slide on the photographs with the given indices (A,)."""
         lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
         return lights.to(self.device)
 
     def _search_randomly(self, rows: Tensor, slide: int) -> Tensor:
-        """Return the best random factors of photographs, shape (A, 3, cells, cells)."""
-        streams = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
+        """Search for factors of a slide by random draws.
+
+        Args:
+            rows: Indices of the photographs, shape (A,).
+            slide: Index of the slide of each photograph.
+
+        Returns:
+            Logarithms of the best factors, shape (A, 3, cells, cells).
+        """
+        # Each photograph has a generator of its own, so its factors do not depend on the batch.
+        generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
         candidates = []
         for _ in range(self.settings.passes):
             drawn = [
                 draw_log_gain(1, self.settings.cells, self.settings.radius, draws)
-                for draws in streams
+                for draws in generators
             ]
             candidates.append(torch.cat(drawn).to(self.device))
         albedo = decode(self._load(rows), "srgb")
@@ -273,7 +298,15 @@ class _PhotographAttack:
         return search_gain(self.model, albedo, light, source, candidates).cpu()
 
     def _descend(self, rows: Tensor, slide: int) -> Tensor:
-        """Return the factors that the gradient finds, shape (A, 3, cells, cells)."""
+        """Search for factors of a slide by gradient descent.
+
+        Args:
+            rows: Indices of the photographs, shape (A,).
+            slide: Index of the slide of each photograph.
+
+        Returns:
+            Logarithms of the best factors of all steps, shape (A, 3, cells, cells).
+        """
         albedo = decode(self._load(rows), "srgb")
         light = self._light(rows, slide)
         source = self.source[rows].to(self.device)
@@ -289,34 +322,53 @@ class _PhotographAttack:
             self.settings.steps,
             best,
         )
+        # `descend_gain` has not classified the factors of its last step.
         with torch.no_grad():
             best.update(last, self.model(light.expose(albedo, last)), source)
         return best.log_gain.cpu()
 
     @torch.no_grad()
     def _count(self, light: str, rows: Tensor, slide: int, log_gain: Tensor) -> None:
-        """Record the predictions under a light, and which photographs change their class."""
+        """Record the predictions under a light, and which photographs change their class.
+
+        Args:
+            light: Key of the results: "slide", "random" or "adversarial".
+            rows: Indices of the photographs, shape (A,).
+            slide: Index of the slide of each photograph.
+            log_gain: Logarithms of the factors of the slide, shape (A, 3, cells, cells).
+        """
         relit = self._light(rows, slide).apply(self._load(rows), log_gain.to(self.device))
         predicted = self.model(relit).argmax(1)
+        # `fooled_in_views` expects examples of several views. A photograph has one view.
         criterion = Criterion(self.source[rows].to(self.device)[:, None])
-        changed = fooled_in_views(
+        # Each pair of a photograph and a slide has sensor noise of its own.
+        noise_indices = rows * self.settings.slides + slide
+        is_changed = fooled_in_views(
             self.model,
             relit[:, None],
             predicted[:, None],
-            rows * self.settings.slides + slide,
+            noise_indices,
             criterion,
             self.counting,
             self.seed,
         )
         self.predicted[light][rows, slide] = predicted.cpu()
-        self.changed[light][rows, slide] = changed[:, 0].cpu()
+        self.changed[light][rows, slide] = is_changed[:, 0].cpu()
         self.log_gain[light][rows, slide] = log_gain
 
 
 def _draw_lights(photographs: Tensor, rows: Sequence[int], slide: int, seed: int) -> ProjectedLight:
-    """Draw the light of a slide on some photographs, which depends on no other photograph.
+    """Draw the light of a slide on some photographs.
 
-    The photographs of the slides are drawn from all photographs.
+    Args:
+        photographs: All N photographs, uint8, shape (N, 3, size, size). Slides may show them.
+        rows: Indices of the photographs that are lit.
+        slide: Index of the slide of each photograph.
+        seed: Seed of the attack.
+
+    Returns:
+        One light for each index. It depends on this index, `slide` and the seed, and not on the
+        other indices.
     """
     size = photographs.shape[-1]
     lights = []

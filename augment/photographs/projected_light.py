@@ -24,17 +24,18 @@ from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
-# Number of nodes per side of the height of the surface.
+# `draw_shading` draws the heights of a surface at a grid with this number of nodes per side.
 SURFACE_NODES = 4
-# Largest steepness: standard deviation of the heights at the nodes, in half widths.
+# Largest standard deviation of these heights, in units of half the width of the image.
 MAX_STEEPNESS = 0.3
 # Largest angle between the light and the normal of the flat print, in degrees.
 MAX_POLAR = 60.0
-# Smallest and largest ambient light. A white slide has the light 1.
+# Smallest and largest ambient light that `draw_projected_light` draws. A white slide has the
+# light 1.
 AMBIENT = (0.01, 0.1)
-# Smallest and largest change of the exposure, in stops.
+# Smallest and largest change of the exposure that `draw_projected_light` draws, in stops.
 STOPS = (-1.0, 0.5)
-# Smallest mean luminance that a camera can expose.
+# Smallest mean luminance by which `ProjectedLight.expose` divides. Darker images stay dark.
 DARKEST = 1e-6
 
 
@@ -81,8 +82,9 @@ class ProjectedLight:
         slide = self.slide
         if log_gain is not None:
             size = slide.shape[-2:]
-            fine = F.interpolate(log_gain, size, mode="bilinear", align_corners=False)
-            slide = slide * fine.exp()
+            # Logarithm of the factor of each pixel, shape (B, 3, H, W).
+            log_gain_of_pixel = F.interpolate(log_gain, size, mode="bilinear", align_corners=False)
+            slide = slide * log_gain_of_pixel.exp()
         return slide * self.shading + self.ambient
 
     def apply(self, photographs: Tensor, log_gain: Tensor | None = None) -> Tensor:
@@ -111,9 +113,10 @@ class ProjectedLight:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
         """
         radiance = albedo * self.light(log_gain)
-        wanted = luminance(albedo).mean((2, 3), keepdim=True)
-        given = luminance(radiance).mean((2, 3), keepdim=True)
-        exposure = 2**self.stops * wanted / given.clamp(min=DARKEST)
+        # Mean luminance of the photograph and of the relit print, shape (B, 1, 1, 1).
+        mean_of_photograph = luminance(albedo).mean((2, 3), keepdim=True)
+        mean_of_print = luminance(radiance).mean((2, 3), keepdim=True)
+        exposure = 2**self.stops * mean_of_photograph / mean_of_print.clamp(min=DARKEST)
         return encode(clamp(exposure * radiance), "srgb")
 
 
@@ -129,15 +132,20 @@ def draw_shading(count: int, size: int, draws: torch.Generator) -> Tensor:
         Cosine between normal and light, 0 where the surface faces away, shape
         (count, 1, size, size).
     """
+    # Numbers in [0, 1], shape (count, 1, 1) each: steepness, and azimuth and polar angle of the
+    # light as fractions of their ranges.
     steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
-    nodes = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
-    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(nodes, size)
-    # An image is two half widths wide.
+    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
+    # Height of each pixel, shape (count, 1, size, size).
+    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
+    # The unit of length is half the width of the image, so a pixel is 2 / size wide.
     slope_down, slope_right = torch.gradient(height[:, 0], spacing=2 / size, dim=(1, 2))
     polar = math.radians(MAX_POLAR) * tilt
     azimuth = 2 * math.pi * turn
+    # Components of the unit vector towards the light. The third is polar.cos().
     to_right = polar.sin() * azimuth.cos()
     to_bottom = polar.sin() * azimuth.sin()
+    # The normal is (-slope_right, -slope_down, 1) / length.
     length = (1 + slope_right**2 + slope_down**2).sqrt()
     cosine = (polar.cos() - to_right * slope_right - to_bottom * slope_down) / length
     return cosine.clamp(min=0)[:, None]
