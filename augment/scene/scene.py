@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from inspect import signature
@@ -477,7 +477,7 @@ class Scene:
             One layer for each of the A · V images.
         """
         row_and_view = [*product(range(len(examples)), range(self.views))]
-        counted = row_and_view
+        counted: Iterable[tuple[int, int]] = row_and_view
         if len(row_and_view) > UNCOUNTED_VIEWS:
             counted = progress(row_and_view, "rendering views")
         for image, (row, view) in enumerate(counted):
