@@ -435,7 +435,7 @@ def quoted(text: str) -> str:
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error, what it was raised for, and so on."""
+    """Yield an error, and then the chain of errors that caused it."""
     cause: BaseException | None = error
     while cause is not None:
         yield cause

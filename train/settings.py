@@ -31,26 +31,37 @@ from renderer.settings import (
 OTHER = "other"
 # Sub-folder of a run with the scores on photographs, if evaluate.photos gives no names.
 PHOTOGRAPHS = "photographs"
-# Sub-folder of a run with renders that are kept aside, and that with their scores.
+# Sub-folder of a run with renders that are kept aside from the training.
 KEPT_ASIDE = "kept_aside"
+# Sub-folder of a run with the scores on the renders that are kept aside.
 LABORATORY = "laboratory"
-# Number of patterns of these renders.
+# Number of projected patterns of the renders that are kept aside.
 KEPT_ASIDE_PATTERNS = 5
-# Names that evaluate.photos cannot give. They name other sub-folders and scores of a run.
+# Names that evaluate.photos must not give to folders, because other sub-folders and
+# scores of a run have these names.
 RESERVED = ("renders", "test", "before", KEPT_ASIDE)
+# Default of model.name.
 WIDERESNET = "wideresnet"
 # Value of train.freeze with which the last layer alone is trained, as by Kirichenko
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
+# Choices of data.name.
 DATA_SETS = ("cifar100", "npz", "folder", "unlabelled", "shapes")
+# Values of data.name that need data.path.
 DATA_SETS_WITH_PATH = ("npz", "folder", "unlabelled")
+# Choices of train.schedule.
 SCHEDULES = ("step", "cosine", "one_cycle")
+# Choices of train.flips.
 FLIPS = ("random", "alternating")
+# Choices of train.augmentation that are transforms of torchvision.
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
 # Augmentation by the light of a projector; see `train.training.relit_batches`.
 RELIGHT = "relight"
+# Choices of train.augmentation.
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
+# Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
+# Choices of train.compile.
 COMPILE = ("auto", "always", "never")
 # Columns of photos.csv by which scores are grouped.
 GROUPS = ("source", "mesh", "class")

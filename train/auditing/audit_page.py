@@ -106,10 +106,12 @@ def write_audit_page(
         The report.
     """
     paths = {name: out / key for key, name in names.items()}
-    scored = {
-        name: {part: read_predictions(path / part / PREDICTIONS, label) for part in folders}
-        for name, path in paths.items()
-    }
+    scored = {}
+    for name, path in paths.items():
+        predictions = {}
+        for part in folders:
+            predictions[part] = read_predictions(path / part / PREDICTIONS, label)
+        scored[name] = predictions
     correct = {name: read_json(path / RECOGNIZED) for name, path in paths.items()}
     counts = {}
     for name, path in paths.items():

@@ -179,8 +179,8 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
         except Exception as error:
             sentence = user_message(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
-            # An error without such a sentence is a fault of the program, and is
-            # shown with its traceback.
+            # If `user_message` has no sentence, the error is a fault of the program.
+            # It is shown with its traceback.
             console.error("failed: %s", reason, exc_info=None if sentence else error)
             # If the disk is full, the console alone shows the reason.
             with suppress(OSError):

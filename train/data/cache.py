@@ -41,10 +41,10 @@ def cache_folder(choice: str | None) -> Path | None:
 
 
 def source_key(*packages: Path) -> str:
-    """Hash the code that a result depends on.
+    """Hash the Python files of some folders, so that a cache notices when code has changed.
 
     Args:
-        packages: The folders whose Python files count.
+        packages: Folders of the files.
 
     Returns:
         A hash of these files and of the versions of torch and NumPy.

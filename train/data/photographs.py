@@ -43,7 +43,7 @@ OTHER_PREFIX = "other_"
 TABLE = "photos.csv"
 # The file in a folder that pnb-lab made.
 DESCRIPTION = "lab.json"
-# This stands between the sources in a cell of the column hard_negatives.
+# Separator of the sources in a cell of the column hard_negatives of photos.csv.
 SEPARATOR = ";"
 SKIP = ", or set skip_unreadable=True to skip them"
 

@@ -27,7 +27,8 @@ from train.system.hashing import content_hash
 
 # Names of folders that divide a data set. They are not names of classes.
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")
-# The number of unlabeled images that are held out, at most. They measure agreement to a percent.
+# Largest number of unlabeled images that are held out from training. This many images
+# measure the agreement of two networks to a percent.
 HELD_OUT = 1000
 
 

@@ -111,8 +111,11 @@ def curves(
     """
     lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
     for method, seeds in methods.items():
-        lines_of_method[method] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
+        lines_of_method[method] = []
+        for points in seeds:
+            lines_of_method[method].append([(x, y) for x, y in points if y is not None])
     all_lines = [line for lines in lines_of_method.values() for line in lines]
+    # A line whose values are all equal shows nothing.
     if not any(len({y for _, y in line}) > 1 for line in all_lines):
         return None
 

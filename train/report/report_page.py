@@ -42,13 +42,15 @@ from train.system.user_errors import user_message
 
 # Name of the file.
 PAGE = "report.html"
-# Number of methods, and of seeds of a method, in plots and comparisons.
+# Largest number of methods in plots and comparisons.
 MAX_METHODS = 6
+# Largest number of seeds of a method in plots and comparisons.
 MAX_SEEDS = 5
-# Number of unfinished runs in plots.
+# Largest number of unfinished runs in plots.
 MAX_UNFINISHED = 3
-# Number of attacks with images, and of examples of such an attack.
+# Largest number of attacks of which the page shows images.
 MAX_ATTACKS = 12
+# Largest number of examples of an attack of which the page shows images.
 ATTACK_EXAMPLES = 4
 # Number of epochs of which the renders are shown.
 SHOWN_EPOCHS = 3
@@ -286,9 +288,12 @@ def _curves(methods: Epochs) -> list[Picture]:
     """
     pictures = []
     for name, title in CURVES.items():
-        lines = {}
+        # For each method, a line for each run. Its points are (epoch, metric).
+        lines: dict[str, list[plots.Points]] = {}
         for method, runs in methods.items():
-            lines[method] = [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
+            lines[method] = []
+            for run in runs:
+                lines[method].append([(epoch["epoch"], epoch.get(name)) for epoch in run])
         pictures.append(plots.curves(lines, title))
     rates = {}
     for method, runs in methods.items():

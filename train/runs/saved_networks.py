@@ -39,9 +39,9 @@ PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_
 FACTS = ("version", "encoding", "validation")
 # Entry of the description of a network that normalizes the light of images, with the settings.
 NORMALIZE_LIGHT = "normalize_light"
-# Prefix of the names of the weights of such a network.
+# Prefix of the names of the weights of a network that normalizes the light of images.
 LIGHT_PREFIX = "network."
-# Characters of a reason in an error, at most.
+# `of_one_architecture` cuts the reason in its error to this many characters.
 LONGEST_REASON = 300
 
 

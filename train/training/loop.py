@@ -44,7 +44,7 @@ from train.training.shared_teacher import share_layers
 
 # Images that are evaluated at a time.
 EVALUATION_BATCH = 512
-# Seconds between two checkpoints within an epoch, at least.
+# `Trainer` waits at least this many seconds between two checkpoints within an epoch.
 SAVING_EVERY = 60.0
 # The largest share of an epoch's time that its checkpoints take.
 SAVING_SHARE = 0.02

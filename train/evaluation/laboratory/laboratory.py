@@ -371,7 +371,7 @@ def _read_environment(path: Path) -> np.ndarray:
         return to_map(light, PROBE_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
     upper_half = radiance[: len(radiance) // 2]
-    # This form also refuses NaN.
+    # With `not`, the condition is also true if the largest radiance is NaN.
     if not upper_half.max() > 0:
         advice = "give a map with light from above the horizon"
         raise InputError(f"environments: {path} is dark above: {advice}")
