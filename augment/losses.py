@@ -58,10 +58,12 @@ def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> T
     """
     wanted = torch.full_like(source, NO_CLASS) if target is None else target
     has_no_target = wanted == NO_CLASS
-    chosen = torch.where(has_no_target, source, wanted)[..., None]
-    best_of_others = logits.scatter(-1, chosen, -torch.inf).amax(-1)
-    gap = logits.gather(-1, chosen)[..., 0] - best_of_others
-    return torch.where(has_no_target, -gap, gap)
+    # The target if there is one, or else the source, shape (..., 1).
+    compared_class = torch.where(has_no_target, source, wanted)[..., None]
+    best_of_others = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
+    # Lead of the compared class. An attack without a target wants the source not to lead.
+    lead = logits.gather(-1, compared_class)[..., 0] - best_of_others
+    return torch.where(has_no_target, -lead, lead)
 
 
 def complementary_label(label: int) -> int:
@@ -110,9 +112,12 @@ def label_loss(
         The losses, shape (N,).
     """
     classes = _class_of(labels)[:, None]
+    # A logit of -∞ is a probability of 0, so these logits leave out the classes that an image
+    # with a complementary label does not show.
     logits_of_others = logits.scatter(1, classes, -torch.inf)
     for index in absent:
         logits_of_others[:, index] = -torch.inf
+    # This is -log(1 - p), where 1 - p is the sum of the probabilities of the other classes.
     complementary = logits.logsumexp(1) - logits_of_others.logsumexp(1)
     cross_entropy = F.cross_entropy(
         logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing
@@ -153,6 +158,7 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
     """
     odds = log_odds(logits, label)
     is_of_class = labels == label
+    # The first axis is the image of the class, and the second the other image, shape (N, N).
     is_pair = is_of_class[:, None] & ~is_of_class
     losses = F.softplus(odds - odds[:, None]) * is_pair
     return losses.sum() / is_pair.sum().clamp(min=1)
@@ -181,15 +187,19 @@ def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
 def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
     """Return a mask of the predictions that agree with the labels.
 
+    A prediction agrees with a complementary label if it is another class than the one that the
+    image does not show, and none of the classes `absent`.
+
     Args:
         predicted: The predicted classes, int64, shape (N,).
         labels: The labels, int64, shape (N,).
         absent: Further classes that images of a complementary label do not show.
 
     Returns:
-        Whether each agrees, bool, shape (N,).
+        Mask of the predictions, bool, shape (N,).
     """
     is_complementary = labels < 0
+    # For a complementary label, a prediction of its class is wrong instead of right.
     right = (predicted == _class_of(labels)) != is_complementary
     for index in absent:
         right = right & (~is_complementary | (predicted != index))

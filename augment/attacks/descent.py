@@ -389,7 +389,15 @@ class Descent:
         )
 
     def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
-        """Return which candidates the next step starts from although they are unfinished, (N,)."""
+        """Return a mask of the candidates from which the next step may start, shape (N,).
+
+        Without backtracking, a step may start from every candidate. With backtracking, it may
+        start only from candidates with a lower cost than the accepted values.
+
+        Args:
+            state: State of the descent, with N active examples.
+            evaluation: Scores of their candidates.
+        """
         is_cheaper = evaluation.score.cost < state.cost[state.active_rows]
         if self.settings.backtracking:
             return is_cheaper
@@ -401,14 +409,18 @@ class Descent:
         state: State,
         evaluation: Evaluation,
     ) -> Tensor:
-        """Return which of the finished examples also lead by more than noise changes, shape (N,).
+        """Return a mask of the finished examples that also lead by more than noise changes.
 
         Args:
             is_finished: Mask of the examples that lead by the margin,
                 shape (N,).
             state: State of the descent.
             evaluation: Images of the N active examples.
+
+        Returns:
+            Mask, shape (N,).
         """
+        # Indices of the finished examples among the N active examples.
         chosen = is_finished.nonzero()[:, 0]
         rows = state.active_rows[chosen]
         state.result.queries[rows] += NOISE_DRAWS * evaluation.images.shape[1]
@@ -422,16 +434,21 @@ class Descent:
 
     @torch.no_grad()
     def _leads_over_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
-        """Return whether the views of examples lead by more than noise changes, shape (A,).
+        """Return a mask of the examples whose views all lead by more than noise changes.
 
-        The lead of a view is its logit gap. The smallest lead, with noise and
-        without, must be `AttackSettings.lead_over_noise` times the range of
-        these leads. The noise is not the one by which a success is counted.
+        The lead of a view is its logit gap. It is computed without noise and
+        with several draws of noise. The smallest of these leads must be at
+        least `AttackSettings.lead_over_noise` times the difference between the
+        largest and the smallest. Other noise decides later whether a success
+        counts.
 
         Args:
             images: Images of the A examples, shape (A, V, 3, H, W).
             examples: Indices of the examples in the problem, shape (A,).
             criterion: Source and target classes of the A examples.
+
+        Returns:
+            Mask, shape (A,).
         """
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
@@ -448,12 +465,16 @@ class Descent:
             logits = torch.cat([self.model(batch) for batch in batches])
             logits_of_views = logits.unflatten(0, version.shape[:2])
             leads.append(logit_gap(logits_of_views, criterion.source, criterion.target))
+        # Shape (A, V) each.
         smallest, largest = torch.stack(leads).aminmax(dim=0)
-        needed = self.settings.lead_over_noise * (largest - smallest)
-        return (smallest >= needed).all(1)
+        needed_lead = self.settings.lead_over_noise * (largest - smallest)
+        return (smallest >= needed_lead).all(1)
 
     def _step(self, state: State) -> None:
-        """Set the candidates of the active examples to one step from their accepted values."""
+        """Move each active example from its accepted values to a new candidate.
+
+        The state keeps the accepted values until the candidate is evaluated.
+        """
         active_rows = state.active_rows
         state.candidate[active_rows] = self.problem.take_step(
             values=state.values[active_rows],

@@ -11,9 +11,9 @@ from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import Ball, nearest_in_box
 
-# A convex set of values (D,), as a function that finds its nearest points to
-# values (A, D). The argument `within` is a ball in which they must lie, too, and
-# whose centers are in the set.
+# A convex set of vectors of D values, given as a function. The function takes values (A, D) and
+# returns the nearest points of the set, shape (A, D). Its argument `within` is a ball that must
+# contain these points, too. The center of the ball is in the set. An example is `unconstrained`.
 Domain = Callable[..., Tensor]
 
 
@@ -80,8 +80,9 @@ def scale_gradient(settings: StepSettings, gradient: Tensor) -> Tensor:
         return settings.step_size * gradient
     if settings.step == "sign":
         return settings.step_size * gradient.sign()
-    # Scaling by the largest entry first keeps tiny gradients from
-    # underflowing when squared.
+    # The step "unit" has the direction of the gradient and the length `step_size`. The
+    # gradient is first divided by its largest entry, because the squares of tiny entries
+    # would be rounded to zero.
     tiny = torch.finfo(gradient.dtype).tiny
     largest = gradient.abs().amax(1, keepdim=True)
     scaled = gradient / largest.clamp(min=tiny)
@@ -140,12 +141,23 @@ def sample(
 
 
 def _sample_unit_ball(shape: torch.Size, generator: torch.Generator, used: Tensor | None) -> Tensor:
-    """Draw points (A, D) uniformly from the unit ball of the L2 norm, along the used axes."""
+    """Draw points uniformly from the unit ball of the L2 norm.
+
+    Args:
+        shape: Shape (A, D) of the points.
+        generator: CPU generator of the random numbers.
+        used: Mask of the axes along which points are drawn, shape (A, D). Coordinates along
+            the other axes are 0. None for all axes.
+
+    Returns:
+        Points, shape (A, D).
+    """
     direction = torch.randn(shape, generator=generator)
     axis_count: int | Tensor = shape[1]
     if used is not None:
         direction = direction * used
         axis_count = used.sum(1, keepdim=True)
-    # The volume within a distance grows with its power of the number of axes.
+    # With n axes, a ball of radius r has r^n of the volume of the unit ball. The distance of a
+    # uniformly drawn point is therefore the n-th root of a uniform number in [0, 1].
     distance = torch.rand(shape[0], 1, generator=generator) ** (1 / axis_count)
     return direction / direction.norm(dim=1, keepdim=True) * distance

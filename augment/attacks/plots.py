@@ -11,8 +11,9 @@ from torch import Tensor
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Number of classes whose probabilities are drawn, the most probable ones.
+# Largest number of classes in the bar chart of a figure. The most probable classes are drawn.
 SHOWN_CLASSES = 5
+# Colors of the bars of the probabilities before and after the attack.
 BEFORE_COLOR = "#4c78a8"
 AFTER_COLOR = "#e45756"
 
@@ -64,9 +65,17 @@ def _most_probable(probabilities: Tensor, classes: Sequence[str]) -> str:
 
 
 def _draw_probabilities(axes: Axes, before: Tensor, after: Tensor, classes: Sequence[str]) -> None:
-    """Draw the probabilities of the most probable classes as bars."""
+    """Draw the probabilities of the most probable classes as pairs of bars.
+
+    Args:
+        axes: Part of the figure to draw in.
+        before: Probability of each class before the attack, shape (C,).
+        after: Probability of each class after the attack, shape (C,).
+        classes: Names of the C classes.
+    """
     shown_count = min(SHOWN_CLASSES, len(classes))
-    # The larger of the two probabilities ranks a class. Bars start at the bottom.
+    # Classes are ordered by the larger of their two probabilities. `flip` puts the most probable
+    # class last, because matplotlib draws bars from the bottom to the top.
     ranked = before.maximum(after).topk(shown_count).indices.flip(0)
     names = [classes[index] for index in ranked.tolist()]
     above = [row + 0.2 for row in range(shown_count)]

@@ -26,15 +26,16 @@ SHRINKAGE = GROWTH**-0.25
 
 @dataclass(frozen=True)
 class RandomSearch(GradientFree):
-    """Random search against one classifier, see the module."""
+    """Random search against one classifier, as the docstring of the module describes it."""
 
     def _step(self, state: State) -> None:
         """Set the candidates of the active examples to random changes of their accepted values."""
         rows = state.active_rows
         examples = state.examples[rows]
-        scale = state.length[rows] * self.problem.search_scale(examples)
-        direction = self._draw_normal(state, count=1)[:, 0]
-        moved = state.values[rows] + scale * direction
+        # Standard deviation of each change, shape (N, D) for N active examples.
+        deviation = state.length[rows] * self.problem.search_scale(examples)
+        normal_numbers = self._draw_normal(state, count=1)[:, 0]
+        moved = state.values[rows] + deviation * normal_numbers
         state.candidate[rows] = self.problem.project(moved, examples)
         state.result.steps[rows] += 1
 

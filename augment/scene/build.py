@@ -196,7 +196,15 @@ def _as_meshes(meshes: object) -> list[Any]:
 def _load_member(
     member: ObjectSettings | tuple[MeshSource, str | int], vertices: int
 ) -> SceneObject:
-    """Load a member of `meshes`, subdivided until it has more than a number of vertices."""
+    """Load an object from a member of the argument `meshes` of `build_scene`.
+
+    Args:
+        member: Settings of the object, or a pair of a mesh and a label.
+        vertices: The mesh is subdivided until it has more vertices than this number.
+
+    Returns:
+        The object.
+    """
     if isinstance(member, ObjectSettings):
         return load_object(member, vertices)
     mesh, label = member
@@ -206,7 +214,19 @@ def _load_member(
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
-    """Check the cameras of `build_scene`, and return them as a list, which is empty for None."""
+    """Check the arguments of `build_scene` about cameras.
+
+    Args:
+        cameras: Cameras that the user gave, or None.
+        views: Number of views.
+        normalize: Whether each mesh is moved and scaled to span [-1, 1].
+
+    Returns:
+        The cameras with numbers as fields. The list is empty for None.
+
+    Raises:
+        InputError: If the arguments do not fit each other.
+    """
     if cameras is None:
         if not normalize:
             raise InputError(
