@@ -77,7 +77,10 @@ class Criterion:
         """Return the criterion of some of the examples.
 
         Args:
-            examples: Indices of the examples, shape (A,), or a slice.
+            examples: Indices of the A examples, shape (A,), or a slice.
+
+        Returns:
+            Source and target classes of the A examples.
         """
         if self.target is None:
             return Criterion(self.source[examples])
@@ -147,7 +150,7 @@ class DescentResult:
         tensors of this result.
 
         Args:
-            example_count: Number of examples, that is, of rows of each tensor.
+            example_count: Number of examples. Each tensor has one row for each example.
         """
         tensors = {}
         for item in fields(self):
@@ -628,10 +631,14 @@ class State:
         )
 
     def begin_result(self, evaluation: Evaluation) -> None:
-        """Set `result` from the evaluation of the initial values, with 0 steps and no success.
+        """Create `result` from the evaluation of the initial values.
 
-        All A examples are still active here. `record` then decides about the
-        initial values as about every candidate.
+        The result has 0 steps and no success. All A examples are still active
+        here. `record` then decides about the initial values as about every
+        candidate.
+
+        Args:
+            evaluation: Evaluation of the initial values of the A examples.
         """
         zeros = torch.zeros_like(self.active_rows)
         self.result = DescentResult(

@@ -102,7 +102,7 @@ class NetworkCall:
         try:
             logits = network(images)
         except Exception as error:
-            # Callers of the library handle these two kinds of errors themselves.
+            # `BatchSize` needs errors of memory as they are, and an `InputError` is clear already.
             if isinstance(error, InputError) or is_out_of_memory(error):
                 raise
             raise InputError(self._failure(network, images, error)) from error
@@ -532,8 +532,8 @@ class AnyFunction(Wrapper):
                 return scores
         except Exception as error:  # Users' functions raise errors of many kinds.
             failure = error
-        # The function failed on a tensor with gradients, or returned no tensor. It may take
-        # arrays of NumPy, or take tensors without gradients and return arrays.
+        # The function failed on a tensor, or returned no tensor. It may take arrays of NumPy.
+        # Or it may take tensors that are cut from the gradient, and return arrays.
         for takes_tensors in (False, True):
             converted = ArrayFunction(self.network, takes_tensors)
             with suppress(Exception):

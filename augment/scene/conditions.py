@@ -14,8 +14,10 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# The fields of `Conditions` that have a value for each vertex, or for each face of a mesh.
+# Names of the fields of `Conditions` that have a row for each vertex of a mesh. `Conditions.row`
+# cuts them to the vertices of one mesh.
 OF_VERTICES = ("vertices",)
+# Names of the fields that have a row for each face.
 OF_FACES = ("albedo", "gloss", "hue")
 
 
@@ -40,17 +42,18 @@ class Example:
 class Conditions:
     """Light, shape and colors with which A examples are rendered.
 
-    N and F are the numbers of vertices and faces of the largest mesh. A smaller mesh has the
-    first rows of them.
+    N and F are the numbers of vertices and faces of the largest mesh of the scene. A smaller mesh
+    uses only the first rows. A field that is None leaves the scene as it is.
 
     Attributes:
         light: The coefficients of the scene's basis, shape (A, coefficients, 3).
         vertices: The vertices, shape (A, N, 3). None for those of the meshes.
-        albedo: What is added to the linear albedo of each face, shape (A, F, 3).
-        pixels: What is added to the values of the V images, shape (A, V, 3, size, size).
+        albedo: Linear RGB that is added to the albedo of each face, shape (A, F, 3).
+        pixels: Offsets that are added to the pixel values of the V images, shape
+            (A, V, 3, size, size).
         positions: The positions of the L lamps, shape (A, L, 3). None for those of the basis.
-        cameras: What is added to the polar angle, the azimuth (in degrees) and the logarithm of
-            the distance of all V cameras, shape (A, 3).
+        cameras: Changes of the polar angle and the azimuth (in degrees) and of the logarithm of
+            the distance. All V cameras of an example are changed alike, shape (A, 3).
         gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
             faces, shape (A, 1, 3). Textures of gloss multiply them.
         hue: The angle in degrees by which the hue of a changed albedo is turned, shape (A, F).
@@ -74,8 +77,8 @@ class Conditions:
         """Return the conditions of one example, without the first dimension.
 
         Args:
-            index: The row.
-            mesh: The mesh of the example, whose vertices and faces are kept.
+            index: The row of the example in the conditions.
+            mesh: The mesh of the example. Rows beyond its vertices and faces are left out.
 
         Returns:
             The conditions.
