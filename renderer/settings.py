@@ -355,8 +355,11 @@ def _check_pair(name: str, value: Any, facts: Facts) -> None:
     maximum = math.inf if facts.maximum is None else facts.maximum
     if len(value) == 2 and minimum <= value[0] <= value[1] <= maximum:
         return
-    expected = f"give [minimum, maximum], both from {minimum:g} to {maximum:g}"
-    raise InputError(f"{name}={list(value)} is no range: {expected}", name)
+    raise InputError(
+        f"{name}={list(value)} is no range: "
+        f"give [minimum, maximum], both from {minimum:g} to {maximum:g}",
+        name,
+    )
 
 
 def require_field_types(settings: Any, *unchecked: str) -> None:

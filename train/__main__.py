@@ -24,8 +24,10 @@ class TrainCommand(Command):
             return
         with self.one_line():
             if "TORCHELASTIC_RUN_ID" in os.environ:
-                advice = "start a sweep with pnb-train --multirun"
-                raise InputError(f"torchrun trains one run in several processes: {advice}")
+                raise InputError(
+                    "torchrun trains one run in several processes: "
+                    "start a sweep with pnb-train --multirun",
+                )
             words = self.words(take_flag(sys.argv[1:]))
             import_function("train.commands.sweep:sweep")(super().__call__, words)
 

@@ -153,8 +153,11 @@ def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> s
     """
     found = classes_of_meshes(items, classes, key)
     if len(set(found)) != 1:
-        fault = f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}"
-        raise InputError(f"{fault}: give the meshes of one class, or label=CLASS", "label")
+        raise InputError(
+            f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}: "
+            "give the meshes of one class, or label=CLASS",
+            "label",
+        )
     return found[0]
 
 

@@ -131,8 +131,10 @@ class Command:
         """Put the words of the command line into the form that Hydra reads."""
         for argument in arguments:
             if argument in SWEEP_FLAGS and not self.sweeps:
-                advice = "give settings as key=value; --help shows them"
-                raise InputError(f"{argument} is not an option of this command: {advice}")
+                raise InputError(
+                    f"{argument} is not an option of this command: "
+                    "give settings as key=value; --help shows them",
+                )
         # Hydra's parser of options wants --multirun before the settings.
         words = sorted(arguments, key=lambda word: word not in SWEEP_FLAGS)
         keys = self.keys

@@ -215,17 +215,23 @@ class AttackExperimentSettings(ClassifierSettings):
         super().__post_init__()
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
-            expected = "give a class, least_likely, or a list of classes, one per view"
-            raise InputError(f"target: {expected}", "target")
+            raise InputError(
+                "target: give a class, least_likely, or a list of classes, one per view",
+                "target",
+            )
         if isinstance(self.target, int | float):  # a class whose name is a number
             self.target = str(self.target)
         attacked = self.attack.parameters
         if (self.attack.relighting is None) != (self.photographs is None):
-            advice = "set both, or neither"
-            raise InputError(f"attack=relighting and photographs belong together: {advice}")
+            raise InputError(
+                "attack=relighting and photographs belong together: set both, or neither",
+            )
         if self.photographs is not None and (attacked or self.reload):
-            remedy = "attack meshes in a command of their own"
-            raise InputError(f"attack=relighting attacks photographs alone: {remedy}", "attack")
+            raise InputError(
+                "attack=relighting attacks photographs alone: "
+                "attack meshes in a command of their own",
+                "attack",
+            )
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if name in attacked and getattr(self.scene, name) is None:
                 setattr(self.scene, name, kind())
@@ -339,11 +345,15 @@ class LabSettings(Settings):
             raise InputError(f"patterns has {SLIDES}: name image files in slides=", "patterns")
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
-            expected = f"must be a multiple of the {len(sources)} patterns and maps"
-            raise InputError(f"setups={self.setups} {expected}", "setups")
+            raise InputError(
+                f"setups={self.setups} must be a multiple of the {len(sources)} patterns and maps",
+                "setups",
+            )
         if len(set(sources)) < len(sources):
-            expected = "must have different names, which are the renders' sources"
-            raise InputError(f"patterns and environments {expected}")
+            raise InputError(
+                "patterns and environments "
+                "must have different names, which are the renders' sources",
+            )
 
 
 @dataclass
@@ -406,8 +416,11 @@ class AuditSettings(ClassifierSettings):
             if getattr(self, key) and not self.meshes:
                 raise InputError(f"{key} is for an audit of meshes: set meshes, too", key)
         if self.laboratory and self.hard_negatives:
-            instead = f"hard_negatives are rendered instead of laboratory={self.laboratory}"
-            raise InputError(f"{instead}: leave one of them out", "hard_negatives")
+            raise InputError(
+                f"hard_negatives are rendered instead of laboratory={self.laboratory}: "
+                "leave one of them out",
+                "hard_negatives",
+            )
 
     def scale(self, count: int) -> int:
         """Multiply a count by the budget. The result is at least 1."""
@@ -429,13 +442,17 @@ class CompareSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.runs:
-            remedy = "give the folders of one run or more, as in runs=[runs/a,runs/b]"
-            raise InputError(f"runs is empty: {remedy}", "runs")
+            raise InputError(
+                "runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]",
+                "runs",
+            )
         folders = [Path(run).resolve() for run in self.runs]
         for run, folder in zip(self.runs, folders, strict=True):
             if folders.count(folder) > 1:
-                fault = f"runs names {run} twice, as if it were another seed"
-                raise InputError(f"{fault}: name each run once", "runs")
+                raise InputError(
+                    f"runs names {run} twice, as if it were another seed: name each run once",
+                    "runs",
+                )
 
 
 @dataclass
@@ -487,8 +504,11 @@ class EvaluateSettings(ClassifierSettings):
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
         if self.classifier and self.model:
-            remedy = "leave it out, since a classifier has its own"
-            raise InputError(f"model={self.model} is for run=FOLDER: {remedy}", "model")
+            raise InputError(
+                f"model={self.model} is for run=FOLDER: "
+                "leave it out, since a classifier has its own",
+                "model",
+            )
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:

@@ -265,8 +265,10 @@ def build_network(
     elif name.startswith(TORCHVISION):
         require_architecture(name.removeprefix(TORCHVISION))
     else:
-        choices = f"{WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
-        raise InputError(f"name={name}: choose {choices}", "name")
+        raise InputError(
+            f"name={name}: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION",
+            "name",
+        )
     # An architecture can refuse a size in many ways.
     try:
         if network is None:
@@ -275,8 +277,10 @@ def build_network(
         _require_logits(network, len(classes), size)
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         task = f"{len(classes)} logits for images of {size} pixels per side"
-        fault = f"name={name} does not give {task} ({single_line(error)})"
-        raise InputError(f"{fault}: choose another", "name") from error
+        raise InputError(
+            f"name={name} does not give {task} ({single_line(error)}): choose another",
+            "name",
+        ) from error
     return network
 
 
@@ -297,11 +301,17 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     if not isinstance(network, nn.Module):
         raise InputError(f"name={name} returns no torch.nn.Module, which training needs", "name")
     if own_size != size:
-        given = f"images of {own_size} pixels per side"
-        raise InputError(f"name={name} is for {given}, and the data has {size}", "name")
+        raise InputError(
+            f"name={name} is for images of {own_size} pixels per side, and the data has {size}",
+            "name",
+        )
     if list(own_classes) != list(classes):
-        fault = "has other classes than the data, or in another order"
-        raise InputError(f"name={name} {fault}: {classes[0]!r} first", "name")
+        raise InputError(
+            f"name={name} "
+            "has other classes than the data, or in another order: "
+            f"{classes[0]!r} first",
+            "name",
+        )
     return network
 
 

@@ -345,18 +345,26 @@ class TrainSettings(Settings):
 
     def __post_init__(self) -> None:
         if self.init_from == "":
-            remedy = "give a run folder, or torchvision:NAME with weights=FILE"
-            raise InputError(f"init_from is not set: {remedy}", "init_from")
+            raise InputError(
+                "init_from is not set: give a run folder, or torchvision:NAME with weights=FILE",
+                "init_from",
+            )
         super().__post_init__()
         if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
-            needed = "distillation_weight, soup and eval_mode need a network to begin with"
-            raise InputError(f"{needed}: set init_from")
+            raise InputError(
+                "distillation_weight, soup and eval_mode need a network to begin with: "
+                "set init_from",
+            )
         if (self.consistency_weight or self.interpolate) and not self.init_from:
-            needed = "consistency_weight and interpolate need a network to begin with"
-            raise InputError(f"{needed}: set init_from")
+            raise InputError(
+                "consistency_weight and interpolate need a network to begin with: set init_from",
+            )
         if self.relight_steps and not self.consistency_weight:
-            needed = "relight_steps attacks the predictions of the network init_from"
-            raise InputError(f"{needed}: set consistency_weight", "relight_steps")
+            raise InputError(
+                "relight_steps attacks the predictions of the network init_from: "
+                "set consistency_weight",
+                "relight_steps",
+            )
 
 
 @dataclass
@@ -386,20 +394,26 @@ class EvaluationSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
-            expected = f"must be a multiple of the {KEPT_ASIDE_PATTERNS} patterns"
             raise InputError(
-                f"laboratory_setups={self.laboratory_setups} {expected}", "laboratory_setups"
+                f"laboratory_setups={self.laboratory_setups} "
+                f"must be a multiple of the {KEPT_ASIDE_PATTERNS} patterns",
+                "laboratory_setups",
             )
         photos = self.photos
         is_mapping = isinstance(photos, dict)
         is_mapping = is_mapping and all(isinstance(folder, str) for folder in photos.values())
         if not (photos is None or isinstance(photos, str) or is_mapping):
-            expected = "must be a folder, or a mapping of names to folders"
-            raise InputError(f"photos={photos} {expected}", "photos")
+            raise InputError(
+                f"photos={photos} must be a folder, or a mapping of names to folders",
+                "photos",
+            )
         for name in self.folders:
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                expected = f"a name of letters, digits, _ and -, not one of {RESERVED}"
-                raise InputError(f"photos: {name} must be {expected}", "photos")
+                raise InputError(
+                    f"photos: {name} must be "
+                    f"a name of letters, digits, _ and -, not one of {RESERVED}",
+                    "photos",
+                )
 
     @property
     def folders(self) -> dict[str, Path]:
@@ -517,8 +531,11 @@ class ExperimentSettings(NetworkSettings):
         self._remove_generated_positives()
         if self.augment.renders and self.augment.mode != "folder":
             if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
-                remedy = "an attack on the pose needs renderer.silhouettes=true"
-                raise InputError(f"renderer.silhouettes=false: {remedy}", "renderer.silhouettes")
+                raise InputError(
+                    "renderer.silhouettes=false: "
+                    "an attack on the pose needs renderer.silhouettes=true",
+                    "renderer.silhouettes",
+                )
             backgrounds = len(self.scene.backgrounds)
             self.augment.examples = self.views * self.scene.objects * backgrounds
             product = "meshes × views × backgrounds"
@@ -570,13 +587,17 @@ class ExperimentSettings(NetworkSettings):
         for key, item in (meshes | negatives).items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
-                remedy = f"give {{mesh: {item.mesh}, label: CLASS}}"
-                raise InputError(f"{key} must name its class: {remedy}", key)
+                raise InputError(
+                    f"{key} must name its class: give {{mesh: {item.mesh}, label: CLASS}}",
+                    key,
+                )
         named = {item.label for item in (*meshes.values(), *negatives.values())}
         missing = set(labels) - named
         if missing and len(labels) > 1:
-            fault = f"label={self.label} has no mesh of {min(missing)}"
-            raise InputError(f"{fault}: name one in scene.meshes", "label")
+            raise InputError(
+                f"label={self.label} has no mesh of {min(missing)}: name one in scene.meshes",
+                "label",
+            )
         return meshes | negatives
 
 
@@ -667,8 +688,10 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
             raise InputError(f"label holds {describe(name)}: give {expected}", "label")
     names = [str(name) for name in listed]
     if not names or len(set(names)) < len(names):
-        given = f"label=[{', '.join(names)}]"
-        raise InputError(f"{given} must name a class, or several, each once", "label")
+        raise InputError(
+            f"label=[{', '.join(names)}] must name a class, or several, each once",
+            "label",
+        )
     return names
 
 

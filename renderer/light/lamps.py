@@ -107,9 +107,9 @@ class Lamps(LocalBasis):
         lamps = cls(positions, settings.power, settings.radius)
         # The comparison is also False for NaN.
         if not ((start >= 0) & (start <= settings.power)).all():
-            limit = f"power={settings.power:g}"
             raise InputError(
-                f"start={settings.start} is out of range: give coefficients from 0 to {limit}"
+                f"start={settings.start} is out of range: give coefficients from 0 to "
+                f"power={settings.power:g}",
             )
         return lamps, lamps.project_nonnegative(start)
 

@@ -129,9 +129,9 @@ def load_light(
         map_degree = DEGREE if degree is None else degree
         coefficients = _read_light_map(Path(light), map_degree, roughness)
     else:
-        files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
         raise InputError(
-            f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}"
+            f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or "
+            f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)",
         )
     # A higher degree appends zeros. A lower degree may only remove zeros.
     size = len(coefficients) if degree is None else Harmonics(degree).size

@@ -352,8 +352,11 @@ def _attack_adversary(
             scene.
     """
     if adversary.pixels is not None:
-        fault = "an attack cannot continue from changed pixels"
-        raise InputError(f"reload={settings.reload}: {fault}: leave attack= out")
+        raise InputError(
+            f"reload={settings.reload}: "
+            "an attack cannot continue from changed pixels: "
+            "leave attack= out",
+        )
     scene = adversary.scene(_start_rasterizer(settings), device)
     result = attack(
         classifier,
@@ -487,8 +490,9 @@ def _load_classifier(item: Any) -> Classifier:
     named = item if isinstance(item, dict) else {"classifier": item}
     for key in named:
         if key not in ("classifier", "weights"):
-            advice = "give names, or {classifier, weights}"
-            raise InputError(f"transfer.classifiers: {key} is not known: {advice}")
+            raise InputError(
+                f"transfer.classifiers: {key} is not known: give names, or {{classifier, weights}}",
+            )
     with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
         return load_network(str(named.get("classifier")), named.get("weights"))
 

@@ -238,8 +238,9 @@ def read_mask(path: str, image: np.ndarray) -> np.ndarray:
     if mask.shape != image.shape[:2]:
         given = _format_size(mask)
         expected = _format_size(image)
-        advice = f"give one of the photograph's size, {expected}"
-        raise InputError(f"mask={path} has {given} pixels: {advice}")
+        raise InputError(
+            f"mask={path} has {given} pixels: give one of the photograph's size, {expected}",
+        )
     return mask
 
 
@@ -266,12 +267,14 @@ def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
-        advice = "pip install opencv-python-headless, or give mask=FILE"
-        raise InputError(f"box= needs OpenCV: {advice}") from error
+        raise InputError(
+            "box= needs OpenCV: pip install opencv-python-headless, or give mask=FILE",
+        ) from error
     height, width = image.shape[:2]
     if not _is_box_within(box, height, width):
-        expected = f"[left, top, right, bottom] within {width} × {height} pixels"
-        raise InputError(f"box={box} is not {expected}")
+        raise InputError(
+            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels",
+        )
     left, top, right, bottom = box
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)

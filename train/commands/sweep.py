@@ -125,8 +125,10 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
         if key == "run":
             raise InputError("run= names the folder of a single run: name a sweep's with sweep=")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
-            fault = "launcher=slurm needs Slurm's sbatch, which is missing"
-            raise InputError(f"{fault}: start the sweep on the cluster")
+            raise InputError(
+                "launcher=slurm needs Slurm's sbatch, which is missing: "
+                "start the sweep on the cluster",
+            )
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
         else:

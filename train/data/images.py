@@ -118,8 +118,10 @@ class ImageFiles:
             broken |= faults
             if broken and not self.skip:
                 path, fault = next(iter(broken.items()))
-                advice = "replace it, or set skip_unreadable=True"
-                raise InputError(f"{self.folder / path} cannot be read ({fault}): {advice}")
+                raise InputError(
+                    f"{self.folder / path} cannot be read ({fault}): "
+                    "replace it, or set skip_unreadable=True",
+                )
             yield images
         if broken:
             first = next(iter(broken))

@@ -133,8 +133,10 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     paths, files = _image_files(folder)
     has_class_folders = _has_class_folders(folder, paths, classes, labels)
     if len(labels) > 1 and not has_class_folders:
-        problem = f"{folder} has no class folders, and label names several classes"
-        raise InputError(f"{problem}: put its images into some")
+        raise InputError(
+            f"{folder} has no class folders, and label names several classes: "
+            "put its images into some",
+        )
     rows = _read_table(folder / TABLE)
     _require_files_of_rows(folder / TABLE, rows, files, paths[0])
 
@@ -147,8 +149,9 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     named = {name for item in photographs for name in item.hard_negatives}
     if named - known:
         source = min(named - known)
-        problem = f"names hard_negatives of source {source!r}, which has no image"
-        raise InputError(f"{folder / TABLE} {problem}")
+        raise InputError(
+            f"{folder / TABLE} names hard_negatives of source {source!r}, which has no image",
+        )
     return photographs
 
 
@@ -234,8 +237,9 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     files = list(_files(folder))
     paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     if not paths:
-        advice = f"put some there ({', '.join(SUFFIXES)})"
-        raise InputError(f"{folder} holds no photographs: {advice}")
+        raise InputError(
+            f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})",
+        )
     return paths, files
 
 
@@ -319,9 +323,11 @@ def _has_class_folders(
         # If `others` has all names, no folder is named after a class.
         if others == names or any(_is_like(name, label) for label in labels):
             suggestions = nearest(name, classes)
-            problem = f"is not named after a class of the model (such as {suggestions})"
-            advice = f"rename it, to {OTHER_PREFIX}{name} if it shows hard negatives"
-            raise InputError(f"{folder / name} {problem}: {advice}")
+            raise InputError(
+                f"{folder / name} "
+                f"is not named after a class of the model (such as {suggestions}): "
+                f"rename it, to {OTHER_PREFIX}{name} if it shows hard negatives",
+            )
     if others:
         count = f"{len(others)} of {len(names)} folders in {folder}"
         shown = ", ".join(others)
@@ -330,8 +336,9 @@ def _has_class_folders(
         )
     loose = [path for path in paths if len(path.parts) == 1]
     if names and loose:
-        problem = f"{folder / loose[0]} lies beside class folders"
-        raise InputError(f"{problem}: move it into the folder of its class")
+        raise InputError(
+            f"{folder / loose[0]} lies beside class folders: move it into the folder of its class",
+        )
     return bool(names)
 
 
@@ -368,8 +375,10 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
         columns = "the columns path and source_tag, separated by commas"
-        advice = f"make it UTF-8 with {columns}, and a row per file"
-        raise InputError(f"{table} cannot be used ({single_line(error)}): {advice}") from error
+        raise InputError(
+            f"{table} cannot be used ({single_line(error)}): "
+            f"make it UTF-8 with {columns}, and a row per file",
+        ) from error
     return rows
 
 
@@ -428,10 +437,11 @@ def load_photographs(
             broken.append((photograph.path, error))
     if broken and not (readable and skip_unreadable):
         path, error = broken[0]
-        counts = f"{len(broken)} of {len(photographs)} photographs cannot be read"
-        first = f"the first being {folder / path} ({error})"
-        remedy = f"replace them{advice if readable else ''}"
-        raise InputError(f"{counts}, {first}: {remedy}")
+        raise InputError(
+            f"{len(broken)} of {len(photographs)} photographs cannot be read, "
+            f"the first being {folder / path} ({error}): "
+            f"replace them{advice if readable else ''}",
+        )
     if broken:
         images = images[readable]
     return [photographs[row] for row in readable], images, [str(path) for path, _ in broken]

@@ -150,8 +150,12 @@ def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fra
         members = torch.nonzero(split.labels == label).squeeze(1)
         count = round(fraction * len(members))
         if not 0 < count < len(members):
-            images = f"class {int(label)}, {len(members)} images"
-            raise InputError(f"{argument}={fraction} of {images}, is all or nothing", argument)
+            raise InputError(
+                f"{argument}={fraction} of "
+                f"class {int(label)}, {len(members)} images, "
+                "is all or nothing",
+                argument,
+            )
         order = torch.randperm(len(members), generator=draws)
         is_held_out[members[order[:count]]] = True
     return is_held_out
@@ -200,8 +204,10 @@ def load_cifar100(path: str) -> DataSet:
         train = CIFAR100(path, train=True, download=True)
         test = CIFAR100(path, train=False, download=True)
     except (OSError, RuntimeError) as error:
-        problem = "CIFAR-100 is not there and cannot be downloaded"
-        raise InputError(f"path={path}: {problem} ({error})", "path") from error
+        raise InputError(
+            f"path={path}: CIFAR-100 is not there and cannot be downloaded ({error})",
+            "path",
+        ) from error
     splits = []
     for part in (train, test):
         images = torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous()
@@ -231,8 +237,10 @@ def load_npz(path: str) -> DataSet:
             return _read_npz(archive)
     # zipfile, zlib and NumPy raise many kinds of errors for a damaged or foreign file.
     except Exception as error:
-        problem = f"is not an .npz file of labeled images: {single_line(error)}"
-        raise InputError(f"path={path} {problem}", "path") from error
+        raise InputError(
+            f"path={path} is not an .npz file of labeled images: {single_line(error)}",
+            "path",
+        ) from error
 
 
 def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
@@ -309,17 +317,23 @@ def load_folder(
     """
     root = Path(path)
     if not root.is_dir():
-        advice = "give a folder with one folder of images per class"
-        raise InputError(f"path={path} is not a folder: {advice}", "path")
+        raise InputError(
+            f"path={path} is not a folder: give a folder with one folder of images per class",
+            "path",
+        )
     parts = [name for name in folder_names(root) if name.lower() in PARTS]
     if parts not in ([], ["test", "train"]):
-        advice = "divide it into train and test, or not at all"
-        raise InputError(f"path={path} holds {', '.join(parts)}: {advice}", "path")
+        raise InputError(
+            f"path={path} holds {', '.join(parts)}: divide it into train and test, or not at all",
+            "path",
+        )
     train_root = root / "train" if parts else root
     classes = tuple(folder_names(train_root))
     if len(classes) < 2:
-        fault = f"path={path} holds {len(classes)} class folders"
-        raise InputError(f"{fault}: it needs two or more", "path")
+        raise InputError(
+            f"path={path} holds {len(classes)} class folders: it needs two or more",
+            "path",
+        )
     unread = unsupported_files(root)
     if unread:
         shown = ", ".join(map(str, unread[:3]))

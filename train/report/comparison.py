@@ -168,8 +168,9 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
     unknown = set(names) - sources
     if unknown:
         known = ", ".join(sorted(filter(None, sources)))
-        problem = f"exclude: no photograph is of source {min(unknown)!r}"
-        raise InputError(f"{problem}; the sources are {known}")
+        raise InputError(
+            f"exclude: no photograph is of source {min(unknown)!r}; the sources are {known}",
+        )
 
 
 def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate | None:
@@ -595,11 +596,15 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
         first, second = (next(iter(group.values()))[0].folder for group in found[:2])
-        problem = f"{second} has other photographs or sources than {first}"
-        raise InputError(f"{problem}: score both networks on the same folder with pnb-evaluate")
+        raise InputError(
+            f"{second} has other photographs or sources than {first}: "
+            "score both networks on the same folder with pnb-evaluate",
+        )
     if not found and photographs != PHOTOGRAPHS:
-        problem = f"photographs={photographs}: no run has a sub-folder of that name"
-        raise InputError(f"{problem} with the files of an evaluation")
+        raise InputError(
+            f"photographs={photographs}: no run has a sub-folder of that name "
+            "with the files of an evaluation",
+        )
     return found[0] if found else None
 
 

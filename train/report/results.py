@@ -58,15 +58,17 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
     if overwrite or not path.exists():
         return
     if not path.is_dir():
-        advice = "choose another file, or set overwrite=true to replace it"
-        raise InputError(f"{key}={path} exists: {advice}")
+        raise InputError(
+            f"{key}={path} exists: choose another file, or set overwrite=true to replace it",
+        )
     for pattern in RESULTS:
         found = None if pattern in own else next(path.glob(pattern), None)
         if found:
             name = found.relative_to(path)
-            fault = f"{key}={path} holds results of an earlier command ({name})"
-            advice = "choose another folder, or set overwrite=true to write over them"
-            raise InputError(f"{fault}: {advice}")
+            raise InputError(
+                f"{key}={path} holds results of an earlier command ({name}): "
+                "choose another folder, or set overwrite=true to write over them",
+            )
 
 
 def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> None:

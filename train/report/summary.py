@@ -235,11 +235,13 @@ def summarize(folder: Path) -> RunSummary:
         # Entries may be missing or of any type.
         files = f"{CONFIG}, {run_log.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {single_line(error)}"
-        problem = f"{folder}: {files} is not as `pnb-train` wrote it ({reason})"
-        raise InputError(f"{problem}: use another run") from error
+        raise InputError(
+            f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run",
+        ) from error
     if summary is None:
-        remedy = "let it finish, or resume it"
-        raise InputError(f"{folder} holds no finished run: {remedy}")
+        raise InputError(
+            f"{folder} holds no finished run: let it finish, or resume it",
+        )
     return summary
 
 
@@ -691,8 +693,9 @@ def read_attack(folder: Path) -> AttackSummary:
         )
     except Exception as error:
         # JSON of any depth and type raises errors of many kinds.
-        problem = f"{path} is damaged or was written by no attack"
-        raise InputError(f"{problem} ({single_line(error)})") from error
+        raise InputError(
+            f"{path} is damaged or was written by no attack ({single_line(error)})",
+        ) from error
 
 
 def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
@@ -800,8 +803,9 @@ def find(folders: Sequence[Path]) -> Findings:
     """
     for folder in folders:
         if not folder.is_dir():
-            remedy = "give those of runs, of a sweep or of attacks"
-            raise InputError(f"runs: {folder} is not a folder: {remedy}")
+            raise InputError(
+                f"runs: {folder} is not a folder: give those of runs, of a sweep or of attacks",
+            )
     paths = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
     if not paths:
         names = ", ".join(map(str, folders))

@@ -59,8 +59,9 @@ def load(path: Path) -> dict[str, Any]:
             raise ValueError("its content does not match its hash")
     except Exception as error:
         # torch raises errors of many types if a file is damaged or no checkpoint.
-        problem = f"checkpoint {path} is damaged or not a checkpoint"
-        raise InputError(f"{problem}: use another checkpoint of the run") from error
+        raise InputError(
+            f"checkpoint {path} is damaged or not a checkpoint: use another checkpoint of the run",
+        ) from error
     return checked(state, path)
 
 
@@ -81,11 +82,13 @@ def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
         version = state["architecture"].get("version", 1)
         finite = all(value.isfinite().all() for value in state["model"].values())
     except (LookupError, AttributeError) as error:
-        problem = f"checkpoint {path} has no architecture or weights"
-        raise InputError(f"{problem}: use another one") from error
+        raise InputError(
+            f"checkpoint {path} has no architecture or weights: use another one",
+        ) from error
     if version not in range(VERSION + 1):
-        problem = f"checkpoint {path} was written by a later version ({version!r})"
-        raise InputError(f"{problem}: install that version")
+        raise InputError(
+            f"checkpoint {path} was written by a later version ({version!r}): install that version",
+        )
     if not finite:
         raise InputError(f"checkpoint {path} has NaN or infinity in its weights: use another one")
     return state

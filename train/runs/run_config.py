@@ -56,8 +56,9 @@ def opened_text(path: Path) -> Iterator[str]:
             raise ValueError("there is no such file")
         yield path.read_text(encoding="utf-8")
     except Exception as error:
-        fault = f"{path} is damaged or of another kind ({single_line(error)})"
-        raise InputError(f"{fault}: use another run") from error
+        raise InputError(
+            f"{path} is damaged or of another kind ({single_line(error)}): use another run",
+        ) from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -234,8 +235,10 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
     if (folder / CONFIG).is_file():
         saved = OmegaConf.to_container(read_config(folder / CONFIG))
     if not isinstance(saved.get("train"), dict) or not isinstance(saved.get("run"), str):
-        fault = f"run={config.run} holds no run to resume"
-        raise InputError(f"{fault}: give the folder of one, or leave train.resume out")
+        raise InputError(
+            f"run={config.run} holds no run to resume: "
+            "give the folder of one, or leave train.resume out",
+        )
     names = [item.name for item in fields(ExperimentSettings)]
     settings = {name: saved[name] for name in names if name in saved}
     # The baselines of a run lie in folders below it. Their settings name the
@@ -313,13 +316,17 @@ def require_same(
         old = before.get(key)
         new = asked.get(key)
         if old != new and not permitted(key, old, new):
-            fault = f"{folder} was made with {key}={old}, not {new}"
-            raise InputError(f"{fault}: give its setting, or another folder with {elsewhere}")
+            raise InputError(
+                f"{folder} was made with {key}={old}, not {new}: "
+                f"give its setting, or another folder with {elsewhere}",
+            )
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
-            fault = f"{path} has changed since {folder} began"
-            raise InputError(f"{fault}: put it back, or start in another folder with {elsewhere}")
+            raise InputError(
+                f"{path} has changed since {folder} began: "
+                f"put it back, or start in another folder with {elsewhere}",
+            )
     return config
 
 

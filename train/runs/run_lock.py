@@ -57,8 +57,10 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
-                fault = f"{key}={folder} is being written by another process"
-                raise InputError(f"{fault}: wait, or choose another folder")
+                raise InputError(
+                    f"{key}={folder} is being written by another process: "
+                    "wait, or choose another folder",
+                )
         try:
             yield
         finally:

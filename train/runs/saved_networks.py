@@ -136,16 +136,20 @@ def load_run(
         32
     """
     if weights is not None:
-        given = f"weights={weights} is not for {RUN}{run}"
-        raise InputError(f"{given}, which has its own: leave it out", "weights")
+        raise InputError(
+            f"weights={weights} is not for {RUN}{run}, which has its own: leave it out",
+            "weights",
+        )
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
-        problem = f"the network in {path} is made by {name}"
-        attack = f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights"
-        raise InputError(f"{problem}: give model={name} to run that code or, {attack}")
+        raise InputError(
+            f"the network in {path} is made by {name}: "
+            f"give model={name} to run that code or, "
+            f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights",
+        )
     with of_one_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
@@ -183,8 +187,10 @@ def of_one_architecture(path: Path) -> Iterator[None]:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        problem = f"checkpoint {path} is from another architecture ({reason})"
-        raise InputError(f"{problem}: use the model settings of its training") from error
+        raise InputError(
+            f"checkpoint {path} is from another architecture ({reason}): "
+            "use the model settings of its training",
+        ) from error
 
 
 def is_classifier(name: str) -> bool:
@@ -243,8 +249,10 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """
     path = selected_file(run)
     if path is None:
-        problem = f"run={run} holds neither {BEST} nor {PUBLISHED}"
-        raise InputError(f"{problem}: give a folder that pnb-train wrote", "run")
+        raise InputError(
+            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote",
+            "run",
+        )
     if path.suffix == ".safetensors":
         return path, _load_published(path)
     return path, load(path)
@@ -304,8 +312,9 @@ def _load_published(path: Path) -> dict[str, Any]:
                 value = file.get_tensor(name)
                 weights[name] = value.float() if value.is_floating_point() else value
     except Exception as error:  # safetensors and JSON raise many kinds for a foreign file.
-        problem = f"checkpoint {path} is damaged or lacks its architecture"
-        raise InputError(f"{problem}; use another one") from error
+        raise InputError(
+            f"checkpoint {path} is damaged or lacks its architecture; use another one",
+        ) from error
     return checked({**facts, "model": weights}, path)
 
 

@@ -197,8 +197,10 @@ def compiles(choice: str, device: torch.device) -> bool:
         InputError: If the choice is "always" on a CPU, which has no graphs to replay.
     """
     if choice == "always" and device.type == "cpu":
-        problem = "choice=always is for a GPU, whose graphs it replays"
-        raise InputError(f"{problem}: use auto or never", "choice")
+        raise InputError(
+            "choice=always is for a GPU, whose graphs it replays: use auto or never",
+            "choice",
+        )
     if choice != "auto" or device.type != "cuda" or distributed.world_size() > 1:
         return choice == "always"
     try:

@@ -132,6 +132,7 @@ def writable_folder(folder: str | Path, key: str) -> Path:
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(bytes(TEST_SIZE))
     except OSError as error:
-        fault = f"{key}={path} cannot be written to ({error.strerror})"
-        raise InputError(f"{fault}: choose another folder") from error
+        raise InputError(
+            f"{key}={path} cannot be written to ({error.strerror}): choose another folder",
+        ) from error
     return path

@@ -106,8 +106,10 @@ class Initial:
                 difference = f"{key} {stored[key]}, not {wanted.get(key)}"
                 if key == "classes":
                     difference = "other classes"
-                problem = f"train.init_from={self.source} was trained with {difference}"
-                raise InputError(f"{problem}: give this run the same")
+                raise InputError(
+                    f"train.init_from={self.source} was trained with {difference}: "
+                    "give this run the same",
+                )
         with of_one_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -132,14 +134,18 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return _classifier(settings, name)
     source = Path(name.removeprefix(RUN))
     if is_state_dict(source):
-        example = f"train.init_from=torchvision:resnet50 weights={source}"
-        fault = f"train.init_from={name} contains weights without their network"
         raise InputError(
-            f"{fault}: give its architecture and the weights, as in {example}", "train.init_from"
+            f"train.init_from={name} contains weights without their network: "
+            "give its architecture and the weights, as in "
+            f"train.init_from=torchvision:resnet50 weights={source}",
+            "train.init_from",
         )
     if settings.weights is not None:
-        given = f"weights={settings.weights} is not for train.init_from={name}"
-        raise InputError(f"{given}, which has its own: leave it out", "weights")
+        raise InputError(
+            f"weights={settings.weights} is not for train.init_from={name}, "
+            "which has its own: leave it out",
+            "weights",
+        )
     require_no_facts(
         f"train.init_from={name}", as_facts(settings.classes, None, settings.normalization)
     )
@@ -173,8 +179,11 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
             return settings
         return with_class_names(settings, initial.classes)
     if initial is None:
-        problem = "label is not set, and there is no train.init_from whose classes are known"
-        raise InputError(f"{problem}: set label=CLASS", "label")
+        raise InputError(
+            "label is not set, and there is no train.init_from whose classes are known: "
+            "set label=CLASS",
+            "label",
+        )
     return with_classes_of_meshes(settings, initial.classes)
 
 
@@ -201,9 +210,10 @@ def _classifier(settings: ExperimentSettings, name: str) -> Initial:
         )
     network = cast(nn.Module, classifier.function)
     if not list(network.parameters()):
-        fault = f"train.init_from={name} is a network without weights that can be trained"
         raise InputError(
-            f"{fault}: give its file of TorchScript or of torch.export", "train.init_from"
+            f"train.init_from={name} is a network without weights that can be trained: "
+            "give its file of TorchScript or of torch.export",
+            "train.init_from",
         )
     # The network is built again from its file, also from another folder.
     shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}

@@ -145,9 +145,11 @@ class Trainer:
     ):
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
-            fault = f"ranking_weight={settings.ranking_weight} requires hard negatives"
-            remedy = "add some to the scene, or set a folder of images that has some"
-            raise InputError(f"{fault}: {remedy}", "ranking_weight")
+            raise InputError(
+                f"ranking_weight={settings.ranking_weight} requires hard negatives: "
+                "add some to the scene, or set a folder of images that has some",
+                "ranking_weight",
+            )
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -473,10 +475,14 @@ class Trainer:
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
             settings = self.settings
-            rate = f"learning_rate={settings.learning_rate}"
-            decay = f"weight_decay={settings.weight_decay}"
-            effect = f"made the loss or weights NaN or infinite in epoch {epoch}"
-            raise InputError(f"{rate} with {decay} {effect}: set lower values", "learning_rate")
+            raise InputError(
+                f"learning_rate={settings.learning_rate} "
+                "with "
+                f"weight_decay={settings.weight_decay} "
+                f"made the loss or weights NaN or infinite in epoch {epoch}: "
+                "set lower values",
+                "learning_rate",
+            )
 
     def _save(self) -> None:
         """Write the checkpoint last.pt, and best.pt if a network was selected since the last time.
@@ -585,9 +591,11 @@ class Trainer:
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = single_line(error)
-            fault = f"the checkpoint in {self.folder} is not one that this run can go on from"
-            remedy = f"restore {checkpoint.LAST}, or start in another folder"
-            raise InputError(f"{fault} ({reason}): {remedy}") from error
+            raise InputError(
+                f"the checkpoint in {self.folder} is not one that this run can go on from "
+                f"({reason}): "
+                f"restore {checkpoint.LAST}, or start in another folder",
+            ) from error
         self._require_own_best()
         if problem:
             console.warning("%s: going on from the one before", problem)
@@ -618,9 +626,10 @@ class Trainer:
                 if line["validation/accuracy"] != best["validation_accuracy"]:
                     raise ValueError("its accuracy is not the one that this run had")
         except (LookupError, TypeError, ValueError) as error:
-            fault = f"{path} is not the network that this run kept ({single_line(error)})"
-            remedy = f"restore {checkpoint.BEST}, or start in another folder"
-            raise InputError(f"{fault}: {remedy}") from error
+            raise InputError(
+                f"{path} is not the network that this run kept ({single_line(error)}): "
+                f"restore {checkpoint.BEST}, or start in another folder",
+            ) from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
         """Raise ValueError if the network of a checkpoint is not the network of this run."""

@@ -150,7 +150,9 @@ def freeze(network: nn.Module, stage: str) -> None:
         frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
     if not frozen:
         parts = nearest(stage, sorted(set(modules)))
-        fault = f"stage={stage} is no module of the network"
-        raise InputError(f"{fault}: choose a module, such as {parts}", "stage")
+        raise InputError(
+            f"stage={stage} is no module of the network: choose a module, such as {parts}",
+            "stage",
+        )
     for parameter in list(network.parameters())[: frozen[-1] + 1]:
         parameter.requires_grad_(False)

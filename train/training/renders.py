@@ -68,8 +68,10 @@ def build_service(
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
 
     if len(positive_classes) == len(data.classes) and (labels < 0).any():
-        problem = f"label={settings.label} has all classes of the network, so that none is left"
-        raise InputError(f"{problem} for negatives without a class: remove them, or label them")
+        raise InputError(
+            f"label={settings.label} has all classes of the network, so that none is left "
+            "for negatives without a class: remove them, or label them",
+        )
     return AugmentationService(
         settings.augment,
         scene,
@@ -159,7 +161,8 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, T
         found, images, _ = load_photographs(folder, found, data.size, advice="")
         missing = set(positive_classes) - {item.label for item in found}
         if missing:
-            problem = f"{folder} holds no image of label={min(missing)}"
-            raise InputError(f"{problem}: add a folder of them")
+            raise InputError(
+                f"{folder} holds no image of label={min(missing)}: add a folder of them",
+            )
     labels = torch.tensor([numbers.get(item.label, other) for item in found])
     return images, labels

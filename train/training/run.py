@@ -225,9 +225,11 @@ class Run:
         if begins_anew or not checkpoint.exists(self.folder):
             return None
         if not resumes:
-            remedy = "set train.resume=true to go on or overwrite=true to begin anew"
-            problem = f"run={self.folder} holds a run already"
-            raise InputError(f"{problem}: {remedy}, or choose another run")
+            raise InputError(
+                f"run={self.folder} holds a run already: "
+                "set train.resume=true to go on or overwrite=true to begin anew, "
+                "or choose another run",
+            )
         return require_same_run(self.folder, self.settings)
 
     def _asked_threads(self, before: DictConfig | None) -> int | None:
@@ -655,8 +657,11 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     if initial is None or not initial.is_classifier:
         return shape
     if shape.get("name", initial.name) != initial.name:
-        network = f"train.init_from={initial.source} has its own network"
-        raise InputError(f"model.name={shape['name']}: {network}: leave it out")
+        raise InputError(
+            f"model.name={shape['name']}: "
+            f"train.init_from={initial.source} has its own network: "
+            "leave it out",
+        )
     return {"name": initial.name, CLASSIFIER: True}
 
 

@@ -314,9 +314,10 @@ def _clear(out: Path, overwrite: bool) -> None:
         for render in out.glob(RENDERS):
             render.unlink()
     elif any(path.name != LOCK for path in out.iterdir()):
-        fault = f"out={out} holds other files, and a laboratory needs an empty folder"
-        advice = "choose another, or set overwrite=true to write over its results"
-        raise InputError(f"{fault}: {advice}")
+        raise InputError(
+            f"out={out} holds other files, and a laboratory needs an empty folder: "
+            "choose another, or set overwrite=true to write over its results",
+        )
 
 
 def _write_render(
@@ -373,8 +374,9 @@ def _read_environment(path: Path) -> np.ndarray:
     upper_half = radiance[: len(radiance) // 2]
     # With `not`, the condition is also true if the largest radiance is NaN.
     if not upper_half.max() > 0:
-        advice = "give a map with light from above the horizon"
-        raise InputError(f"environments: {path} is dark above: {advice}")
+        raise InputError(
+            f"environments: {path} is dark above: give a map with light from above the horizon",
+        )
     return radiance
 
 
@@ -401,10 +403,13 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     if not label and name:
         label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
     if not label:
-        advice = f"give {{mesh: {settings.mesh}, label: CLASS or {OTHER_PREFIX}NAME}}"
-        raise InputError(f"meshes[{index}] has no label: {advice}")
+        raise InputError(
+            f"meshes[{index}] has no label: "
+            f"give {{mesh: {settings.mesh}, label: CLASS or {OTHER_PREFIX}NAME}}",
+        )
     if Path(label).name != label or label == "..":
-        fault = f"meshes[{index}]: the label {label!r} names the renders' folder"
-        raise InputError(f"{fault}: leave out slashes")
+        raise InputError(
+            f"meshes[{index}]: the label {label!r} names the renders' folder: leave out slashes",
+        )
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)

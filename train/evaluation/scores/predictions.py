@@ -221,8 +221,10 @@ def compute_logits(
             another shape, are NaN or are infinite.
     """
     if classes < 2:
-        problem = "the model has a single class, so its log-odds are infinite"
-        raise InputError(f"{problem}: evaluate a model with at least two classes")
+        raise InputError(
+            "the model has a single class, so its log-odds are infinite: "
+            "evaluate a model with at least two classes",
+        )
     call = NetworkCall("model")
     in_eval_mode = eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext()
     batches = []
@@ -232,11 +234,15 @@ def compute_logits(
     logits = torch.cat(batches).float().cpu()
     expected = (len(images), classes)
     if logits.shape != expected:
-        problem = f"the model returned logits of shape {tuple(logits.shape)}, not {expected}"
-        raise InputError(f"{problem}: evaluate a checkpoint that was trained on these classes")
+        raise InputError(
+            f"the model returned logits of shape {tuple(logits.shape)}, not {expected}: "
+            "evaluate a checkpoint that was trained on these classes",
+        )
     if not logits.isfinite().all():
-        problem = "the model returned NaN or infinite logits"
-        raise InputError(f"{problem}: evaluate a checkpoint of a run that converged")
+        raise InputError(
+            "the model returned NaN or infinite logits: "
+            "evaluate a checkpoint of a run that converged",
+        )
     return logits
 
 
@@ -380,8 +386,10 @@ def read_predictions(path: Path, label: Label) -> list[Prediction]:
             rows = list(csv.DictReader(file))
         return [_from_row(row, name) for name in label_names(label) for row in rows]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
-        advice = f"score the photographs again, with label={label}"
-        raise InputError(f"{path} cannot be used ({single_line(error)}): {advice}") from error
+        raise InputError(
+            f"{path} cannot be used ({single_line(error)}): "
+            f"score the photographs again, with label={label}",
+        ) from error
 
 
 def _from_row(row: Mapping[str, str], label: str) -> Prediction:

@@ -234,8 +234,9 @@ def score(
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
-        problem = f"by=mesh: {predicted.folder} has no {TABLE} with a column mesh"
-        raise InputError(f"{problem}: leave it out")
+        raise InputError(
+            f"by=mesh: {predicted.folder} has no {TABLE} with a column mesh: leave it out",
+        )
     limits = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=limits)
     has_several = len(predicted.labels) > 1
@@ -350,8 +351,10 @@ def choose_operating_points(
         if count * exact_rate < 1:
             fault = f"folder={folder} has {count} negatives for {name}"
             least = math.ceil(1 / exact_rate)
-            advice = f"give at least {least} for false_positive_rate={rate}"
-            raise InputError(f"{fault}: {advice}", "folder")
+            raise InputError(
+                f"{fault}: give at least {least} for false_positive_rate={rate}",
+                "folder",
+            )
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
         points.append(
             OperatingPoint(
