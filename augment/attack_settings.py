@@ -172,8 +172,11 @@ class AttackSettings(ParameterSettings):
             raise InputError("lighting and skylight both set the light: choose one of them")
         has_radius = all(steps.radius is not None for steps in self.parameters.values())
         if self.restarts and not has_radius:
-            remedy = "set the radius of every parameter, or restarts=0"
-            raise InputError(f"restarts draws from the norm-balls: {remedy}", "restarts")
+            raise InputError(
+                "restarts draws from the norm-balls: "
+                "set the radius of every parameter, or restarts=0",
+                "restarts",
+            )
 
     @property
     def uses_gradients(self) -> bool:

@@ -37,8 +37,11 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     """
     if not has_memory(needed, device):
         free = free_memory(device) or 0
-        sizes = f"{needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free"
-        raise InputError(f"{name} need {sizes}: reduce their number or size")
+        raise InputError(
+            f"{name} need "
+            f"{needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free: "
+            "reduce their number or size",
+        )
 
 
 def has_memory(needed: int, device: torch.device) -> bool:

@@ -158,9 +158,9 @@ class PoseSettings(StepSettings):
             argument = "joints" if name == "joints" else f"joints.{name}"
             require_range(argument, degrees, 0, MAX_JOINT_ANGLE)
         if not any([*limits.values(), *(getattr(self, name) for name in POSE_PARTS)]):
-            parts = f"{', '.join(POSE_PARTS)} and joints"
             raise InputError(
-                f"{parts} are all 0, so the pose cannot change: set one of them above 0"
+                f"{', '.join(POSE_PARTS)} and joints "
+                "are all 0, so the pose cannot change: set one of them above 0",
             )
 
 

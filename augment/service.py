@@ -173,14 +173,18 @@ class AugmentationService:
             int(label) for label in as_integers("positive_classes", self.positive_classes)
         ]
         if self.scene is not None and self.labels.shape != (len(self.scene),):
-            fault = f"labels has shape {tuple(self.labels.shape)}"
-            raise InputError(f"{fault}: give one of each of {len(self.scene)} examples")
+            raise InputError(
+                f"labels has shape {tuple(self.labels.shape)}: "
+                f"give one of each of {len(self.scene)} examples",
+            )
         if self.images is not None:
             self.images = self._checked_images(self.images)
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
-            fault = f"{source} is None, and mode={self.settings.mode} needs examples"
-            raise InputError(f"{fault}: give a scene, or images for a folder")
+            raise InputError(
+                f"{source} is None, and mode={self.settings.mode} needs examples: "
+                "give a scene, or images for a folder",
+            )
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
             self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
@@ -202,8 +206,9 @@ class AugmentationService:
         if not isinstance(images, Tensor):
             images = torch.from_numpy(as_array("images", images))
         if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
-            expected = "bytes (E, 3, H, W), one for each label"
-            raise InputError(f"images is {describe(images)}: give {expected}")
+            raise InputError(
+                f"images is {describe(images)}: give bytes (E, 3, H, W), one for each label",
+            )
         return images
 
     @classmethod
@@ -346,11 +351,14 @@ class AugmentationService:
         if values is not None:
             values = as_tensor("state", values)
             if values.ndim != 2 or len(values) != len(self.labels):
-                fault = f"state has values of {len(values)} examples, not of {len(self.labels)}"
-                raise InputError(f"{fault}: resume with the settings of the run")
+                raise InputError(
+                    f"state has values of {len(values)} examples, not of {len(self.labels)}: "
+                    "resume with the settings of the run",
+                )
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
-            remedy = "resume with the same meshes, labels, views and light"
-            raise InputError(f"state is of another scene: {remedy}")
+            raise InputError(
+                "state is of another scene: resume with the same meshes, labels, views and light",
+            )
         self._last_values = None if values is None else values.to(self.labels.device)
 
     @cached_property

@@ -154,8 +154,11 @@ class ObjectSettings(MeshSettings):
             if isinstance(prop, Mapping):
                 self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
             elif not isinstance(prop, PropSettings):
-                expected = "give mappings, or a list of nb.PropSettings"
-                raise InputError(f"props[{index}] is {describe(prop)}: {expected}", "props")
+                raise InputError(
+                    f"props[{index}] is {describe(prop)}: "
+                    "give mappings, or a list of nb.PropSettings",
+                    "props",
+                )
 
 
 @dataclass
@@ -492,8 +495,11 @@ class VariationSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if tuple(self.fov) != NONE and self.fov[0] < MIN_FOV:
-            expected = f"give [minimum, maximum], both from {MIN_FOV:g} to {MAX_FOV:g}"
-            raise InputError(f"fov={list(self.fov)}: {expected}", "fov")
+            raise InputError(
+                f"fov={list(self.fov)}: "
+                f"give [minimum, maximum], both from {MIN_FOV:g} to {MAX_FOV:g}",
+                "fov",
+            )
 
     @property
     def moves(self) -> bool:
@@ -603,11 +609,15 @@ class AugmentationSettings(Settings):
                 f"attack is {describe(self.attack)}: give the settings of an attack", "attack"
             )
         if not self.attack.parameters:
-            remedy = "give TrainingAttackSettings(), or name a parameter"
-            raise InputError(f"attack changes nothing: {remedy}", "attack")
+            raise InputError(
+                "attack changes nothing: give TrainingAttackSettings(), or name a parameter",
+                "attack",
+            )
         if self.mode == "folder" and not self.folder:
-            given = f"folder is {self.folder}, and mode=folder shows its images"
-            raise InputError(f"{given}: name a folder", "folder")
+            raise InputError(
+                f"folder is {self.folder}, and mode=folder shows its images: name a folder",
+                "folder",
+            )
         uses_random_draws = "random" in (self.mode, self.init)
         for name, steps in self.attack.parameters.items():
             if uses_random_draws and name != "lighting" and steps.radius is None:
@@ -648,11 +658,12 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
         return views
     derived, rest = divmod(examples or 0, objects * backgrounds)
     if rest or derived < 1 or views not in (None, derived):
-        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        remedy = (
-            "change one of them, or derive one from the other, with None for views or for examples"
+        raise InputError(
+            f"examples={examples} is not "
+            f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds: "
+            "change one of them, or derive one from the other, with None for views or for examples",
+            "examples",
         )
-        raise InputError(f"examples={examples} is not {product}: {remedy}", "examples")
     return derived
 
 
@@ -714,5 +725,8 @@ def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | No
         return value
     if isinstance(value, Mapping):
         return settings_from(NormalizedLightSettings, value, "normalize_light")
-    expected = "true, false, or a mapping such as {white_balance: 0.5}"
-    raise InputError(f"normalize_light is {describe(value)}: give {expected}", "normalize_light")
+    raise InputError(
+        f"normalize_light is {describe(value)}: give "
+        "true, false, or a mapping such as {white_balance: 0.5}",
+        "normalize_light",
+    )

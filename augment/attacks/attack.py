@@ -688,8 +688,11 @@ def target_labels(
     is_one_class = isinstance(target, str) or is_whole(target)
     names = [str(target)] * view_count if is_one_class else _target_names(target)
     if len(names) != view_count:
-        counts = f"{len(names)} classes for {view_count} views that share what is attacked"
-        raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")
+        raise InputError(
+            f"target={names} names "
+            f"{len(names)} classes for {view_count} views that share what is attacked: "
+            "give one class per view, and shared=True",
+        )
     indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
     labels = torch.tensor(indices, device=logits.device).expand(len(logits), view_count)
     if torch.eq(labels, source).any():

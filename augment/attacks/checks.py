@@ -329,8 +329,11 @@ def require_transferable(
         ("meshes", objects, bound_to_mesh),
     ):
         if requested and bound_parameters:
-            problem = f"attacked {bound_parameters[0]} cannot be transferred to others"
-            raise InputError(f"{argument}: {problem}, leave one of them out")
+            raise InputError(
+                f"{argument}: "
+                f"attacked {bound_parameters[0]} cannot be transferred to others, "
+                "leave one of them out",
+            )
 
 
 @dataclass(frozen=True)

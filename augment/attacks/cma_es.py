@@ -171,8 +171,10 @@ def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
     try:
         cma: Any = importlib.import_module("cma")
     except ImportError as error:
-        advice = 'pip install "parametric-norm-balls[search]"'
-        raise InputError(f"optimizer=cma_es needs cma: {advice}", "optimizer") from error
+        raise InputError(
+            'optimizer=cma_es needs cma: pip install "parametric-norm-balls[search]"',
+            "optimizer",
+        ) from error
     numbers = np.random.default_rng(seed)
     options = {
         "verbose": -9,

@@ -77,8 +77,10 @@ def _efficientnet_lite(version: int) -> Source:
 def _load_python(name: str, weights: Path | None) -> Classifier:
     """Call a function of a user, which loads its own weights."""
     if weights is not None:
-        fault = f"weights={weights} is not for python:{name}, which loads its own"
-        raise InputError(f"{fault}: leave it out", "weights")
+        raise InputError(
+            f"weights={weights} is not for python:{name}, which loads its own: leave it out",
+            "weights",
+        )
     return load_python(name)
 
 
@@ -159,8 +161,11 @@ def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
             return load(*arguments)
     if Path(name).suffix.lower() in SUFFIXES:
         if path is not None:
-            fault = f"weights={path} cannot be combined with {name}, which contains its own weights"
-            raise InputError(f"{fault}: remove weights", "weights")
+            raise InputError(
+                f"weights={path} cannot be combined with {name}, which contains its own weights: "
+                "remove weights",
+                "weights",
+            )
         with progress_message(f"loading {name}"):
             return load_file(name, facts)
     choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]

@@ -156,8 +156,11 @@ class NetworkCall:
             return
         self.probability_rows += len(logits)
         if self.probability_rows >= MIN_PROBABILITY_ROWS:
-            fault = "returned probabilities (values in [0, 1] that sum to 1) instead of logits"
-            raise InputError(f"{self.name} {fault}: remove its softmax, or return its logarithm")
+            raise InputError(
+                f"{self.name} "
+                "returned probabilities (values in [0, 1] that sum to 1) instead of logits: "
+                "remove its softmax, or return its logarithm",
+            )
 
 
 def are_probabilities(outputs: Tensor) -> bool:
@@ -230,9 +233,11 @@ class Classifier(nn.Module):
         self.name = name
         self._call_network = NetworkCall(f"classifier {name}")
         if not 0 < len(set(self.classes)) == len(self.classes):
-            fault = f"classifier {name}: classes has {len(self.classes)} names"
-            remedy = "give each class a name of its own, in the order of the logits"
-            raise InputError(f"{fault}, of which {len(set(self.classes))} are different: {remedy}")
+            raise InputError(
+                f"classifier {name}: classes has {len(self.classes)} names, "
+                f"of which {len(set(self.classes))} are different: "
+                "give each class a name of its own, in the order of the logits",
+            )
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
@@ -352,8 +357,9 @@ class Classifier(nn.Module):
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
             remedy = f"set label to one of {known}" if known else "store one with pnb-publish"
-            fault = f"classifier {self.name} has no operating point for label={label}"
-            raise InputError(f"{fault}: {remedy}")
+            raise InputError(
+                f"classifier {self.name} has no operating point for label={label}: {remedy}",
+            )
         (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
@@ -413,8 +419,10 @@ def require_unit_range(name: str, *extremes: Tensor) -> None:
         return
     low, high = torch.stack(extremes).tolist()
     if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-        remedy = "use RGB in [0, 1], without normalization (divide bytes by 255)"
-        raise InputError(f"{name} has values from {low:g} to {high:g}: {remedy}")
+        raise InputError(
+            f"{name} has values from {low:g} to {high:g}: "
+            "use RGB in [0, 1], without normalization (divide bytes by 255)",
+        )
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
@@ -657,17 +665,20 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     text = str(name)
     is_index = text.isascii() and text.isdecimal()
     if isinstance(name, str) and not is_index and _are_indices(classes):
-        remedy = f"give an index from 0 to {len(classes) - 1}, or name the classes"
         raise InputError(
-            f"{subject}: {name!r} is a name, but the classes have only indices: {remedy}"
+            f"{subject}: {name!r} is a name, but the classes have only indices: "
+            f"give an index from 0 to {len(classes) - 1}, or name the classes",
         )
     if is_index:
         if int(text) < len(classes):
             return int(text)
-        indices = f"indices go from 0 to {len(classes) - 1}"
-        raise InputError(f"{subject}: the label {text} is not a class: {indices}")
-    remedy = f"choose one, such as {nearest(text, classes)}"
-    raise InputError(f"{subject}: {name!r} is not a class of the model: {remedy}")
+        raise InputError(
+            f"{subject}: the label {text} is not a class: indices go from 0 to {len(classes) - 1}",
+        )
+    raise InputError(
+        f"{subject}: {name!r} is not a class of the model: "
+        f"choose one, such as {nearest(text, classes)}",
+    )
 
 
 def _are_indices(classes: Sequence[str]) -> bool:
@@ -730,26 +741,39 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         module = importlib.import_module(module_name)
         if not hasattr(module, function_name):
             choices = nearest(function_name, [*vars(module)])
-            fault = f"name=python:{name}: {module.__file__} has no function {function_name}"
-            raise InputError(f"{fault}: did you mean {choices}?", "name")
+            raise InputError(
+                f"name=python:{name}: {module.__file__} has no function {function_name}: "
+                f"did you mean {choices}?",
+                "name",
+            )
         network, size, classes = getattr(module, function_name)()
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
-            fault = f"name=python:{name}: there is no module {module_name} in {current_folder}"
-            raise InputError(f"{fault}: start the command beside it", "name") from error
+            raise InputError(
+                f"name=python:{name}: there is no module {module_name} in {current_folder}: "
+                "start the command beside it",
+                "name",
+            ) from error
         last_call = traceback.extract_tb(error.__traceback__)[-1]
         kind = type(error).__name__
         place = f"line {last_call.lineno} of {last_call.filename}"
-        reason = f"{kind}: {single_line(error)}, in {place}"  # type: ignore[arg-type]
-        expected = "python:package.module:function, which returns (module, size, classes)"
-        raise InputError(f"name=python:{name} fails ({reason}): use {expected}", "name") from error
+        raise InputError(
+            f"name=python:{name} fails ("
+            f"{kind}: {single_line(error)}, in {place}"
+            "): use "
+            "python:package.module:function, which returns (module, size, classes)",
+            "name",
+        ) from error
     # A string is a sequence of strings, too, but no list of names.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
     if not (callable(network) and type(size) is int and has_names):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
-        expected = "return (torch.nn.Module, pixels per side, class names)"
-        raise InputError(f"name=python:{name} returns ({kinds}): {expected}", "name")
+        raise InputError(
+            f"name=python:{name} returns ({kinds}): "
+            "return (torch.nn.Module, pixels per side, class names)",
+            "name",
+        )
     return network, size, classes

@@ -112,9 +112,10 @@ def _read(path: Path) -> Content:
     except InputError:
         raise
     except Exception as error:  # Each library raises many kinds for a damaged file.
-        advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
         raise InputError(
-            f"name={path} cannot be read ({single_line(error)}): {advice}", "name"
+            f"name={path} cannot be read ({single_line(error)}): "
+            "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)",
+            "name",
         ) from error
 
 
@@ -214,8 +215,10 @@ def read_onnx(path: Path) -> Content:
     try:
         onnxruntime: Any = importlib.import_module("onnxruntime")
     except ImportError as error:
-        advice = 'pip install "parametric-norm-balls[onnx]"'
-        raise InputError(f"name={path} needs onnxruntime: {advice}", "name") from error
+        raise InputError(
+            f'name={path} needs onnxruntime: pip install "parametric-norm-balls[onnx]"',
+            "name",
+        ) from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Log errors and fatal errors.
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -191,8 +191,10 @@ def as_classifier(
     function = _preprocessed(network, normalization, value_range).to(device)
     count = _count_outputs(function, size, device, argument)
     if names is not None and len(names) != count:
-        fault = f"classes has {len(names)} names, but the network returns {count} outputs"
-        raise InputError(f"{fault}: give one name per output")
+        raise InputError(
+            f"classes has {len(names)} names, but the network returns {count} outputs: "
+            "give one name per output",
+        )
     name = name or type(network).__name__
     return Classifier(function, size, names or index_names(count), name, normalize_light)
 

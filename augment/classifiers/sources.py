@@ -204,8 +204,11 @@ def require_architecture(model: str) -> None:
 
     choices = models.list_models(module=models)
     if model not in choices:
-        fault = f"name=torchvision:{model} is not a classifier of torchvision"
-        raise InputError(f"{fault}: choose one, such as {nearest(model, choices)}", "name")
+        raise InputError(
+            f"name=torchvision:{model} is not a classifier of torchvision: "
+            f"choose one, such as {nearest(model, choices)}",
+            "name",
+        )
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
@@ -230,9 +233,11 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # The network, the disk or the file's hash may fail.
-        remedy = f"set weights=FILE to a copy of {published.url}"
-        fault = f"name={name} cannot be downloaded ({single_line(error)})"
-        raise InputError(f"{fault}: {remedy}", "name") from error
+        raise InputError(
+            f"name={name} cannot be downloaded ({single_line(error)}): "
+            f"set weights=FILE to a copy of {published.url}",
+            "name",
+        ) from error
 
 
 def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
@@ -297,8 +302,10 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
         InputError: If no file is given, or if the weights do not fit.
     """
     if weights is None:
-        fault = f"name={SQUEEZENET_CAFFE} has no published weights"
-        raise InputError(f"{fault}: set weights=FILE", "name")
+        raise InputError(
+            f"name={SQUEEZENET_CAFFE} has no published weights: set weights=FILE",
+            "name",
+        )
     return fill(build_squeezenet_caffe(), read_weights(weights), weights)
 
 
@@ -351,8 +358,10 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
         raise
     except Exception as error:  # The network, the disk or timm's hub may fail.
         reason = single_line(error)
-        fault = f"name=timm:{model} cannot be downloaded ({reason})"
-        raise InputError(f"{fault}: set weights=FILE", "name") from error
+        raise InputError(
+            f"name=timm:{model} cannot be downloaded ({reason}): set weights=FILE",
+            "name",
+        ) from error
 
 
 def _head_of_timm(classifier: Classifier) -> str:
@@ -388,16 +397,19 @@ def build_timm(
     timm = _required("timm", name)
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
-        fault = f"name={name} is not a network of timm"
-        raise InputError(f"{fault}: choose one, such as {choices}", "name")
+        raise InputError(
+            f"name={name} is not a network of timm: choose one, such as {choices}",
+            "name",
+        )
     classes = facts.classes or imagenet_classes()
     options = {} if facts.classes is None else {"num_classes": len(classes)}
     network = timm.create_model(model, pretrained=pretrained, **options)
     published = network.pretrained_cfg
     if network.num_classes != len(classes):
-        fault = f"name={name} has {network.num_classes} classes"
         raise InputError(
-            f"{fault}: choose a network with ImageNet's 1,000, or name them in classes=", "name"
+            f"name={name} has {network.num_classes} classes: "
+            "choose a network with ImageNet's 1,000, or name them in classes=",
+            "name",
         )
     size = size or facts.size or published["input_size"][-1]
     mean, std = _normalization(facts, published["mean"], published["std"])
@@ -443,8 +455,10 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
             reason = "it is no file of weights, or contains other objects"
-        fault = f"weights={path} cannot be read ({reason})"
-        raise InputError(f"{fault}: save a network's state_dict() alone", "weights") from error
+        raise InputError(
+            f"weights={path} cannot be read ({reason}): save a network's state_dict() alone",
+            "weights",
+        ) from error
 
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
@@ -531,6 +545,9 @@ def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path
         _network(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
-        fault = f"weights={source} do not fit {classifier.name} ({reason})"
-        raise InputError(f"{fault}: use weights of that network", "weights") from error
+        raise InputError(
+            f"weights={source} do not fit {classifier.name} ({reason}): "
+            "use weights of that network",
+            "weights",
+        ) from error
     return classifier

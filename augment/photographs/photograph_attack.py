@@ -174,8 +174,10 @@ def attack_photographs(
             network, size, classes, normalization, value_range, device_of(network)
         )
         if classifier.size != size:
-            fault = f"photographs have {size} pixels per side"
-            raise InputError(f"{fault}, but the network takes {classifier.size}: resize them")
+            raise InputError(
+                f"photographs have {size} pixels per side, "
+                f"but the network takes {classifier.size}: resize them",
+            )
         attack = _PhotographAttack(classifier, photographs, settings, counting, seed)
         return attack.run()
 

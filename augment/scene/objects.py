@@ -318,8 +318,10 @@ def _load(item: MeshSettings) -> Mesh:
     # Column 1 of the gloss is the metallic factor of each face.
     is_metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
     if is_metal and item.color is None and not _has_colors(mesh):
-        remedy = "give color=[red,green,blue], or a metallic of 0"
-        raise InputError(f"{item.mesh} is a metal without a color: {remedy}")
+        raise InputError(
+            f"{item.mesh} is a metal without a color: "
+            "give color=[red,green,blue], or a metallic of 0",
+        )
     return mesh
 
 
@@ -336,8 +338,10 @@ def _load_with_color(item: MeshSettings) -> Mesh:
     if item.color is None:
         return mesh
     if _has_colors(mesh):
-        remedy = "remove color, and set albedo_scale to make them brighter or darker"
-        raise InputError(f"color is set, but {item.mesh} has its own colors: {remedy}")
+        raise InputError(
+            f"color is set, but {item.mesh} has its own colors: "
+            "remove color, and set albedo_scale to make them brighter or darker",
+        )
     colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
     return replace(colored, gloss=mesh.gloss, skin=mesh.skin)
 

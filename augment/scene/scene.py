@@ -103,8 +103,10 @@ class Scene:
         effects = "a function of images and examples"
         require_kind("camera_effects", camera_effects, Callable | None, effects)
         if not hasattr(rasterizer, "rasterize"):
-            advice = "give renderer.visibility.rasterizers.choose(name)"
-            raise InputError(f"rasterizer is {describe(rasterizer)}: {advice}")
+            raise InputError(
+                f"rasterizer is {describe(rasterizer)}: "
+                "give renderer.visibility.rasterizers.choose(name)",
+            )
         self.objects = as_list("objects", objects, SceneObject, "a list of scene objects")
         examples = as_list("examples", examples, Example, "a list of examples")
         lights = as_tensor("lights", lights)
@@ -336,9 +338,10 @@ class Scene:
         expected = "conditions, such as scene.conditions(examples)"
         require_kind("conditions", conditions, Conditions, expected)
         if conditions.light.shape[1:] != (self.basis.size, 3):
-            fault = f"conditions.light has shape {tuple(conditions.light.shape)}"
-            remedy = f"use one light for each example, such as {(len(self), self.basis.size, 3)}"
-            raise InputError(f"{fault}: {remedy}")
+            raise InputError(
+                f"conditions.light has shape {tuple(conditions.light.shape)}: "
+                f"use one light for each example, such as {(len(self), self.basis.size, 3)}",
+            )
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
         # The images are the backgrounds, in which the pixels of the layers are overwritten.
@@ -374,13 +377,16 @@ class Scene:
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
             number = "a list of" if count is None else str(count)
-            advice = f"give {number} indices, one for each light"
-            raise InputError(f"examples has shape {tuple(indices.shape)}: {advice}")
+            raise InputError(
+                f"examples has shape {tuple(indices.shape)}: "
+                f"give {number} indices, one for each light",
+            )
         if indices.device.type != "cpu" or not len(indices):
             return indices.to(self.lights.device)
         if int(indices.min()) < 0 or int(indices.max()) >= len(self):
-            advice = f"give indices from 0 to {len(self) - 1}"
-            raise InputError(f"examples names some that are not there: {advice}")
+            raise InputError(
+                f"examples names some that are not there: give indices from 0 to {len(self) - 1}",
+            )
         return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:

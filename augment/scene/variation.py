@@ -74,8 +74,10 @@ def vary(
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
-            fault = "tables require one view per example and objects without a table of their own"
-            raise InputError(f"{fault}: set views=1 and remove ground, or set tables=0")
+            raise InputError(
+                "tables require one view per example and objects without a table of their own: "
+                "set views=1 and remove ground, or set tables=0",
+            )
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _vary_geometry(scene, settings, draws, once, is_on_table)

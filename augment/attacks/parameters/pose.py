@@ -281,6 +281,8 @@ def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
         limits = dict.fromkeys(names, limits)
     for name in limits:
         if name not in names:
-            choices = f"choose from {', '.join(names)}"
-            raise InputError(f"joints: {item.name} has no joint {name}: {choices}", "joints")
+            raise InputError(
+                f"joints: {item.name} has no joint {name}: choose from {', '.join(names)}",
+                "joints",
+            )
     return [float(limits.get(name, 0)) for name in names]
