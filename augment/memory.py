@@ -38,8 +38,7 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     if not has_memory(needed, device):
         free = free_memory(device) or 0
         raise InputError(
-            f"{name} need "
-            f"{needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free: "
+            f"{name} need {needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free: "
             "reduce their number or size",
         )
 

@@ -307,8 +307,7 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
         )
     if list(own_classes) != list(classes):
         raise InputError(
-            f"name={name} "
-            "has other classes than the data, or in another order: "
+            f"name={name} has other classes than the data, or in another order: "
             f"{classes[0]!r} first",
             "name",
         )

@@ -330,8 +330,7 @@ def require_transferable(
     ):
         if requested and bound_parameters:
             raise InputError(
-                f"{argument}: "
-                f"attacked {bound_parameters[0]} cannot be transferred to others, "
+                f"{argument}: attacked {bound_parameters[0]} cannot be transferred to others, "
                 "leave one of them out",
             )
 

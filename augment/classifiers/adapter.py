@@ -157,8 +157,8 @@ class NetworkCall:
         self.probability_rows += len(logits)
         if self.probability_rows >= MIN_PROBABILITY_ROWS:
             raise InputError(
-                f"{self.name} "
-                "returned probabilities (values in [0, 1] that sum to 1) instead of logits: "
+                f"{self.name} returned probabilities (values in [0, 1] that sum to 1) instead "
+                "of logits: "
                 "remove its softmax, or return its logarithm",
             )
 
@@ -759,11 +759,10 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         last_call = traceback.extract_tb(error.__traceback__)[-1]
         kind = type(error).__name__
         place = f"line {last_call.lineno} of {last_call.filename}"
+        reason = single_line(error)  # type: ignore[arg-type]
         raise InputError(
-            f"name=python:{name} fails ("
-            f"{kind}: {single_line(error)}, in {place}"
-            "): use "
-            "python:package.module:function, which returns (module, size, classes)",
+            f"name=python:{name} fails ({kind}: {reason}, in {place}): "
+            "use python:package.module:function, which returns (module, size, classes)",
             "name",
         ) from error
     # A string is a sequence of strings, too, but no list of names.

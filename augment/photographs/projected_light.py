@@ -236,7 +236,6 @@ def require_photographs(name: str, photographs: Tensor) -> None:
     is_square = len(shape) == 4 and shape[1] == 3 and shape[2] == shape[3]
     if photographs.dtype != torch.uint8 or not is_square or not shape[0]:
         raise InputError(
-            f"{name} is "
-            f"{str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
+            f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
             "give uint8 of shape (N, 3, size, size)",
         )

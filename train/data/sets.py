@@ -151,8 +151,7 @@ def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fra
         count = round(fraction * len(members))
         if not 0 < count < len(members):
             raise InputError(
-                f"{argument}={fraction} of "
-                f"class {int(label)}, {len(members)} images, "
+                f"{argument}={fraction} of class {int(label)}, {len(members)} images, "
                 "is all or nothing",
                 argument,
             )

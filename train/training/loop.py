@@ -476,9 +476,7 @@ class Trainer:
         if not (math.isfinite(loss) and is_finite):
             settings = self.settings
             raise InputError(
-                f"learning_rate={settings.learning_rate} "
-                "with "
-                f"weight_decay={settings.weight_decay} "
+                f"learning_rate={settings.learning_rate} with weight_decay={settings.weight_decay} "
                 f"made the loss or weights NaN or infinite in epoch {epoch}: "
                 "set lower values",
                 "learning_rate",
