@@ -6,9 +6,10 @@ from train.help import HelpText
 
 
 def list_parameters(words: list[str]) -> list[str]:
-    """Write attack=lighting+geometry as attack=[lighting,geometry].
+    """Replace attack=lighting+geometry by the list attack=[lighting,geometry].
 
-    A reloaded adversary is not attacked, unless attack= asks for it.
+    With reload=FOLDER, the command shows a saved adversary. The default attack is
+    then replaced by an empty list, unless the words contain attack=.
 
     Args:
         words: Words of the command line.

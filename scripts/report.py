@@ -25,10 +25,10 @@ def name_folders(words: list[str]) -> list[str]:
 
 
 def names_folder(word: str) -> bool:
-    """Return whether a word of the command line names a folder.
+    """Return whether a word of the command line is the path of a folder.
 
-    Other words are options, such as --help, and settings, such as out=page. The
-    path of a folder may contain "=" if the folder exists.
+    Words that begin with "-" are options. Words that contain "=" are settings,
+    such as out=page, except if a file or folder of this name exists.
     """
     if not word or word.startswith("-"):
         return False

@@ -37,7 +37,8 @@ from train.settings import (
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
 # Renderers that can verify written adversaries.
 RENDERERS = ("reload", "mitsuba")
-# Power of the default lamps if only their positions are attacked.
+# Power with which each default lamp starts (`LampsSettings.start`) if an attack moves the
+# lamps, but does not change their power.
 LAMP_POWER = 2.0
 # Patterns of projectors that a training may use.
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")

@@ -412,7 +412,9 @@ class Descent:
         state: State,
         evaluation: Evaluation,
     ) -> Tensor:
-        """Return a mask of the finished examples that also lead by more than noise changes.
+        """Return a mask of the finished examples whose lead survives the noise of a camera.
+
+        The lead of a view is its logit gap, see `augment.losses.logit_gap`.
 
         Args:
             is_finished: Mask of the examples that lead by the margin,

@@ -23,7 +23,8 @@ ONNX = ".onnx"
 TORCHSCRIPT = (".pt", ".pth", ".ts", ".jit", ".torchscript")
 # Endings of the names of all files that contain a network.
 SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
-# Pixels per side of the images of a network whose file and user name none.
+# Pixels per side of the images of a network, if neither its file nor the setting
+# `size` tells another number.
 DEFAULT_SIZE = 224
 
 

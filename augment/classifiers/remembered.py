@@ -29,8 +29,8 @@ class Remembered(Wrapper):
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W)."""
         keys = [_digest(image) for image in images.detach().cpu()]
-        # Index in `images` of each new image, by its hash. If two images of the batch are the
-        # same, the function gets one of them.
+        # Index in `images` of each image without remembered scores, by the hash of the
+        # image. Equal images have one entry, so the network classifies them once.
         row_of_key = {key: row for row, key in enumerate(keys) if key not in self.scores}
         if row_of_key:
             rows = torch.tensor(list(row_of_key.values()), device=images.device)

@@ -81,7 +81,8 @@ NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
 )
-# Keys of the settings that name the folder of a part.
+# Settings of pnb-audit that name a folder of images to score. The keys are the
+# names of these images on the page.
 FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
 # Keys of settings that may be set when a stopped audit continues.
 ADDED = ("hardened", "photos", "photographs")

@@ -219,7 +219,8 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
     pixels = cast(Tensor, split.images)
     device = pixels.device
     # Number of images that are shifted and flipped in one call. It is a multiple
-    # of `share`, so that the images make whole batches.
+    # of `share`, the number of images of this process in a batch, so that these
+    # images fill whole batches.
     at_once = share * max(1, CHUNK_BYTES // (share * pixels[0].numel()))
 
     # The draws of all batches are copied to the device together, so that no batch

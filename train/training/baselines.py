@@ -104,7 +104,8 @@ def pgd(
         images: Images, shape (B, 3, H, W), uint8.
         labels: Labels, shape (B,); see `augment.losses.label_loss`.
         draws: CPU generator of the random start.
-        absent: Further classes that no image of a complementary label shows.
+        absent: Classes that an image with a complementary label certainly does
+            not show, besides the class of this label.
 
     Returns:
         Images within the norm-balls of `PGD`, rounded to 8 bits,

@@ -18,9 +18,10 @@ from train.settings import ExperimentSettings, label_names, simplified
 FIRST_SEED = 2001
 # Number of instances of each class under study.
 INSTANCES = 6
-# Number of instances of each other thing in OTHERS.
+# Number of instances of each solid in OTHERS.
 OTHER_INSTANCES = 2
-# Generated things that resemble fruit.
+# Generated solids that a network may confuse with the class under study: fruit, a
+# vegetable and a ball.
 OTHERS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
 
 
