@@ -382,7 +382,7 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
         after = fmean(run.scores["test/accuracy"] for run in runs)
         images = runs[0].config.get("test_images", "the test images")
         change = f"accuracy went from {before:.1%} to {after:.1%}"
-        sentences.append(f"{method}: {change}, on {images}.")
+        sentences.append(f"{method}: {change} on {images}.")
     return sentences
 
 

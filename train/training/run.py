@@ -680,8 +680,10 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
     # The test images are read only at the end of the run, so the classes are
     # counted in the training images.
-    others = len(data.classes) - len(data.train.labels.unique())
-    return f"{kind}, not of the network's {others} other classes" if others else kind
+    class_count = len(data.train.labels.unique())
+    if class_count == len(data.classes):
+        return kind
+    return f"{kind} of {class_count} of the network's {len(data.classes)} classes"
 
 
 def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
