@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 SRGB_KNEE = 0.0031308
 # Encoded value at the same point of the curve.
 SRGB_ENCODED_KNEE = 0.04045
+# Weights of linear red, green and blue in the luminance (Rec. 709, IEC 61966-2-1).
+LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def tonemap(

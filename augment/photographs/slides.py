@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from augment.scene.patterns import draw_patterns, pixel_centers, random_colors
-from renderer.image import decode, to_unit
+from renderer.image import LUMINANCE, decode, to_unit
 
 # Smallest and largest number of cells of a slide that `draw_cells` draws.
 MIN_CELLS = 3
@@ -34,8 +34,6 @@ SHARES = (0.4, 0.15, 0.15, 0.3)
 # Coordinate of unused centers of cells in `draw_cells`. They are so far away that no pixel is
 # in their cells.
 FAR = 100.0
-# Luminance of red, green and blue of linear sRGB (IEC 61966-2-1).
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def luminance(linear: Tensor) -> Tensor:

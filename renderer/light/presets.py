@@ -15,6 +15,7 @@ from torch import Tensor
 
 from renderer.errors import InputError, require_bounded
 from renderer.geometry.mesh import Y_UP_TO_Z_UP
+from renderer.image import LUMINANCE
 from renderer.light.basis import COEFFICIENTS, DEGREE, Harmonics
 from renderer.light.environment import SUFFIXES, read_panorama
 from renderer.light.harmonics import (
@@ -74,8 +75,6 @@ PROBES = tuple(_PUBLISHED_PROBES)
 UNIFORM = "uniform"
 # `load_light` scales environment maps to the mean luminance of this probe.
 _REFERENCE_PROBE = "grace"
-# Weights of linear red, green and blue (Rec. 709) in the luminance.
-_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 
 
 def load_light(
@@ -236,7 +235,8 @@ def mean_luminance(coefficients: Tensor) -> float:
     Returns:
         Luminance.
     """
-    return float(coefficients[0].cpu().double() @ _LUMINANCE)
+    weights = torch.tensor(LUMINANCE, dtype=torch.float64)
+    return float(coefficients[0].cpu().double() @ weights)
 
 
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:

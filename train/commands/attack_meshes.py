@@ -2,7 +2,7 @@
 
 import shlex
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -161,21 +161,8 @@ def run(settings: AttackExperimentSettings) -> None:
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
         _remove_adversaries(out)
-        sweeps: dict[str, Sweep] = {}
-        outcomes = []
         mesh_attacks = attacks(settings, classifier, device, adversary)
-        for index, mesh_attack in enumerate(mesh_attacks):
-            # Windows allows no colon in the name of a folder.
-            stem = Path(mesh_attack.name.replace(":", "_")).stem
-            folder = out / f"{index}_{stem}"
-            outcome = _write_attack(mesh_attack, folder, settings, targets)
-            if settings.attack.radius_scales:
-                sweep = success_by_radius(mesh_attack.result, settings.attack.radius_scales)
-                sweeps[folder.name] = sweep
-                outcome.details += format_sweep(sweep).splitlines()
-            outcomes.append(outcome)
-            if is_verbose():
-                print("\n".join([outcome.heading, *outcome.details, ""]))
+        outcomes, sweeps = _write_attacks(mesh_attacks, out, settings, targets)
         if not is_verbose():
             print("\n".join(shortened(format_outcomes(outcomes))))
         if sweeps:
@@ -203,6 +190,41 @@ def _require_attack_settings(settings: AttackExperimentSettings) -> None:
         )
     with keyed("attack", **keys_of("attack", settings.attack)):
         require_renderers(settings.attack.renderers)
+
+
+def _write_attacks(
+    mesh_attacks: Iterable[MeshAttack],
+    out: Path,
+    settings: AttackExperimentSettings,
+    targets: TransferTargets,
+) -> tuple[list[Outcome], dict[str, Sweep]]:
+    """Attack each mesh, and write the result to a folder of its own.
+
+    Args:
+        mesh_attacks: Attacks, each of which runs when it is asked for.
+        out: Folder that contains the folders of the meshes.
+        settings: Settings of pnb-attack.
+        targets: Other classifiers, views and meshes that see the adversaries.
+
+    Returns:
+        Outcome of each attack, and the success at each radius by the name of the
+        folder. The second is empty if `attack.radius_scales` is empty.
+    """
+    sweeps: dict[str, Sweep] = {}
+    outcomes = []
+    for index, mesh_attack in enumerate(mesh_attacks):
+        # Windows allows no colon in the name of a folder.
+        stem = Path(mesh_attack.name.replace(":", "_")).stem
+        folder = out / f"{index}_{stem}"
+        outcome = _write_attack(mesh_attack, folder, settings, targets)
+        if settings.attack.radius_scales:
+            sweep = success_by_radius(mesh_attack.result, settings.attack.radius_scales)
+            sweeps[folder.name] = sweep
+            outcome.details += format_sweep(sweep).splitlines()
+        outcomes.append(outcome)
+        if is_verbose():
+            print("\n".join([outcome.heading, *outcome.details, ""]))
+    return outcomes, sweeps
 
 
 def _write_attack(
