@@ -164,7 +164,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     # Change of the attack values of this example, shape (1, D).
     change = descent.values[[example]] - result.problem.start[[example]]
     changes = result.problem.split_by_parameter(change)
-    # By the name of the parameter.
+    # The keys are the names of the attacked parameters.
     largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
     return {
         "clean_correct": bool(result.clean_correct[example]),

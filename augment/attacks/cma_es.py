@@ -180,7 +180,7 @@ def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
         "verbose": -9,
         "popsize": population_size,
         "CMA_diagonal": value_count > MAX_FULL_COVARIANCE,
-        # With a seed, the library would seed NumPy for the whole process.
+        # If cma got a seed, it would seed NumPy for the whole process.
         "seed": np.nan,
         "randn": lambda *shape: numbers.standard_normal(shape),
     }
