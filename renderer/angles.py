@@ -4,10 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-# Files with angles in degrees have the entry `ANGLE_UNIT` with the value `DEGREES`.
+# Name of the entry of a file that says the unit of the angles in the file.
 ANGLE_UNIT = "angle_unit"
+# Value of this entry in files whose angles are in degrees.
 DEGREES = "degrees"
-# Names of the entries of a file that are angles.
+# Names of the entries that are angles, in files with cameras or projectors.
 ANGLES = ("polar", "azimuth", "fov")
 
 
@@ -15,9 +16,9 @@ def angles_in_degrees(description: Mapping[str, Any], unit: str | None) -> dict[
     """Convert the angles of a camera or of a projector from a file to degrees.
 
     Args:
-        description: Entries of the file. Entries with names in `ANGLES` are
-            angles.
-        unit: Value of the entry `ANGLE_UNIT` of the file. None for files of
+        description: Entries of the camera or of the projector by name. The
+            entries "polar", "azimuth" and "fov" are angles.
+        unit: Unit of the angles in the file: "degrees", or None for files of
             earlier versions, whose angles are in radians.
 
     Returns:

@@ -24,17 +24,19 @@ from renderer.vectors import unit
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
-# `vertex_normals` adds up area vectors of the faces around a vertex. If the sum is
-# shorter than this fraction of the sum of the lengths, it is only rounding error.
-ROUNDING = 64 * torch.finfo(torch.float64).eps
-# If a mesh has at least FEW times as many vertices as the given faces have corners,
-# it is faster to renumber the vertices of these faces than to process all vertices.
-FEW = 2
-# A face is a sliver if the sine of the angle at its first corner is at most this
-# number. With a smaller angle, the cross product in plain float64 would lose more
-# than about 64 units in the last place.
-SLIVER = 1 / 16
-# `_halves` multiplies a float64 number by this number to split its 53 binary digits
+# `vertex_normals` adds up the area vectors of the faces around a vertex. They cancel
+# if their sum is shorter than this fraction of the sum of their lengths. Such a short
+# sum consists of rounding errors only.
+CANCELLATION = 64 * torch.finfo(torch.float64).eps
+# A call may be about a few faces of a large mesh. If the mesh has at least this many
+# vertices per corner of these faces, only the vertices of these faces are processed,
+# which is then faster than processing all vertices.
+SPARSE_VERTEX_RATIO = 2
+# A triangle counts as a sliver if the sine of the angle at its first corner is at most
+# this number. Below it, a plain float64 cross product of the two edges would have a
+# rounding error of more than about 64 units in the last place.
+MAX_SLIVER_SINE = 1 / 16
+# `_halves` multiplies a float64 number by this constant to split its 53 binary digits
 # into two halves (Dekker 1971).
 _SPLITTER = 2.0**27 + 1
 
@@ -42,9 +44,10 @@ _SPLITTER = 2.0**27 + 1
 def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
     """Compute the unit normals of faces, differentiable with respect to the vertices.
 
-    The derivative of a normal n by a corner v is ∂n/∂v = -h nᵀ / |h|², with the
-    perpendicular vector h from the opposite edge to v. The paper's Section 3
-    prints the wrong sign.
+    The derivative of the normal n with respect to a corner v of the face is
+    ∂n/∂v = -h nᵀ / |h|². The vector h is the height of the triangle: it leads from
+    the opposite edge to v and is perpendicular to this edge. (Section 3 of the
+    paper "Beyond Pixel Norm-Balls" prints the wrong sign.)
 
     Args:
         vertices: Vertex positions, shape (V, 3).
@@ -87,22 +90,25 @@ def vertex_normals(
     Raises:
         InputError: If a position is NaN or infinite.
     """
-    # All first corners come first. Shape (3 components, 3 F corners).
+    # Each corner of a face gets the area vector of the face, shape (3 components,
+    # 3 F corners). The F first corners come first, then all second and third corners.
     corner_vectors = area_vectors(vertices, faces).repeat(1, 3)
     vertex_of_corner = faces.T.flatten()
     zero_vectors = corner_vectors.new_zeros(3, len(vertices))
     vertex_vectors = zero_vectors.index_add(1, vertex_of_corner, corner_vectors)
-    # Sum of the lengths of the vectors around each vertex, shape (V,).
-    length_sums = corner_vectors.new_zeros(len(vertices))
-    length_sums = length_sums.index_add(0, vertex_of_corner, _length(corner_vectors.detach()))
-    is_canceled = _length(vertex_vectors.detach()) <= ROUNDING * length_sums
+    # For each vertex, the sum of the lengths of the area vectors around it, shape (V,).
+    zero_lengths = corner_vectors.new_zeros(len(vertices))
+    corner_lengths = _length(corner_vectors.detach())
+    length_sums = zero_lengths.index_add(0, vertex_of_corner, corner_lengths)
+    is_canceled = _length(vertex_vectors.detach()) <= CANCELLATION * length_sums
     return unit(vertex_vectors.masked_fill(is_canceled, 0)).T.to(vertices.dtype)
 
 
 def plain_face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Compute the unit normals of faces with NumPy, without a gradient.
 
-    Unlike in `face_normals`, rounding errors are not corrected.
+    Unlike `face_normals`, this function does not correct the rounding errors of
+    triangles with a very small angle.
 
     Args:
         vertices: Vertex positions, shape (V, 3).
@@ -120,7 +126,7 @@ def plain_face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute a normal vector of each face whose length is twice the area of the face.
+    """Compute a vector along the normal of each face, whose length is twice the face area.
 
     Args:
         vertices: Vertex positions, shape (V, 3).
@@ -132,9 +138,9 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
-    # The edges a and b lead from the first corner to the second and the third
-    # corner. Their cross product is written out, because np.cross is several times
-    # slower.
+    # The edge a leads from the first corner of a face to the second corner, and the
+    # edge b to the third corner. The cross product a × b is written out, because
+    # np.cross is several times slower.
     ax, ay, az = corners[:, 1] - corners[:, 0]
     bx, by, bz = corners[:, 2] - corners[:, 0]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
@@ -143,45 +149,45 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def corner_normals(
     vertices: np.ndarray, faces: np.ndarray, normals: str, crease: float = -2.0
 ) -> np.ndarray:
-    """Compute the unit normals with which the corners of faces are shaded.
+    """Compute a shading normal for each corner of each face.
 
     Args:
         vertices: Vertex positions, float64, shape (V, 3).
         faces: Vertex indices of the faces, counter-clockwise seen from outside,
             shape (F, 3).
-        normals: "smooth" for vertex normals, or "flat" for face normals.
-        crease: Cosine of the largest angle between the normals of a vertex and a
-            face at which "smooth" uses the vertex normal. If the angle is
-            larger, the corner gets the face normal. The default -2 allows all
-            angles.
+        normals: "flat" gives a corner the normal of its face. "smooth" gives it
+            the normal of its vertex.
+        crease: Smallest cosine of the angle between the vertex normal and the
+            face normal at which "smooth" uses the vertex normal. At sharper
+            creases, the corner gets the face normal. The default -2 uses the
+            vertex normal at all angles.
 
     Returns:
-        Unit normals of the three corners of each face, float64,
-        shape (F, 3, 3). A corner gets (0, 0, 1) if both normals are zero.
+        Unit normals, one row for each face and one column for each corner,
+        float64, shape (F, 3, 3). The normal is (0, 0, 1) if the face normal and
+        the vertex normal are both zero.
 
     Raises:
         InputError: If `normals` is neither "smooth" nor "flat".
     """
     require_choice("normals", normals, NORMALS)
-    normals_by_face = plain_face_normals(vertices, faces)
-    # Repeat the normal of each face for its three corners, shape (F, 3, 3).
-    chosen = np.broadcast_to(normals_by_face[:, None], (len(faces), 3, 3))
+    face_normal = plain_face_normals(vertices, faces)
+    # The normal of a face, repeated for its three corners, shape (F, 3, 3).
+    normal_of_corner = np.broadcast_to(face_normal[:, None], (len(faces), 3, 3))
     if normals == "smooth":
-        normals_by_vertex = vertex_normals(
-            torch.from_numpy(vertices), torch.from_numpy(faces)
-        ).numpy()
-        smooth = normals_by_vertex[faces]
-        cosine = (smooth * chosen).sum(axis=-1)
-        is_flat = ~smooth.any(axis=-1) | (cosine < crease)
-        chosen = np.where(is_flat[..., None], chosen, smooth)
-    has_normal = chosen.any(axis=-1, keepdims=True)
-    return np.where(has_normal, chosen, [0.0, 0.0, 1.0])
+        vertex_normal = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+        smooth_normal = vertex_normal[faces]
+        cosine = (smooth_normal * normal_of_corner).sum(axis=-1)
+        is_flat = ~smooth_normal.any(axis=-1) | (cosine < crease)
+        normal_of_corner = np.where(is_flat[..., None], normal_of_corner, smooth_normal)
+    has_normal = normal_of_corner.any(axis=-1, keepdims=True)
+    return np.where(has_normal, normal_of_corner, [0.0, 0.0, 1.0])
 
 
 def area_vectors(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float64[Tensor, "3 F"]:
-    """Compute a normal vector of each face whose length is proportional to the area of the face.
+    """Compute a vector along the normal of each face, with a length in proportion to its area.
 
     The vectors are differentiable with respect to the vertices.
 
@@ -191,8 +197,8 @@ def area_vectors(
             shape (F, 3).
 
     Returns:
-        Outward vectors, float64, shape (3, F). The length divided by the area is
-        the same power of two for all faces.
+        Outward vectors, float64, shape (3, F). The ratio of length to face area is
+        the same for all faces, and is a power of two.
 
     Raises:
         InputError: If a position is NaN or infinite.
@@ -210,11 +216,11 @@ class _AreaVectors(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> Tensor:
-        """Compute the area vector u × v of each face from scaled edges u and v.
+        """Compute the area vector u × v of each face from its edges u and v.
 
-        All edges are divided by the same power of two, so that products of large
-        edges do not overflow. The area vectors are therefore divided by the
-        square of this power. For positions that are not float64, the power is 1.
+        Edges in float64 are first divided by a power of two that all faces share.
+        Products of large edges then do not overflow. The area vectors become
+        smaller by the square of this power.
 
         Args:
             ctx: Context of autograd.
@@ -227,68 +233,90 @@ class _AreaVectors(torch.autograd.Function):
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
         # Positions of the corners of F faces, shape (3 components, 3 corners, F).
         corners = corners.unflatten(1, (3, -1))
-        # Both edges of each face, shape (3 components, 2 edges, F).
+        # The edges from the first corner of each face to the second and the third
+        # corner, shape (3 components, 2 edges, F).
         edges = corners[:, 1:] - corners[:, :1]
-        # Products of float64 values may overflow, so float64 edges are scaled.
+        # Products of edges overflow only if the positions are float64.
         is_float64 = vertices.dtype == torch.float64
         scale = _power_of_two(edges) if is_float64 else edges.new_ones(())
         edge_u, edge_v = edges.div_(scale).unbind(1)
-        product = _cross(edge_u, edge_v)
+        area_vectors = _cross(edge_u, edge_v)
         squared_u, squared_v = edges.square().sum(0)
-        # |u × v| is |u| |v| times the sine of the angle at the first corner.
-        is_sliver = product.square().sum(0) <= SLIVER**2 * squared_u * squared_v
+        # The length |u × v| is |u| |v| times the sine of the angle between u and v.
+        max_squared_length = MAX_SLIVER_SINE**2 * squared_u * squared_v
+        is_sliver = area_vectors.square().sum(0) <= max_squared_length
         slivers = torch.nonzero(is_sliver).squeeze(1)
         if len(slivers):
-            product[:, slivers] = _exact_cross(*(corners[:, :, slivers] / scale).unbind(1))
+            first, second, third = (corners[:, :, slivers] / scale).unbind(1)
+            area_vectors[:, slivers] = _exact_cross(first, second, third)
         ctx.save_for_backward(faces, edge_u, edge_v, scale)
         ctx.vertex_shape = vertices.shape
         ctx.dtype = vertices.dtype
-        return product
+        return area_vectors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient by the vertices.
+        """Compute the gradient of the loss with respect to the vertices.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the area vectors, shape (3, F).
+            upstream: Gradient of the loss with respect to the area vectors,
+                shape (3, F).
 
         Returns:
-            Gradient by the vertices, shape (V, 3), and None for the faces.
+            Gradient with respect to the vertices, shape (V, 3), and None, because
+            the faces have no gradient.
         """
         faces, edge_u, edge_v, scale = ctx.saved_tensors
-        # The gradient of g · (u × v) is v × g by u, and g × u by v. The second
-        # corner moves u, the third corner moves v, and the first corner moves both
-        # edges in the opposite direction.
+        # The gradient of g · (u × v) is v × g with respect to u, and g × u with
+        # respect to v. The second corner is the end of u, and the third the end of v.
         second_corner_gradient = _cross(edge_v, upstream)
         third_corner_gradient = _cross(upstream, edge_u)
+        # The first corner is the start of both edges, so the signs are reversed.
         first_corner_gradient = -second_corner_gradient - third_corner_gradient
-        # Shape (3 components, 3 F corners), with all first corners first.
+        # Shape (3 components, 3 F corners): all first corners, then all second and
+        # all third corners.
         corner_gradients = torch.cat(
             [first_corner_gradient, second_corner_gradient, third_corner_gradient], dim=1
         )
         corner_gradients = corner_gradients.div_(scale)
-        vertex_of_corner = faces.T.flatten()
-        vertex_count, component_count = ctx.vertex_shape
-        if vertex_count < FEW * len(vertex_of_corner):
-            # Add the gradients of the corners at each vertex.
-            gradient = upstream.new_zeros(component_count, vertex_count)
-            gradient.index_add_(1, vertex_of_corner, corner_gradients)
-            return gradient.T.to(ctx.dtype), None
-        # Only few of the vertices have faces. Adding the gradients of these
-        # vertices alone avoids a float64 tensor of all vertices.
-        used_vertices, corner_to_used = vertex_of_corner.unique(return_inverse=True)
-        zeros = corner_gradients.new_zeros(3, len(used_vertices))
-        sums = zeros.index_add_(1, corner_to_used, corner_gradients)
-        gradient = torch.zeros(component_count, vertex_count, dtype=ctx.dtype, device=sums.device)
-        return gradient.index_copy_(1, used_vertices, sums.to(ctx.dtype)).T, None
+        gradient = _sum_at_vertices(corner_gradients, faces, ctx.vertex_shape[0], ctx.dtype)
+        return gradient.T, None
+
+
+def _sum_at_vertices(
+    corner_gradients: Tensor, faces: Tensor, vertex_count: int, dtype: torch.dtype
+) -> Tensor:
+    """Add up the gradients of all face corners that lie at the same vertex.
+
+    Args:
+        corner_gradients: Gradient of each corner: all first corners of the F
+            faces, then all second and all third corners, shape (3, 3 F).
+        faces: Vertex indices of the corners of each face, shape (F, 3).
+        vertex_count: Number V of vertices of the mesh.
+        dtype: Type of the result.
+
+    Returns:
+        Gradient of each vertex, shape (3, V).
+    """
+    vertex_of_corner = faces.T.flatten()
+    if vertex_count < SPARSE_VERTEX_RATIO * len(vertex_of_corner):
+        zeros = corner_gradients.new_zeros(3, vertex_count)
+        return zeros.index_add_(1, vertex_of_corner, corner_gradients).to(dtype)
+    # Most vertices have no face here. Adding up the gradients of the other vertices
+    # alone avoids a float64 tensor of the size of the mesh.
+    used_vertices, corner_to_used = vertex_of_corner.unique(return_inverse=True)
+    zeros = corner_gradients.new_zeros(3, len(used_vertices))
+    sums = zeros.index_add_(1, corner_to_used, corner_gradients)
+    gradient = torch.zeros(3, vertex_count, dtype=dtype, device=sums.device)
+    return gradient.index_copy_(1, used_vertices, sums.to(dtype))
 
 
 def _length(vectors: Tensor) -> Tensor:
     """Compute the lengths of N vectors.
 
-    torch.norm is fifty times slower along an axis of length three.
+    torch.norm would be fifty times slower along an axis of length three.
 
     Args:
         vectors: Vectors, shape (3, N).
@@ -300,19 +328,20 @@ def _length(vectors: Tensor) -> Tensor:
 
 
 def _power_of_two(edges: Tensor) -> Tensor:
-    """Find a power of two that is about the largest component of all edges.
+    """Find the smallest power of two above the magnitudes of all components of some edges.
 
-    A division by a power of two has no rounding error. Products of edges that
-    are divided by it do not overflow.
+    Edges that are divided by this power have components between -1 and 1, so
+    products of them do not overflow. The division has no rounding error.
 
     Args:
         edges: Edge vectors of any shape.
 
     Returns:
-        Power of two, shape (). It is 1 if there are no edges.
+        Power of two, shape (). It is 1 if there are no edges, or if all are zero.
     """
     if not edges.numel():
         return edges.new_ones(())
+    # For a number x > 0, frexp gives the exponent e with 2^(e - 1) <= x < 2^e.
     _, exponent = torch.frexp(edges.abs().max())
     return torch.ldexp(edges.new_ones(()), exponent)
 
@@ -320,8 +349,8 @@ def _power_of_two(edges: Tensor) -> Tensor:
 def _cross(u: Tensor, v: Tensor) -> Tensor:
     """Compute the cross products of N pairs of vectors.
 
-    Unlike torch.linalg.cross, the result for parallel vectors is exactly zero,
-    because multiplications and additions are not fused.
+    Unlike torch.linalg.cross, this function gives exactly zero for parallel
+    vectors, because it does not fuse multiplications and additions.
 
     Args:
         u: First vector of each pair, shape (3, N).
@@ -353,66 +382,77 @@ def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     v, v_error = _difference(c, a)
     ux, uy, uz = u
     vx, vy, vz = v
-    # Components of u × v, in which the rounding errors of the products are corrected.
+    # The components of u × v, with the rounding errors of the products added back.
     x = _difference_of_products(uy, vz, uz, vy)
     y = _difference_of_products(uz, vx, ux, vz)
     z = _difference_of_products(ux, vy, uy, vx)
-    # The rounding errors of u and v change the product by u × v_error and u_error × v.
-    # The product u_error × v_error is negligible.
-    return torch.stack([x, y, z]) + (_cross(u, v_error) + _cross(u_error, v))
+    product = torch.stack([x, y, z])
+    # (u + u_error) × (v + v_error) = u × v + u × v_error + u_error × v, because
+    # u_error × v_error is negligible.
+    return product + (_cross(u, v_error) + _cross(u_error, v))
 
 
 def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a - b, and the rounding error of the difference (Knuth 1969).
+    """Compute a - b, and the rounding error of this difference (Knuth 1969).
 
     Args:
-        a: Minuend, shape (N,) or (3, N).
+        a: Minuend, float64, shape (N,) or (3, N).
         b: Subtrahend, same shape.
 
     Returns:
-        The rounded difference, and the exact difference minus the rounded one.
+        A tuple of
+        - the rounded difference;
+        - the exact difference minus the rounded difference.
     """
     rounded = a - b
+    # Without rounding, `negative_b` would be -b, and both errors would be 0.
     negative_b = rounded - a
-    return rounded, (a - (rounded - negative_b)) - (b + negative_b)
+    error_of_a = a - (rounded - negative_b)
+    error_of_b = b + negative_b
+    return rounded, error_of_a - error_of_b
 
 
 def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a · b, and the rounding error of the product (Dekker 1971).
+    """Compute a · b, and the rounding error of this product (Dekker 1971).
 
-    Each factor is split into two halves of its digits. Products of halves are
-    exact.
+    The binary digits of each factor are split into an upper and a lower half.
+    Products of two halves have no rounding error.
 
     Args:
-        a: First factor, shape (N,).
-        b: Second factor, shape (N,).
+        a: First factor, float64, shape (N,).
+        b: Second factor, float64, shape (N,).
 
     Returns:
-        The rounded product, and the exact product minus the rounded one.
+        A tuple of
+        - the rounded product;
+        - the exact product minus the rounded product.
     """
     rounded = a * b
     a_high, a_low = _halves(a)
     b_high, b_low = _halves(b)
+    # Subtract `rounded` from the four products of halves, the largest product first.
     error = (a_high * b_high - rounded) + a_high * b_low + a_low * b_high
     return rounded, error + a_low * b_low
 
 
-def _halves(value: Tensor) -> tuple[Tensor, Tensor]:
-    """Split numbers into the upper and the lower half of their binary digits.
+def _halves(numbers: Tensor) -> tuple[Tensor, Tensor]:
+    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971).
 
     Args:
-        value: Numbers, float64, shape (N,).
+        numbers: Numbers, float64, shape (N,).
 
     Returns:
-        The upper and the lower halves, whose sums are exactly the numbers.
+        Upper halves and lower halves, shape (N,) each. Their sums are exactly the
+        given numbers.
     """
-    scaled = _SPLITTER * value
-    high = scaled - (scaled - value)
-    return high, value - high
+    scaled = _SPLITTER * numbers
+    # Both subtractions round away the lower half of the digits.
+    high = scaled - (scaled - numbers)
+    return high, numbers - high
 
 
 def _difference_of_products(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Compute a · b - c · d almost without rounding errors.
+    """Compute a · b - c · d for N quadruples of numbers, almost without rounding errors.
 
     Args:
         a: First factor of the first product, float64, shape (N,).

@@ -37,7 +37,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
-from renderer.geometry.normals import FEW, area_vectors, vertex_normals
+from renderer.geometry.normals import SPARSE_VERTEX_RATIO, area_vectors, vertex_normals
 from renderer.light import harmonics
 from renderer.shading.gloss import SampleGloss, at_samples, toward_camera
 from renderer.shading.lobes import along, coat_bands
@@ -568,7 +568,7 @@ def normals_in_sight(
     first, second, third = has_seen_corner.T
     needed_faces = faces[first | second | third]
     vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
-    if len(vertices) < FEW * needed_faces.numel():
+    if len(vertices) < SPARSE_VERTEX_RATIO * needed_faces.numel():
         return vertex_normals(vertices, needed_faces)
     # If the needed faces have few of the vertices, compute normals of these only.
     used_vertices, renumbered_faces = needed_faces.unique(return_inverse=True)
