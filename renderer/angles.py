@@ -6,7 +6,7 @@ from typing import Any
 
 # Name of the entry of a file that says the unit of the angles in the file.
 ANGLE_UNIT = "angle_unit"
-# Value of this entry in files whose angles are in degrees.
+# Value of the entry "angle_unit" in files whose angles are in degrees.
 DEGREES = "degrees"
 # Names of the entries that are angles, in files with cameras or projectors.
 ANGLES = ("polar", "azimuth", "fov")

@@ -24,13 +24,13 @@ from renderer.geometry.skin import Skin
 from renderer.settings import MAX_VERTICES
 from renderer.validation import as_array, require_whole
 
-# Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. Loaders use it
-# for files in which y points up.
+# Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes
+# from files in which y points up to our axes, in which z points up.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
-# Allowed values of `dtype.kind` for each array of a mesh (f: floating-point, i:
-# signed integer, u: unsigned integer).
+# Allowed types of each array of a mesh, as values of `dtype.kind`: f is floating-point,
+# i is a signed integer, and u is an unsigned integer.
 _KINDS = {
     "vertices": "fiu",
     "faces": "iu",
@@ -39,23 +39,20 @@ _KINDS = {
     "texture_ids": "iu",
     "gloss": "fiu",
 }
-# Names of the attributes of a mesh that have a row for each face.
+# Names of the arrays of a mesh that have one row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
-# For each of the three edges of a face, the numbers (0 to 2) of the two corners at
-# its ends.
+# The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
-# `_quartered` divides a face into these four triangles. Points 0 to 2 are the
-# corners of the face, and points 3 to 5 are the midpoints of its `EDGES`.
+# Corners of the four triangles into which a triangle is divided. Points 0, 1 and 2 are
+# its corners. Points 3, 4 and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-# Row of `Mesh.gloss` (roughness, metallic, specular factor) for a face without
-# specular reflection. `concatenate` uses the row for matte meshes if another mesh
-# has gloss.
+# Roughness, metallic and specular factor of a face without specular reflection.
 _MATTE = np.array([[1, 0, 0]], dtype=np.float32)
-# Gloss texture with one texel, whose factors are 1. `concatenate` uses it for
-# textures of meshes that have no gloss textures.
+# Gloss texture with one texel that leaves roughness and metallic unchanged. The stored
+# value 255 means the factor 1.
 _NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
-# Factors for red, green and blue in [0, 255] that pack a texel into one integer:
-# red in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
+# Factors that pack the red, green and blue bytes of a texel into one integer: red in
+# bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
 _PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
 
 
@@ -74,8 +71,8 @@ class Mesh:
         corner_uvs: Texture coordinates of the three corners of each face,
             float32, shape (F, 3, 2). The origin is the bottom left corner of the
             texture. Zeros for faces without a texture.
-        texture_ids: Index in `textures` of the texture of each face, or
-            `NO_TEXTURE`, int32, shape (F,).
+        texture_ids: Index in `textures` of the texture of each face, int32,
+            shape (F,). -1 for a face without a texture.
         textures: sRGB-encoded textures, uint8, shape (H, W, 3) each, for H rows
             and W columns of texels. Row 0 is at the top.
         gloss: Roughness, metallic and specular factor of each face, in [0, 1]
@@ -113,8 +110,8 @@ class Mesh:
     skin: Skin | None = None
 
     def __post_init__(self) -> None:
-        """Convert lists to arrays, and check shapes, types and indices."""
-        # object.__setattr__ is needed to set attributes of a frozen dataclass.
+        """Convert lists to arrays, and check the shapes, types and indices in all fields."""
+        # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
         for name, kinds in _KINDS.items():
             value = getattr(self, name)
             is_matte = name == "gloss" and value is None
@@ -185,8 +182,8 @@ class Mesh:
         """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
         given_faces = as_array("faces", faces)
-        # The conversion turns NaN into an arbitrary integer. The comparison below
-        # then raises the error.
+        # astype turns NaN into an arbitrary integer, with a warning. The warning is
+        # suppressed, because the comparison below finds the difference.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
@@ -197,8 +194,8 @@ class Mesh:
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
         try:
             vertex_colors = np.broadcast_to(color, vertices.shape)
-            # Indices out of range are clipped here. `Mesh(...)` below raises an error
-            # that names them.
+            # Vertex indices out of range are clipped, because `Mesh(...)` below raises
+            # a better error than `take` would.
             corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(
@@ -222,7 +219,7 @@ class Mesh:
 
     def face_areas(self) -> np.ndarray:
         """Compute the areas of the F faces in squared world units, shape (F,)."""
-        # The length of the vector of a face is twice the area of the face.
+        # The length of each of these vectors is twice the area of a face.
         doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
         return np.linalg.norm(doubled_vectors, axis=1) / 2
 
@@ -230,8 +227,8 @@ class Mesh:
     def vertex_normals(self) -> np.ndarray:
         """Outward unit normals of the V vertices, shape (V, 3).
 
-        The normal of a vertex is the mean of the normals of the faces around it,
-        weighted with their areas (see `renderer.geometry.normals`).
+        The normal of a vertex is the mean of the normals of the faces around the
+        vertex, weighted with the areas of the faces.
         """
         return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
 
@@ -246,13 +243,17 @@ class Mesh:
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     def moved(self, vertices: np.ndarray) -> Mesh:
-        """Return a copy with other vertex positions and without a skin.
+        """Return a copy of the mesh with other vertex positions and without a skin.
 
         Args:
             vertices: Vertex positions of the copy, shape (V, 3).
+
+        Returns:
+            Copy of the mesh, which shares the packed textures with this mesh.
         """
         moved_mesh = replace(self, vertices=vertices, skin=None)
-        # Packing textures takes long, so the copy gets the cached packed textures.
+        # Packing the textures again would take long. A cached property stores its value
+        # in `__dict__`.
         moved_mesh.__dict__["packed_textures"] = self.packed_textures
         return moved_mesh
 
@@ -260,8 +261,9 @@ class Mesh:
     def packed_textures(self) -> tuple[np.ndarray, ...]:
         """Textures with one integer per texel, int32, shape (H, W) each.
 
-        Bits 0 to 7 of a texel are red, 8 to 15 green, and 16 to 23 blue. Looking
-        up one integer is faster than looking up three.
+        Bits 0 to 7 of the integer are red, bits 8 to 15 are green, and bits 16 to
+        23 are blue. Looking up one integer per texel is faster than looking up
+        three bytes.
         """
         return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
 
@@ -270,57 +272,60 @@ class Mesh:
         """True if no camera outside of the mesh can see a face from behind.
 
         Each connected part of the mesh must be watertight, and its faces must be
-        counter-clockwise seen from outside. A part fulfills this if each of its
-        edges occurs once in both directions, and if its faces enclose a positive
-        volume.
+        counter-clockwise seen from outside. This is so if each edge of the part
+        belongs to one face in one direction and to one face in the other
+        direction, and if the faces enclose a positive volume.
         """
         part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
         if part_of_face is None:
             return False
         centered_vertices = self.vertices - self.vertices.mean(axis=0)
         first_corners = centered_vertices[self.faces[:, 0]]
-        # A face and the center form a tetrahedron. This is six times its volume,
-        # negative if the face points to the center, shape (F,).
-        volumes = np.einsum(
-            "fi,fi->f", first_corners, doubled_area_vectors(self.vertices, self.faces)
-        )
-        volume_of_part = np.bincount(part_of_face, volumes)
+        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
+        # Six times the volume of the tetrahedron of each face and the mesh center,
+        # shape (F,). It is negative if the face is turned toward the center.
+        sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
+        volume_of_part = np.bincount(part_of_face, sixfold_volumes)
         return bool((volume_of_part > 0).all())
 
 
-# The cache keeps the last result, because all instances of a procedural solid have
-# the same faces.
+# The result for the last mesh is cached. The next mesh often has the same faces, for
+# example if it is another instance of the same procedural solid.
 @lru_cache(maxsize=1)
 def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
-    """Find the connected parts of a mesh if each edge occurs once in both directions.
+    """Find the connected parts of a mesh, all of which must be closed surfaces.
 
     Args:
-        face_bytes: Bytes of the int64 array `Mesh.faces`, shape (F, 3). Bytes can
-            be hashed, so that the result can be cached.
+        face_bytes: Bytes of the int64 array `Mesh.faces`, shape (F, 3). Unlike an
+            array, bytes can be a key of the cache.
 
     Returns:
-        Index of the connected part of each face, shape (F,). None if an edge has
-        only one face, or more than two faces.
+        Index of the connected part of each face, shape (F,). None if a part is not
+        closed, or if two neighboring faces have opposite orientations.
     """
     # trimesh is imported here because the import takes half a second.
     from trimesh.graph import connected_component_labels
 
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    # Vertices at both ends of the three edges of each face, shape (3 F, 2). The
-    # edges 3 f, 3 f + 1 and 3 f + 2 belong to face f.
+    # First and last vertex of each edge of each face, shape (3 F, 2). The edges in
+    # rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
     edge_ends = faces[:, EDGES].reshape(-1, 2)
     vertex_count = faces.max(initial=0) + 1
-    # An edge from vertex a to vertex b gets the key a · V + b, and the reversed edge
-    # b · V + a. If each edge occurs in both directions, both sets of keys are equal.
+    # In a mesh of V vertices, an edge from vertex a to vertex b has the key a · V + b.
     keys = edge_ends @ [vertex_count, 1]
+    # Key of the same edge in the opposite direction: b · V + a.
     reversed_keys = edge_ends @ [1, vertex_count]
     key_order = np.argsort(keys)
     reversed_key_order = np.argsort(reversed_keys)
-    is_repeated = (np.diff(keys[key_order]) == 0).any()
-    if is_repeated or not np.array_equal(keys[key_order], reversed_keys[reversed_key_order]):
+    sorted_keys = keys[key_order]
+    is_repeated = (np.diff(sorted_keys) == 0).any()
+    # In closed surfaces, each edge occurs once in each direction, so the set of keys
+    # equals the set of reversed keys.
+    if is_repeated or not np.array_equal(sorted_keys, reversed_keys[reversed_key_order]):
         return None
-    # Entry i of both orders is the same edge, in two faces. Dividing by 3 gives
-    # these two faces, shape (3 F, 2).
+    # Both orders list the edges by the same keys, so entry i of the first order and
+    # entry i of the second one are the same edge in two neighboring faces. The edge in
+    # row r belongs to face r // 3.
     neighboring_faces = np.stack([key_order, reversed_key_order], axis=1) // 3
     return connected_component_labels(neighboring_faces, node_count=len(faces))
 
@@ -385,10 +390,10 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     Returns:
         Mesh with all vertices, faces and textures.
     """
-    # The indices of vertices and textures of a mesh grow by the numbers of vertices
-    # and textures of the meshes before it.
     faces = []
     texture_ids = []
+    # Numbers of vertices and textures of the meshes before the mesh of the loop. The
+    # indices of this mesh grow by these numbers.
     vertex_count = 0
     texture_count = 0
     for mesh in meshes:
@@ -411,7 +416,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def _concatenate_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
-    """Concatenate the gloss of the faces of several meshes.
+    """Concatenate the gloss (specular reflection) of the faces of several meshes.
 
     Args:
         meshes: Meshes with F faces in total.
@@ -432,13 +437,16 @@ def _concatenate_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
 def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
     """Concatenate the gloss textures of several meshes.
 
+    A gloss texture has factors for roughness and metallic. If a mesh has any, it
+    has one for each of its color textures.
+
     Args:
-        meshes: Meshes with T textures in total.
+        meshes: Meshes with T color textures in total.
 
     Returns:
-        T gloss textures, uint8, shape (H, W, 2) each. Textures of a mesh without
-        gloss textures get a neutral gloss texture. Empty if no mesh has gloss
-        textures.
+        T gloss textures, uint8, shape (H, W, 2) each. The color textures of a mesh
+        without gloss textures get gloss textures with the factor 1. Empty if no
+        mesh has gloss textures.
     """
     if not any(mesh.gloss_textures for mesh in meshes):
         return ()
@@ -450,15 +458,15 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
 
 
 def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
-    """Extend the skin of the first mesh to the vertices of several meshes.
+    """Extend the joints of the first mesh to the vertices of several meshes.
 
     Args:
-        meshes: Meshes with V vertices in total.
+        meshes: Meshes with V vertices in total. Each has the joints of the first
+            mesh, or none.
 
     Returns:
-        Skin with the J joints of the first mesh. Its array `carried`,
-        shape (V, J, 4), is zero for the vertices of meshes without a skin, so no
-        joint moves them. None if the first mesh has no skin.
+        Skin for all V vertices. Its joints do not move the vertices of meshes
+        without joints. None if the first mesh has no joints.
     """
     skin = meshes[0].skin
     if skin is None:
@@ -474,11 +482,13 @@ def normalize(mesh: Mesh) -> Mesh:
     """Return a copy of a mesh that is centered and scaled to the cube [-1, 1]³.
 
     The centroid of the surface moves to the origin. It is the mean of the face
-    centers, weighted with the areas of the faces. (The paper's appendix averages
-    the vertices, weighted with the areas around them, which gives the same
-    point.) The largest magnitude of a coordinate becomes 1. The vertices are
-    rounded to float32. Mesh files store float32 numbers exactly, so a mesh that
-    is saved and loaded covers the same pixels.
+    centers, weighted with the areas of the faces. The largest magnitude of a
+    coordinate becomes 1. The vertices are rounded to float32. Mesh files store
+    float32 numbers exactly, so a mesh that is saved and loaded covers the same
+    pixels.
+
+    The appendix of the paper "Beyond Pixel Norm-Balls" averages the vertices,
+    weighted with the areas around them. This gives the same point.
 
     Args:
         mesh: Mesh to normalize.
@@ -501,7 +511,7 @@ def normalize(mesh: Mesh) -> Mesh:
     center, extent = center_and_extent(mesh)
     centered = mesh.vertices - center
     normalized = (centered / extent).astype(np.float32).astype(np.float64)
-    # The same transformation as an affine matrix, for the joints.
+    # Affine matrix that subtracts the center and divides by the extent.
     matrix = np.eye(4)
     matrix[:3] = np.column_stack([np.eye(3), -center]) / extent
     skin = mesh.skin and mesh.skin.transformed(matrix)
@@ -509,12 +519,12 @@ def normalize(mesh: Mesh) -> Mesh:
 
 
 def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
-    """Compute the center of a mesh and its largest extent from the center.
+    """Compute the center of a mesh, and its largest extent from the center along an axis.
 
     `normalize` moves the center to the origin and scales the extent to 1.
 
     Args:
-        mesh: Mesh with F faces.
+        mesh: Mesh to measure.
 
     Returns:
         A tuple of
@@ -537,14 +547,18 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """Return a copy of a mesh to which an affine transformation is applied.
+    """Return a copy of a mesh after an affine transformation.
 
-    If the transformation mirrors the mesh, the order of the corners of each face
-    is reversed. The faces then stay counter-clockwise seen from outside.
+    A transformation that mirrors the mesh would make its faces clockwise seen
+    from outside. The order of their corners is therefore reversed.
 
     Args:
         mesh: Mesh to transform.
-        matrix: Affine matrix, shape (4, 4).
+        matrix: Affine matrix, shape (4, 4). The product with a column (x, y, z, 1)
+            is the transformed point.
+
+    Returns:
+        Transformed copy of the mesh, with transformed joints.
     """
     is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
     corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
@@ -564,8 +578,8 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
     The surface stays the same. New vertices are the midpoints of edges. Faces
     that share an edge share the new vertex, so a closed mesh stays closed. The
     sRGB-encoded colors and the texture coordinates are interpolated. The old
-    vertices keep their indices. In one division, face f becomes the faces 4 f to
-    4 f + 3.
+    vertices keep their indices. Each division replaces face f by the faces 4 f
+    to 4 f + 3.
 
     Args:
         mesh: Mesh to divide.
@@ -573,7 +587,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
             `MAX_VERTICES`.
 
     Returns:
-        Divided mesh. The given mesh if it has more vertices already.
+        Divided mesh. The given mesh itself if it already has more vertices.
 
     Raises:
         InputError: If `vertices` is not whole or out of range.
@@ -586,7 +600,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
         (True, 0)
     """
     require_mesh("mesh", mesh)
-    # Floating-point numbers with whole values, such as 1e4, are accepted.
+    # A whole number may be written as a float, such as 1e4.
     is_whole_float = isinstance(vertices, float) and vertices.is_integer()
     require_whole("vertices", int(vertices) if is_whole_float else vertices)
     require_range("vertices", vertices, 0, MAX_VERTICES)
@@ -598,16 +612,16 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
 def refine(mesh: Mesh, area: float) -> Mesh:
     """Divide the large faces of a mesh into four, until all faces are small enough.
 
-    The surface stays the same, but the faces are in another order. The old
+    The surface stays the same, but the order of the faces changes. The old
     vertices keep their indices. A new vertex of a divided face may lie in the
-    middle of an edge of an undivided neighbor.
+    middle of an edge of a neighboring face that is not divided.
 
     Args:
         mesh: Mesh to divide.
         area: Largest allowed area of a face in squared world units.
 
     Returns:
-        Divided mesh. The given mesh if all its faces are small enough.
+        Divided mesh. The given mesh itself if all its faces are small enough.
     """
     is_large = mesh.face_areas() > area
     if not is_large.any():
@@ -615,16 +629,16 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     if is_large.all():
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
-    # `divided` has all old vertices, so the vertex indices of the small faces stay valid.
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
-    rows_of_all_faces: dict[str, Any] = {}
+    # The divided mesh has all old vertices, so it can take over the small faces.
+    arrays: dict[str, Any] = {}
     for name in PER_FACE:
         rows_of_small_faces = getattr(small_faces, name)
-        # `gloss` is None for a matte mesh.
+        # The array `gloss` of a matte mesh is None.
         if rows_of_small_faces is not None:
-            rows = [rows_of_small_faces, getattr(divided, name)]
-            rows_of_all_faces[name] = np.concatenate(rows)
-    return replace(divided, **rows_of_all_faces)
+            rows_of_divided_faces = getattr(divided, name)
+            arrays[name] = np.concatenate([rows_of_small_faces, rows_of_divided_faces])
+    return replace(divided, **arrays)
 
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
@@ -632,41 +646,41 @@ def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
 
     Args:
         mesh: Mesh with F faces.
-        faces: Faces to keep: indices, a mask of shape (F,), or a slice.
+        faces: Faces to keep: their indices, a mask of shape (F,), or a slice.
+
+    Returns:
+        Copy of the mesh with the chosen faces.
     """
     selected_rows = {}
     for name in PER_FACE:
         rows = getattr(mesh, name)
-        # `gloss` is None for a matte mesh.
+        # The array `gloss` of a matte mesh is None.
         if rows is not None:
             selected_rows[name] = rows[faces]
     return replace(mesh, **selected_rows)
 
 
 def _quartered(mesh: Mesh) -> Mesh:
-    """Return a copy of a mesh in which each of the F faces is divided into four.
+    """Return a copy of a mesh in which each face is divided into four triangles.
 
-    New vertices are the midpoints of edges. Faces that share an edge share its
-    midpoint.
+    New vertices are the midpoints of edges. Two faces that share an edge also
+    share its midpoint.
+
+    Args:
+        mesh: Mesh with V vertices and F faces.
+
+    Returns:
+        Mesh with 4 F faces. Its first V vertices are the old ones.
     """
-    vertex_count = len(mesh.vertices)
-    # Vertices at both ends of the three sides of each face, the lower index first,
-    # shape (3 F, 2).
-    side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
-    # Two faces that share an edge have a side with the same key. np.unique sorts
-    # one number per side faster than a pair of vertices.
-    side_keys = side_ends @ [vertex_count, 1]
-    edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
-    # Vertices at both ends of each edge, shape (edges, 2).
-    edge_ends = np.stack(np.divmod(edge_keys, vertex_count), axis=1)
+    edge_ends, edge_of_side = _shared_edges(mesh)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
     skin = mesh.skin
     if skin is not None:
-        carried = np.concatenate([skin.carried, skin.carried[edge_ends].mean(axis=1)])
-        skin = replace(skin, carried=carried)
-    # Vertices of the three corners and of the three midpoints of each face,
-    # shape (F, 6). The midpoints follow the old vertices.
-    midpoint_vertices = vertex_count + edge_of_side.reshape(-1, 3)
+        midpoint_shares = skin.carried[edge_ends].mean(axis=1)
+        skin = replace(skin, carried=np.concatenate([skin.carried, midpoint_shares]))
+    # The midpoints follow the old vertices, so their indices begin at V.
+    midpoint_vertices = len(mesh.vertices) + edge_of_side
+    # Vertices of the three corners and of the three midpoints of each face, shape (F, 6).
     points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
     return replace(
         mesh,
@@ -680,18 +694,47 @@ def _quartered(mesh: Mesh) -> Mesh:
     )
 
 
-def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
-    """Interpolate values at the corners of faces to the corners of their quarters.
+def _shared_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """List the E edges of a mesh. Sides of faces with the same two vertices are one edge.
 
     Args:
-        corner_values: D values at the three corners of F faces, shape (F, 3, D).
+        mesh: Mesh with F faces.
 
     Returns:
-        Values at the corners of the four quarters of each face, in the order of
-        `_QUARTERS`, shape (4 F, 3, D).
+        A tuple of
+        - the two vertices of each edge, shape (E, 2);
+        - the index of the edge of each of the three sides of each face,
+          shape (F, 3).
     """
-    # The EDGES select two corners each, shape (F, 3 edges, 2 ends, D).
-    midpoint_values = corner_values[:, EDGES].mean(axis=2)
-    # D values at the three corners and the three midpoints of each face, shape (F, 6, D).
+    vertex_count = len(mesh.vertices)
+    # The two vertices of each side, the smaller index first, shape (3 F, 2).
+    side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
+    # In a mesh of V vertices, a side from vertex a to vertex b has the key a · V + b.
+    # np.unique sorts these numbers faster than pairs of vertices.
+    side_keys = side_ends @ [vertex_count, 1]
+    edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
+    # Dividing the key a · V + b by V gives the quotient a and the remainder b.
+    edge_ends = np.stack(np.divmod(edge_keys, vertex_count), axis=1)
+    return edge_ends, edge_of_side.reshape(-1, 3)
+
+
+def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
+    """Interpolate values at the corners of faces to the corners of the four parts of each face.
+
+    The four parts are the triangles between the corners of a face and the
+    midpoints of its edges.
+
+    Args:
+        corner_values: D values at the three corners of each of F faces,
+            shape (F, 3, D).
+
+    Returns:
+        Values at the three corners of each of the four parts of each face, in the
+        order of `_QUARTERS`, shape (4 F, 3, D).
+    """
+    # Values at both ends of each edge of each face, shape (F, 3 edges, 2 ends, D).
+    edge_values = corner_values[:, EDGES]
+    midpoint_values = edge_values.mean(axis=2)
+    # Values at the three corners and the three midpoints of each face, shape (F, 6, D).
     point_values = np.concatenate([corner_values, midpoint_values], axis=1)
     return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])
