@@ -46,6 +46,7 @@ from renderer.errors import InputError
 from renderer.settings import Settings
 from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
+from train.system.memory import reuse_freed_memory
 from train.system.verbosity import take_flag
 
 # Exit status after an error of the user.
@@ -237,6 +238,7 @@ def set_up_process() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Waiting threads of torch then sleep, so that they do not slow down others.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    reuse_freed_memory()
     if Path(sys.argv[0]).stem.startswith(PREFIX):
         # Child processes must not import a train.py of the current folder.
         os.environ["PYTHONSAFEPATH"] = "1"
