@@ -35,28 +35,28 @@ from renderer.io.images import eight_bits
 from renderer.io.skins import skinned, with_skins_as_attributes
 from renderer.validation import as_path, require_flag
 
-# Suffixes of archives. trimesh could read them, but this module does not, because the
-# names of the files inside cannot be checked first.
+# Suffixes of archive files, which are not read. trimesh could read them, but the names of
+# the files inside an archive cannot be checked first.
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
-# Lines of .mtl files that define a material.
-DEFINED = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-# Lines of .obj files that use a material.
-USED = re.compile(rb"^[ \t]*usemtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-# Pattern for the messages in trimesh's log that say that trimesh could not read an
-# image, a material or another part of a file. For .obj, .ply and .dae files, the log is
-# the only place where this can be seen.
+# Pattern for the lines of .mtl files that define a material.
+DEFINED_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
+# Pattern for the lines of .obj files that use a material.
+USED_MATERIAL = re.compile(rb"^[ \t]*usemtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
+# Pattern for the messages in trimesh's log that say that trimesh left out an image, a
+# material or something else of a file. For .obj, .ply and .dae files, only the log tells.
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")
-# Number for the type float32 in glTF 2.0 (section 3.6.2.2).
+# Number that stands for the type float32 in glTF 2.0 (section 3.6.2.2).
 FLOAT = 5126
-# Numbers for the kinds of primitives in glTF 2.0 that consist of triangles (section
-# 5.24.4): separate triangles, triangle strips and triangle fans. trimesh skips fans.
+# Numbers for the kinds of glTF primitives that consist of triangles (glTF 2.0, section
+# 5.24.4): separate triangles, triangle strips and triangle fans.
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
 # Name of the glTF extension that shifts, scales or rotates a texture.
 TRANSFORM = "KHR_texture_transform"
-# First letters of the names of glTF extensions that do not move vertices.
-HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
+# Beginnings of the names of glTF extensions that a reader may ignore, because they do not
+# change the shape of a mesh.
+HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
 
 
 def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
@@ -109,8 +109,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     if not placed_parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _merge_vertices(concatenate(placed_parts))
-    # The coordinates were checked in each part, but the matrices of a scene may be
-    # wrong, too. The comparison is also False for NaN.
+    # The matrices of a scene may have huge numbers or NaN. A comparison with NaN is False,
+    # so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
         raise InputError(
             f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: "
@@ -130,35 +130,38 @@ def _merge_vertices(mesh: Mesh) -> Mesh:
     Vertices that joints move in different ways are not merged. Vertices without
     faces are dropped.
     """
-    # Vertices with equal rows are merged. A row has the position and, with a skin, a
-    # number for the way in which joints move the vertex.
-    vertex_rows = mesh.vertices
+    # Vertices with equal keys are merged. The key is the position.
+    vertex_keys = mesh.vertices
     skin = mesh.skin
     if skin is not None:
-        distinct_carried, carried_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
-        vertex_rows = np.column_stack([vertex_rows, carried_of_vertex.ravel()])
-    corner_rows = vertex_rows[mesh.faces].reshape(-1, vertex_rows.shape[1])
-    merged_rows, vertex_of_corner = np.unique(corner_rows, axis=0, return_inverse=True)
+        # The key also has a number. It is the same for vertices that all joints move alike.
+        distinct_shares, shares_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
+        vertex_keys = np.column_stack([vertex_keys, shares_of_vertex.ravel()])
+    corner_keys = vertex_keys[mesh.faces].reshape(-1, vertex_keys.shape[1])
+    merged_keys, vertex_of_corner = np.unique(corner_keys, axis=0, return_inverse=True)
     if skin is not None:
-        carried_of_merged = merged_rows[:, -1].astype(np.int64)
-        skin = replace(skin, carried=distinct_carried[carried_of_merged])
+        shares_of_merged = merged_keys[:, -1].astype(np.int64)
+        skin = replace(skin, carried=distinct_shares[shares_of_merged])
     faces = vertex_of_corner.reshape(-1, 3)
-    return replace(mesh, vertices=merged_rows[:, :3], faces=faces, skin=skin)
+    return replace(mesh, vertices=merged_keys[:, :3], faces=faces, skin=skin)
 
 
 def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a mesh file, and the matrices that place them in the scene.
+    """Read the parts of a mesh file, and the matrices that place the parts in the scene.
+
+    A part is a mesh with one material. A file may hold several parts.
 
     Args:
         path: File to read.
-        linear: True if the colors of the file, except for textures, are linear.
+        linear: True if the file stores linear colors, except for textures. False
+            if it stores sRGB-encoded colors.
         gloss: True reads the specular reflection of glTF materials: roughness,
             metallic and specular factor. False makes the parts matte.
 
     Returns:
-        The mesh of each part in its own coordinates, with the affine matrix that
-        places it in the scene, shape (4, 4). A part with a skin is in scene
-        coordinates already and has the identity matrix.
+        Pairs of a part in its own coordinates and of the affine matrix that places
+        the part in the scene, shape (4, 4). If the file has joints, all parts are
+        already in scene coordinates, and the matrix is the identity.
 
     Raises:
         InputError: If the file does not exist, has an unknown format, or cannot
@@ -170,7 +173,7 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
     if suffix not in formats:
         known = ", ".join(sorted(formats))
         raise InputError(f"{path} has no known mesh format: use one of {known}")
-    # Readers of meshes and images raise almost any exception for a damaged file.
+    # For a damaged file, trimesh and Pillow can raise almost any exception.
     try:
         return _read_parts(path, suffix, linear, gloss)
     except Exception as error:
@@ -180,16 +183,19 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
 def _read_parts(
     path: Path, suffix: str, linear: bool, gloss: bool
 ) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a file of a known format. See `read_parts`.
+    """Read the parts of a mesh file whose format trimesh knows.
+
+    A part is a mesh with one material. A file may hold several parts.
 
     Args:
         path: File to read.
         suffix: Suffix of the file in lower case, without the period.
-        linear: True if the colors of the file, except for textures, are linear.
+        linear: True if the file stores linear colors, except for textures.
         gloss: True reads the specular reflection of glTF materials.
 
     Returns:
-        Mesh of each part, with the affine matrix that places it, shape (4, 4).
+        Pairs of a part and of the affine matrix that places the part in the
+        scene, shape (4, 4).
 
     Raises:
         Exception: Any exception, if the file is damaged or not supported.
@@ -206,23 +212,24 @@ def _read_parts(
     scene = _load(content, suffix, _Files(path))
     parts = {}
     for name, geometry in scene.geometry.items():
-        # A file may also contain points and lines.
+        # The geometry may also be points or lines, which are skipped.
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
         part = _as_mesh(geometry, linear)
         parts[name] = _with_gloss(part, geometry.visual, specular_factors) if gloss else part
-    # trimesh leaves out a glTF image that it cannot read, without a message.
+    # trimesh skips a glTF image that it cannot read, and reports no error. Such a file then
+    # has too few textures.
     if sum(len(part.textures) for part in parts.values()) < textured_count:
         raise ValueError("the image of a texture is missing, or cannot be decoded")
-    # A part occurs once for each node of the scene that shows the part.
     placed_parts = []
+    # Several nodes of the scene may show the same part at different places.
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         if name not in parts:
             continue
         if has_skins:
-            # `skinned` returns vertices in the coordinates of the scene.
-            placed_parts.append((skinned(parts[name], node, scene, tree), np.eye(4)))
+            part_in_scene = skinned(parts[name], node, scene, tree)
+            placed_parts.append((part_in_scene, np.eye(4)))
         else:
             placed_parts.append((parts[name], matrix))
     return placed_parts
@@ -231,7 +238,7 @@ def _read_parts(
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
     """Reader for the files that a mesh file refers to, such as images and .mtl files.
 
-    trimesh calls `get` for each such file.
+    trimesh calls `get` for each of these files.
 
     Attributes:
         materials: Content of the .mtl file that was read last, in UTF-8.
@@ -242,12 +249,12 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
     def get(self, name: str) -> bytes:
         """Read a file that the mesh file refers to.
 
-        The file is sought at the given path relative to the folder of the mesh
-        file, and then directly in this folder. A name may contain \\ instead of
-        / and %20 instead of a blank.
+        The file is first sought at the given path, relative to the folder of the
+        mesh file. If it is not there, it is sought in this folder itself. A path
+        may contain \\ instead of / and %20 instead of a blank.
 
         Args:
-            name: Path of the file, as the mesh file writes it.
+            name: Path of the file, as it is written in the mesh file.
 
         Returns:
             Content of the file.
@@ -261,7 +268,7 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
             Path(self.parent, Path(relative_path).name),
         )
         for file in candidates:
-            # `is_file` is False for a pipe. Reading a pipe would never end.
+            # For a named pipe, `is_file` is False. Reading a pipe might never end.
             if file.is_file() and file.suffix.lower() == ".mtl":
                 self.materials = _as_utf8(file.read_bytes())
                 return self.materials
@@ -271,7 +278,7 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
 
 
 def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
-    """Read a scene with trimesh, and check that trimesh read all of the surface.
+    """Read a scene with trimesh, and check that trimesh left nothing out.
 
     Args:
         content: Content of the mesh file.
@@ -290,8 +297,9 @@ def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
             io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False
         )
     if suffix == "obj" and b"mtllib" in content:
-        undefined = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
-        for name in undefined:
+        used_materials = set(USED_MATERIAL.findall(content))
+        defined_materials = set(DEFINED_MATERIAL.findall(files.materials))
+        for name in used_materials - defined_materials:
             omissions.append(f"the .mtl file does not define the material {name.decode()}")
     if omissions:
         raise ValueError(omissions[0])
@@ -300,13 +308,12 @@ def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
 
 @contextmanager
 def _recorded_omissions() -> Iterator[list[str]]:
-    """Record the messages of trimesh's log about parts of a file that it could not read.
+    """Record trimesh's log messages about what it could not read, during a `with` block.
 
-    Messages are recorded while the `with` block runs. trimesh's log shows no
-    messages during this time.
+    During the block, trimesh's log shows no messages.
 
     Yields:
-        List of the messages, which grows during the block.
+        List of the recorded messages, which grows during the block.
     """
     recorder = _OmissionRecorder()
     log = trimesh.util.log
@@ -321,7 +328,7 @@ def _recorded_omissions() -> Iterator[list[str]]:
 
 
 class _OmissionRecorder(logging.Filter):
-    """Filter that records messages of a log about parts of a file that could not be read.
+    """Log filter that records messages that say that something could not be read from a file.
 
     Attributes:
         omissions: Recorded messages.
@@ -332,10 +339,10 @@ class _OmissionRecorder(logging.Filter):
         self.omissions: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Record a message that says that a part of a file could not be read.
+        """Record a log message if it says that something could not be read from a file.
 
-        The pattern `OMISSION` recognizes such messages. An exception that was
-        logged with the message is appended.
+        The pattern `OMISSION` recognizes such messages. If an exception was logged
+        with the message, its text is recorded, too.
 
         Args:
             record: Message of the log.
@@ -374,11 +381,11 @@ def _gltf_tree(content: bytes) -> dict[str, Any]:
     """
     if content.startswith(b"glTF"):
         # A .glb file begins with a header of 12 bytes. Then come the length of the
-        # JSON (4 bytes), its type (4 bytes), and the JSON itself.
+        # JSON text (4 bytes), its type (4 bytes), and the JSON text itself.
         (json_length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + json_length]
-    # glTF does not allow NaN and Infinity, but Python's parser does. It would pass their
-    # names to `parse_constant`, and `int` raises ValueError for such a name.
+    # Python's parser accepts NaN and Infinity, which glTF forbids. It passes these names to
+    # `parse_constant`, and `int("NaN")` raises ValueError.
     tree: dict[str, Any] = json.loads(content, parse_constant=int)
     return tree
 
@@ -386,13 +393,14 @@ def _gltf_tree(content: bytes) -> dict[str, Any]:
 def _specular_factors(tree: dict[str, Any]) -> dict[str | None, float]:
     """Read the specular factor of each material of a glTF file.
 
-    trimesh does not read the extension KHR_materials_specular.
+    The factor is in the extension KHR_materials_specular, which trimesh ignores.
 
     Args:
         tree: JSON object of the file.
 
     Returns:
-        Specular factors by the names of the materials. The default is 1.
+        Specular factor of each material by the name of the material. It is 1 for a
+        material without the extension.
 
     Raises:
         ValueError: If two materials with the same name have different specular
@@ -411,14 +419,18 @@ def _specular_factors(tree: dict[str, Any]) -> dict[str | None, float]:
 
 
 def _count_textured_parts(tree: dict[str, Any], gloss: bool) -> int:
-    """Count the parts of a glTF file whose color is an image, and check for unsupported features.
+    """Count the triangle primitives of a glTF file that have a color texture.
+
+    A primitive is a mesh with one material. Features of the file that trimesh
+    does not support raise an error.
 
     Args:
-        tree: JSON object of the file.
+        tree: JSON object of the file. It is empty for a file of another format,
+            which gives 0.
         gloss: True if the textures of roughness and metallic are read, too.
 
     Returns:
-        Number of parts.
+        Number of primitives with a color texture.
 
     Raises:
         ValueError: If trimesh would read the shape or the texture coordinates
@@ -426,65 +438,65 @@ def _count_textured_parts(tree: dict[str, Any], gloss: bool) -> int:
         Exception: Any other exception, if the file is damaged.
     """
     for name in tree.get("extensionsRequired", []):
-        if not name.startswith(HARMLESS):
+        if not name.startswith(HARMLESS_EXTENSIONS):
             raise ValueError(f"the file needs the extension {name}, which is not supported")
     textured_count = 0
     for mesh in tree.get("meshes", []):
-        for part in mesh["primitives"]:
-            if part.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
-                _require_supported_accessors(tree, part)
-                textured_count += _is_textured(tree, part, gloss)
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
+                _require_supported_accessors(tree, primitive)
+                textured_count += _is_textured(tree, primitive, gloss)
     return textured_count
 
 
-def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> None:
-    """Raise `ValueError` if trimesh cannot read the numbers of a glTF part.
+def _require_supported_accessors(tree: dict[str, Any], primitive: dict[str, Any]) -> None:
+    """Raise `ValueError` if trimesh cannot read the arrays of a glTF primitive.
 
-    An accessor describes how glTF stores an array, such as the positions.
+    A primitive is a mesh with one material. An accessor describes how the file
+    stores an array, such as the positions.
 
     Args:
         tree: JSON object of the file.
-        part: Primitive of glTF.
+        primitive: Entry of the primitive in the JSON object.
 
     Raises:
-        ValueError: If the part is a triangle fan, has a sparse accessor, or has
-            texture coordinates that are no floating-point numbers.
+        ValueError: If the primitive is a triangle fan, has a sparse accessor, or
+            has texture coordinates that are not floating-point numbers.
     """
-    attributes = part["attributes"]
-    indices = (*attributes.values(), part.get("indices", 0))
+    attributes = primitive["attributes"]
+    indices = (*attributes.values(), primitive.get("indices", 0))
     accessors = [tree["accessors"][index] for index in indices]
-    if part.get("mode") == FAN or any("sparse" in accessor for accessor in accessors):
+    if primitive.get("mode") == FAN or any("sparse" in accessor for accessor in accessors):
         raise ValueError("triangle fans and sparse accessors are not supported")
-    # If there are no texture coordinates, check the positions, which are always
-    # floating-point numbers.
-    uvs = tree["accessors"][attributes.get("TEXCOORD_0", attributes["POSITION"])]
-    if uvs["componentType"] != FLOAT:
-        raise ValueError(
-            "texture coordinates that are not floating-point numbers are not supported"
-        )
+    if "TEXCOORD_0" in attributes:
+        texture_coordinates = tree["accessors"][attributes["TEXCOORD_0"]]
+        if texture_coordinates["componentType"] != FLOAT:
+            raise ValueError(
+                "texture coordinates that are not floating-point numbers are not supported"
+            )
 
 
-def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> bool:
-    """Tell whether the color of a glTF part is an image.
+def _is_textured(tree: dict[str, Any], primitive: dict[str, Any], gloss: bool) -> bool:
+    """Tell whether a glTF primitive (a mesh with one material) has a color texture.
 
     Args:
         tree: JSON object of the file.
-        part: Primitive of glTF.
+        primitive: Entry of the primitive in the JSON object.
         gloss: True if the texture of roughness and metallic is read, too. Its
-            coordinates are then checked.
+            texture coordinates are then also checked.
 
     Returns:
-        True if the material of the part has a texture for its color.
+        True if the material of the primitive has a color texture.
 
     Raises:
         ValueError: If a texture is transformed, or uses a second set of
             texture coordinates.
     """
-    material = tree["materials"][part["material"]] if "material" in part else {}
+    material = tree["materials"][primitive["material"]] if "material" in primitive else {}
     extensions = material.get("extensions", {})
     specular_glossiness = extensions.get("KHR_materials_pbrSpecularGlossiness", {})
     metallic_roughness = material.get("pbrMetallicRoughness", {})
-    # glTF has two material models. Each stores the color texture under its own name.
+    # The two material models of glTF have different names for the color texture.
     candidates = [
         metallic_roughness.get("baseColorTexture"),
         specular_glossiness.get("diffuseTexture"),
@@ -494,7 +506,7 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
     if gloss:
         used_textures.append(metallic_roughness.get("metallicRoughnessTexture") or {})
     for texture in used_textures:
-        # "texCoord" is the number of the set of coordinates, which is 0 by default.
+        # "texCoord" is the number of the set of texture coordinates, and 0 by default.
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
             raise ValueError(
                 "a texture is transformed or uses a second set of texture coordinates, "
@@ -504,11 +516,12 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
 
 
 def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
-    """Convert a mesh of trimesh to a `Mesh`, without specular reflection.
+    """Convert a mesh of trimesh to a `Mesh` without specular reflection.
 
     Args:
-        geometry: Mesh of trimesh with V vertices and F faces.
-        linear: True if its colors, except for textures, are linear.
+        geometry: Mesh of trimesh.
+        linear: True if its colors are linear, except for textures. False if they
+            are sRGB-encoded.
 
     Returns:
         Matte mesh in the same coordinates.
@@ -524,7 +537,7 @@ def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     colors, image = _corner_colors(geometry.visual, faces)
     values_by_name = {"coordinates": vertices, "texture coordinates": uvs, "colors": colors}
     for name, values in values_by_name.items():
-        # The comparison is also False for NaN.
+        # A comparison with NaN is False, so `not` also finds NaN.
         if values is not None and not (np.abs(values) <= MAX_MAGNITUDE).all():
             raise ValueError(f"{name} are not finite or beyond {MAX_MAGNITUDE:g}")
     if linear:
@@ -537,11 +550,12 @@ def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
 
 
 def _with_texture(mesh: Mesh, uvs: np.ndarray | None, texture: np.ndarray) -> Mesh:
-    """Return a copy of a mesh with V vertices, in which all faces have one texture.
+    """Return a copy of a mesh in which all faces have the same texture.
 
     Args:
-        mesh: Mesh without textures.
-        uvs: Texture coordinates of the vertices, shape (V, 2).
+        mesh: Mesh with V vertices and without textures.
+        uvs: Texture coordinates of the vertices, shape (V, 2). None if the file
+            has none.
         texture: sRGB-encoded texture, uint8, shape (H, W, 3).
 
     Returns:
@@ -563,16 +577,18 @@ def _with_texture(mesh: Mesh, uvs: np.ndarray | None, texture: np.ndarray) -> Me
 def _with_gloss(mesh: Mesh, visual: Visuals, specular_factors: dict[str | None, float]) -> Mesh:
     """Return a copy of a mesh with the specular reflection of its glTF material.
 
-    Roughness, metallic and specular factor are 1 if the material does not have
-    them, as the standard of glTF says. This is a rough metal.
+    If the material does not specify roughness, metallic or specular factor, the
+    value is 1, as the glTF standard says. A material without any of them is
+    therefore a rough metal.
 
     Args:
-        mesh: Mesh with F faces.
-        visual: Appearance of the mesh in trimesh.
-        specular_factors: Specular factors by the names of materials.
+        mesh: Mesh without specular reflection.
+        visual: Appearance of the mesh, as trimesh read it.
+        specular_factors: Specular factor of each material by the name of the
+            material.
 
     Returns:
-        Mesh with gloss. The given mesh if it has no glTF material.
+        Mesh with gloss. The given mesh itself if it has no glTF material.
 
     Raises:
         ValueError: If there is a texture, but there are no texture coordinates.
@@ -580,20 +596,20 @@ def _with_gloss(mesh: Mesh, visual: Visuals, specular_factors: dict[str | None, 
     material = getattr(visual, "material", None)
     if not isinstance(material, PBRMaterial):
         return mesh
-    given = (
+    given_factors = (
         material.roughnessFactor,
         material.metallicFactor,
         specular_factors.get(material.name),
     )
-    factors = [1.0 if factor is None else factor for factor in given]
-    gloss_row = np.clip(factors, 0, 1).astype(np.float32)
-    mesh = replace(mesh, gloss=gloss_row[None].repeat(len(mesh.faces), axis=0))
+    factors = [1.0 if factor is None else factor for factor in given_factors]
+    gloss_of_face = np.clip(factors, 0, 1).astype(np.float32)
+    mesh = replace(mesh, gloss=gloss_of_face[None].repeat(len(mesh.faces), axis=0))
     if material.metallicRoughnessTexture is None:
         return mesh
     if visual.uv is None:
         raise ValueError("the mesh has a texture, but no texture coordinates")
     if not mesh.textures:
-        # Gloss textures belong to color textures, so a white color texture is added.
+        # A gloss texture needs a color texture, so a white texture is added.
         white = np.full((1, 1, 3), 255, dtype=np.uint8)
         mesh = _with_texture(mesh, visual.uv, white)
     texels = np.array(eight_bits(material.metallicRoughnessTexture).convert("RGB"))
@@ -602,13 +618,13 @@ def _with_gloss(mesh: Mesh, visual: Visuals, specular_factors: dict[str | None, 
 
 
 def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Image.Image | None]:
-    """Compute the color at the three corners of each of F faces, and find the texture.
+    """Compute the color at each corner of each face, and find the texture of a mesh.
 
     The color is the product of the material color and the vertex or face colors,
-    as far as the file has them. It is linear or encoded, as in the file.
+    as far as the file has them. It is linear or sRGB-encoded, as in the file.
 
     Args:
-        visual: Appearance of a mesh in trimesh.
+        visual: Appearance of the mesh, as trimesh read it.
         faces: Vertex indices of the faces, shape (F, 3).
 
     Returns:
@@ -646,22 +662,24 @@ def _material_color(material: Material) -> tuple[np.ndarray, Image.Image | None]
         factor = material.baseColorFactor
         color = np.ones(3) if factor is None else _unit_rgb(factor)
         return color, material.baseColorTexture
-    # If an .obj file has no color or no image, trimesh sets a gray color or a gray
-    # image. It stores a color that the file does have under the name "kd".
+    # If a material of an .obj file has no image, trimesh inserts a gray image.
     is_placeholder = material.image == empty_material().image
     image = None if is_placeholder else material.image
-    return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image
+    # "kd" is the color in the .obj file. trimesh's own attribute would be gray if the file
+    # has no color.
+    color = material.kwargs.get("kd", np.ones(3))
+    return np.clip(color, 0, 1), image
 
 
 def _unit_rgb(colors: np.ndarray) -> np.ndarray:
     """Convert RGB or RGBA colors to red, green and blue in [0, 1].
 
     Args:
-        colors: Unsigned integers, or numbers in [0, 1], shape (..., 3) or
-            (..., 4).
+        colors: Colors as unsigned integers, or as floating-point numbers in
+            [0, 1], shape (..., 3) or (..., 4).
 
     Returns:
-        Colors, shape (..., 3).
+        Colors without alpha, shape (..., 3).
     """
     rgb = np.asarray(colors)[..., :3]
     is_integer = rgb.dtype.kind in "ui"
