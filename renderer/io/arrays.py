@@ -9,7 +9,9 @@ from renderer.io.files import atomic_write
 
 
 def write_numbers(path: Path, numbers: np.ndarray) -> None:
-    """Write an array to an .npy file, see `atomic_write`.
+    """Write an array to an .npy file.
+
+    A reader never sees a part of the new file: see `atomic_write`.
 
     Args:
         path: File to replace or to create.
@@ -24,16 +26,16 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """Read real numbers from an .npy file.
+    """Read an array of real numbers from an .npy file.
 
-    The file is mapped into memory. If the header is damaged and claims a huge
-    array, this raises an error instead of allocating the memory.
+    The file is mapped into memory. A damaged header that claims a huge array
+    therefore raises an error instead of allocating memory.
 
     Args:
         path: .npy file.
 
     Returns:
-        Numbers, float32. Larger numbers become infinite.
+        Array, float32. Numbers that are too large for float32 become infinite.
 
     Raises:
         ValueError: If the file holds no real numbers.

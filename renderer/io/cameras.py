@@ -1,8 +1,8 @@
 """Read cameras from the files of COLMAP and nerfstudio.
 
-The intrinsics of a camera are the matrix (fx, 0, cx; 0, fy, cy; 0, 0, 1) with
-the focal lengths fx and fy and the principal point (cx, cy), in pixels from the
-top left corner of the image.
+The intrinsics of a camera are the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+The focal lengths fx and fy are in pixels. The principal point (cx, cy) is in
+pixels from the top left corner of the image.
 """
 
 import json
@@ -17,18 +17,18 @@ from renderer.camera import PinholeCamera
 from renderer.errors import InputError, require_file
 from renderer.validation import as_path
 
-# Names of the text files of a COLMAP model.
+# Names of the text files in which COLMAP stores cameras and the poses of images.
 COLMAP_CAMERAS = "cameras.txt"
 COLMAP_IMAGES = "images.txt"
-# Name of the camera file of nerfstudio.
+# Name of the file in which nerfstudio stores cameras.
 TRANSFORMS = "transforms.json"
-# COLMAP's camera models without lens distortion, and their numbers of parameters.
+# COLMAP's camera models without lens distortion, with their numbers of parameters.
 COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
-# Keys of the distortion parameters in transforms.json.
+# Names of the parameters of lens distortion in transforms.json.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-# Advice in errors about lens distortion.
+# Advice at the end of errors about lens distortion.
 UNDISTORT = "undistort the images first, for example with colmap image_undistorter"
-# Exceptions that are raised if a file has missing or wrong entries.
+# Exceptions that Python raises if a file lacks an entry or has a wrong one.
 _DAMAGED_FILE_ERRORS = (ValueError, KeyError, TypeError, IndexError, AttributeError)
 
 
@@ -41,8 +41,8 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     model_converter --output_type TXT`.
 
     The cameras have the world coordinates of the file, so load the mesh with
-    up="z", which leaves its axes as they are. Cameras of images that are not
-    square show the square in the center, see `PinholeCamera.from_matrix`.
+    `nb.load_mesh(path, up="z")`, which leaves its axes as they are. The camera of
+    an image that is not square shows the square in its center.
 
     Args:
         path: A transforms.json file of nerfstudio, or a folder with this file or
@@ -73,7 +73,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     else:
         cameras = _read_transforms(path / TRANSFORMS if path.is_dir() else path)
     if not cameras:
-        raise InputError(f"{path} has no cameras: give files with one image or more")
+        raise InputError(f"{path} has no cameras: give files with at least one image")
     return cameras
 
 
@@ -92,10 +92,10 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
     """
     cameras_path = folder / COLMAP_CAMERAS
     require_file(cameras_path, "give a folder with cameras.txt and images.txt")
-    # Intrinsics and image size (width, height) by the id of the camera.
+    # Intrinsic matrix and image size (width, height) of each camera by its id in the file.
     intrinsics_and_size = {}
     cameras = {}
-    # File that is being read, for the error.
+    # The error below names the file that is being read.
     path = cameras_path
     try:
         for line in _lines(cameras_path):
@@ -107,7 +107,7 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
             _, qw, qx, qy, qz, tx, ty, tz, camera_id, image_name = line.split(maxsplit=9)
             rotation = _rotation(np.array([qw, qx, qy, qz], dtype=float))
             translation = np.array([tx, ty, tz], dtype=float)
-            # Matrix from world axes to the axes of the camera, shape (3, 4).
+            # Matrix from world coordinates to camera coordinates, shape (3, 4).
             view_matrix = np.column_stack([rotation, translation])
             intrinsics, size = intrinsics_and_size[camera_id]
             camera = PinholeCamera.from_matrix(view_matrix, intrinsics, size)
@@ -131,8 +131,8 @@ def _lines(path: Path) -> Iterator[str]:
 def _image_lines(path: Path) -> Iterator[str]:
     """Yield the line with the pose of each image from the file images.txt of COLMAP.
 
-    The file has two lines for each image. The second line lists image points, is
-    skipped, and may be empty.
+    The file has two lines for each image. The second line lists points in the
+    image. It may be empty, and is skipped.
 
     Args:
         path: Path of images.txt.
@@ -151,9 +151,9 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     """Convert the parameters of a COLMAP camera to an intrinsic matrix.
 
     Args:
-        model: Name of the camera model, such as "PINHOLE".
-        parameters: One or two focal lengths and the principal point (x, y), in
-            pixels, as text.
+        model: Name of COLMAP's camera model, such as "PINHOLE".
+        parameters: Numbers in pixels, as text: one or two focal lengths, and then
+            the x and y of the principal point.
 
     Returns:
         Intrinsic matrix, shape (3, 3).
@@ -171,7 +171,7 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     values = [float(parameter) for parameter in parameters]
     if len(values) != COLMAP_PARAMETERS[model]:
         raise ValueError(f"{model} with {len(values)} parameters")
-    # SIMPLE_PINHOLE has one focal length for both axes.
+    # PINHOLE has the focal lengths (fx, fy), and SIMPLE_PINHOLE has one for both axes.
     *focal_lengths, center_x, center_y = values
     return _intrinsic_matrix(focal_lengths[0], focal_lengths[-1], center_x, center_y)
 
@@ -186,7 +186,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
         Rotation matrix, shape (3, 3).
     """
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    # Multiplying by this matrix is the cross product with (x, y, z).
+    # The product of this matrix and a vector is the cross product of (x, y, z) and the vector.
     cross_matrix = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross_matrix + 2 * cross_matrix @ cross_matrix
 
@@ -197,10 +197,12 @@ def _intrinsic_matrix(
     """Create the intrinsic matrix of a pinhole camera.
 
     Args:
-        focal_x: Focal length along image rows, in pixels.
-        focal_y: Focal length along image columns, in pixels.
-        center_x: Principal point, in pixels from the left edge of the image.
-        center_y: Principal point, in pixels from the top edge of the image.
+        focal_x: Horizontal focal length in pixels.
+        focal_y: Vertical focal length in pixels.
+        center_x: Distance of the principal point from the left edge of the image
+            in pixels.
+        center_y: Distance of the principal point from the top edge of the image
+            in pixels.
 
     Returns:
         Matrix, shape (3, 3).
@@ -215,7 +217,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
         path: Path of the file.
 
     Returns:
-        Cameras by the paths of their images in the file.
+        Camera of each image by the path of the image, as it is in the file.
 
     Raises:
         InputError: If the file is missing or damaged, or if a camera has
@@ -226,9 +228,9 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
     try:
         scene = json.loads(path.read_text(encoding="utf-8-sig"))
         for frame in scene["frames"]:
-            # Intrinsics of the frame override those of the scene.
+            # A frame is an image of the scene. Its entries override those of the scene.
             intrinsics, size = _transforms_intrinsics({**scene, **frame})
-            # The file stores the matrix from the axes of the camera to world axes.
+            # Matrix from camera coordinates to world coordinates, shape (4, 4).
             camera_to_world = np.array(frame["transform_matrix"], dtype=float)
             view_matrix = np.linalg.inv(camera_to_world)
             camera = PinholeCamera.from_matrix(view_matrix, intrinsics, size, "opengl")
@@ -243,10 +245,11 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
 
 
 def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
-    """Read the intrinsic matrix and the image size of a frame of transforms.json.
+    """Read the intrinsic matrix and the image size of an image from transforms.json.
 
     Args:
-        entries: Entries of the scene, overridden by those of the frame.
+        entries: Entries of the image, such as "fl_x", and those of the whole scene
+            that the image does not have itself.
 
     Returns:
         A tuple of
@@ -262,8 +265,8 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
             f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
             f"supported: {UNDISTORT}"
         )
-    # A file with only a field of view may leave out the size of its square images.
-    # The intrinsics are then those of an image of one pixel.
+    # A file with square images may have a field of view, but no image size. The focal length
+    # and the principal point are then computed for an image of one pixel.
     width = int(entries.get("w", 1))
     height = int(entries.get("h", width))
     if "fl_x" in entries:

@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     import trimesh  # It takes half a second, so functions import it where they use it.
     from trimesh.visual.material import PBRMaterial
 
-# Names of the vertex attributes for colors and normals while trimesh writes a file.
-# trimesh writes attributes whose names begin with an underscore without conversion.
-# `_as_one_mesh` then gives the attributes their names in glTF.
+# Temporary names of the vertex attributes for colors and normals. trimesh writes attributes
+# whose names begin with an underscore without changing their values. Before the file is
+# written, `_as_one_mesh` renames the attributes to COLOR_0 and NORMAL.
 _COLOR = "_COLOR_0"
 _NORMAL = "_NORMAL"
-# Name of the specular factor in glTF. trimesh does not write it. `_material` therefore puts
-# it into the name of a material, and `_as_one_mesh` moves it to the right place.
+# Name of the specular factor of a material in glTF. trimesh cannot write this factor. It is
+# first appended to the name of the material, and `_as_one_mesh` moves it to its place.
 SPECULAR = "specularFactor"
-# Roughness and metallic of the material of a mesh without gloss.
+# Roughness and metallic of a material without specular reflection.
 MATTE = (1.0, 0.0)
 
 
@@ -45,11 +45,11 @@ def export_mesh(
 ) -> None:
     """Write a mesh to a .glb file.
 
-    `load_mesh` returns the same surface from the file, with float32 precision.
-    In the file, y points up and colors are linear. The mesh has one part for
-    each combination of texture and gloss, in ascending order, so the order of
-    the faces can change. Materials are visible from both sides. A vertex is
-    repeated if its corners differ in color, texture coordinates or normal.
+    `load_mesh` reads the same surface from the file, with float32 precision. In
+    the file, y points up and colors are linear. Faces with the same texture and
+    gloss are written together, so the order of the faces can change. Materials
+    are visible from both sides. A vertex is repeated if the faces around it have
+    different colors, texture coordinates or normals there.
 
     Args:
         mesh: Mesh to write.
@@ -58,7 +58,7 @@ def export_mesh(
             "flat".
         cameras: Cameras to write as nodes of the file, in this order.
         first: Number of faces at the beginning of the mesh that are written
-            before all other faces. None orders all faces by texture and gloss.
+            before all other faces. None sorts all faces by texture and gloss.
 
     Raises:
         InputError: If an argument is invalid, or if the file cannot be written.
@@ -75,17 +75,17 @@ def export_mesh(
     if first is not None:
         require_whole("first", first)
         require_range("first", first, 0, len(mesh.faces))
-    normals_of_corners = corner_normals(mesh.vertices, mesh.faces, normals)
+    unit_normals = corner_normals(mesh.vertices, mesh.faces, normals)
     if path.suffix.lower() != ".glb":
         raise InputError(
             f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
         )
-    content = _glb(mesh, normals_of_corners, cameras, first)
+    content = _glb(mesh, unit_normals, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
     except OSError as error:
-        raise InputError(f"mesh {path} cannot be written: {error}") from error
+        raise InputError(f"the mesh file {path} cannot be written: {error}") from error
 
 
 def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
@@ -96,7 +96,8 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
         normals: Unit normals of the three corners of each face,
             shape (F, 3, 3).
         cameras: Cameras to write.
-        first: Number of faces that are written before all other faces, or None.
+        first: Number of faces at the beginning of the mesh that are written before
+            all other faces, or None.
 
     Returns:
         Content of the file.
@@ -105,16 +106,16 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
 
     first_count = len(mesh.faces) if first is None else first
     is_later = np.arange(len(mesh.faces)) >= first_count
-    # One row for each face, with a flag, the texture and the gloss. Faces with equal rows
-    # become one part. float64 stores indices and gloss exactly.
+    # Faces with the same key are written together. The key is the flag `is_later`, the
+    # index of the texture and, if the mesh has gloss, the three values of the gloss.
     keys = np.stack([is_later, mesh.texture_ids], axis=1)
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
     parts = []
     for key in np.unique(keys, axis=0):
-        is_in_part = (keys == key).all(1)
+        has_key = (keys == key).all(1)
         surface = _PartSurface(texture_id=int(key[1]), gloss=key[2:].tolist())
-        parts.append(_write_part(mesh, normals, surface, is_in_part))
+        parts.append(_part_for_trimesh(mesh, normals, surface, has_key))
     return trimesh.Scene(parts).export(
         file_type="glb",
         include_normals=False,
@@ -124,10 +125,10 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
 
 @dataclass(frozen=True)
 class _PartSurface:
-    """Texture and gloss that all faces of a part of a file have in common.
+    """Texture and gloss that some faces of a mesh have in common.
 
     Attributes:
-        texture_id: Index in `Mesh.textures`, or -1 for no texture.
+        texture_id: Index of the texture in `Mesh.textures`, or -1 for no texture.
         gloss: Roughness, metallic and specular factor. Empty for a matte mesh.
     """
 
@@ -135,16 +136,16 @@ class _PartSurface:
     gloss: list[float]
 
 
-def _write_part(
+def _part_for_trimesh(
     mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
 ) -> "trimesh.Trimesh":
-    """Convert some faces of a mesh to a mesh of trimesh, with y up.
+    """Convert the faces of a mesh with one texture and gloss to a mesh of trimesh, with y up.
 
     Args:
         mesh: Mesh with F faces.
         normals: Unit normals of the three corners of each face,
             shape (F, 3, 3).
-        surface: Texture and gloss of the faces.
+        surface: Texture and gloss that the faces have in common.
         is_in_part: True for the faces to convert, shape (F,).
 
     Returns:
@@ -159,29 +160,31 @@ def _write_part(
     corner_values = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
     vertex_ids, values, faces = _split_vertices(mesh.faces[is_in_part], corner_values)
     linear_colors = decode(torch.from_numpy(values[:, :3]), "srgb")
-    # Row vectors times the matrix from y up to z up are rotated from z up to y up.
-    to_y_up = Y_UP_TO_Z_UP[:3, :3]
+    y_up_to_z_up = Y_UP_TO_Z_UP[:3, :3]
+    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
+    positions = mesh.vertices[vertex_ids] @ y_up_to_z_up
+    rotated_normals = values[:, 5:] @ y_up_to_z_up
     return trimesh.Trimesh(
-        mesh.vertices[vertex_ids] @ to_y_up,
+        positions,
         faces,
         visual=TextureVisuals(uv=values[:, 3:5], material=_material(mesh, surface)),
         vertex_attributes={
             _COLOR: linear_colors.float().numpy(),
-            _NORMAL: (values[:, 5:] @ to_y_up).astype(np.float32),
+            _NORMAL: rotated_normals.astype(np.float32),
         },
         process=False,
     )
 
 
 def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
-    """Create the glTF material of a part.
+    """Create the glTF material of faces with one texture and gloss.
 
     Args:
         mesh: Mesh with the textures.
-        surface: Texture and gloss of the part.
+        surface: Texture and gloss of the faces.
 
     Returns:
-        Material of trimesh.
+        Material for trimesh. The specular factor is at the end of its name.
     """
     from trimesh.visual.material import PBRMaterial
 
@@ -191,10 +194,11 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
         texture = Image.fromarray(mesh.textures[surface.texture_id])
         if mesh.gloss_textures:
             factors = mesh.gloss_textures[surface.texture_id]
-            # glTF stores roughness in green and metallic in blue. Red is set to 0.
+            # glTF stores roughness in green and metallic in blue, so an empty red channel
+            # is inserted.
             gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
-    # trimesh would merge two images with the same bytes and different sizes if
-    # their materials had the same name.
+    # Materials need different names. Otherwise trimesh would merge two images with the same
+    # bytes, even if their widths and heights differ.
     name = f"texture {surface.texture_id}"
     roughness, metallic = MATTE
     if surface.gloss:
@@ -211,14 +215,14 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
 
 
 def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
-    """Change the JSON object of a .glb file, in place, before trimesh writes it.
+    """Change the JSON object of a .glb file before trimesh writes the file.
 
-    All parts become one glTF mesh. Colors, normals and specular factors get their
-    names in glTF, and the cameras are added. trimesh itself would write colors
-    with 8 bits, which is too coarse for dark linear colors.
+    All meshes become primitives of one glTF mesh. Colors, normals and specular
+    factors get their names in glTF, and the cameras are added. trimesh itself
+    would write colors with 8 bits, which is too coarse for dark linear colors.
 
     Args:
-        tree: JSON object of the file.
+        tree: JSON object of the file, changed in place.
         cameras: Cameras to add.
     """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
@@ -235,29 +239,31 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
             tree["extensionsUsed"] = ["KHR_materials_specular"]
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
+    z_up_to_y_up = Y_UP_TO_Z_UP.T
     for index, camera in enumerate(cameras):
-        # Cameras of glTF look along -z, as ours do. Matrices are stored column by column
-        # (glTF 2.0, section 3.10).
-        pose = Y_UP_TO_Z_UP.T @ camera.pose()
+        # The axes of a camera in glTF are the same as ours: right, up and back.
+        pose = z_up_to_y_up @ camera.pose()
+        # glTF stores matrices column by column.
         matrix = pose.T.ravel().tolist()
         tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": matrix})
     tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
-    """Convert a camera to the description of a camera in glTF.
+    """Describe a camera as glTF does.
+
+    The principal point of a perspective camera in glTF is the image center. If
+    the camera has another one, the image in glTF is larger and contains the image
+    of the camera.
 
     Args:
-        camera: Camera to convert.
+        camera: Camera to describe.
 
     Returns:
-        Entry of "cameras" in the JSON object of the file.
+        Entry of the list "cameras" in the JSON object of a glTF file.
     """
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
-        # The principal point of a glTF camera is the image center. For a camera with
-        # another principal point, the image is enlarged until it contains the image of the
-        # camera.
         half_width = math.tan(math.radians(camera.angle) / 2)
         half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)
@@ -273,14 +279,14 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
 def _split_vertices(
     faces: np.ndarray, corner_values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Repeat each vertex for each combination of values that its corners have.
+    """Repeat vertices until all face corners at a vertex have the same values.
 
-    In a file, each vertex has one color, one pair of texture coordinates and one
-    normal.
+    In a mesh, two faces may have different colors at the same vertex. In a file,
+    each vertex has only one color, one normal and so on.
 
     Args:
         faces: Vertex indices of F faces, shape (F, 3).
-        corner_values: D values of the three corners of each face,
+        corner_values: D values at each of the three corners of each face,
             shape (F, 3, D).
 
     Returns:
@@ -290,10 +296,10 @@ def _split_vertices(
         - the values of the new vertices, shape (N, D);
         - the faces with indices of new vertices, shape (F, 3).
     """
-    # Corners with equal rows become one new vertex. A row has the old vertex and the
-    # values. float64 stores both exactly.
-    rows = np.concatenate([faces[..., None], corner_values], axis=-1)
-    flat_rows = rows.reshape(-1, rows.shape[-1])
-    distinct_rows, corner_to_vertex = np.unique(flat_rows, axis=0, return_inverse=True)
-    original_vertices = distinct_rows[:, 0].astype(np.int64)
-    return original_vertices, distinct_rows[:, 1:], corner_to_vertex.reshape(-1, 3)
+    # Corners with the same key become one new vertex. The key of a corner is its original
+    # vertex, followed by its values. Converting the index to float64 does not round it.
+    keys = np.concatenate([faces[..., None], corner_values], axis=-1)
+    corner_keys = keys.reshape(-1, keys.shape[-1])
+    vertex_keys, corner_to_vertex = np.unique(corner_keys, axis=0, return_inverse=True)
+    original_vertices = vertex_keys[:, 0].astype(np.int64)
+    return original_vertices, vertex_keys[:, 1:], corner_to_vertex.reshape(-1, 3)

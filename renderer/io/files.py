@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-# Pattern for the names of temporary files. A temporary file is in the folder of the file
-# that it replaces.
+# Pattern for the names of temporary files. The new content of a file is first written to a
+# temporary file in the same folder, which then replaces the old file.
 TEMPORARY = ".pnb-*.tmp"
 
 
@@ -52,15 +52,15 @@ def replacing(
         if previous and target.exists():
             os.replace(target, previous)
         os.replace(temporary, target)
-        # The name of the file is stored in the folder, so the folder must be flushed, too.
-        # Only POSIX systems can flush folders.
+        # The folder stores the name of the file, so the folder must be flushed, too. Only
+        # POSIX systems can flush folders.
         if durable and os.name == "posix":
             _flush(target.parent)
     except OSError as error:
-        # Errors of libraries have no number and are raised as they are. Other errors name
-        # the temporary file, so `path` is inserted instead.
+        # An error of a library has no error number, and is raised as it is.
         if error.errno is None:
             raise
+        # An error of the system names the temporary file. The new error names `path`.
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):
@@ -73,13 +73,17 @@ def atomic_write(
     durable: bool = False,
     previous: Path | None = None,
 ) -> None:
-    """Write a file so that a reader never sees a part of the content, see `replacing`.
+    """Write a file so that a reader sees either the old content or all of the new content.
+
+    The content is written to a temporary file, which then replaces the old file
+    (see `replacing`).
 
     Args:
         path: File to replace or to create.
         content: New content. Text is encoded as UTF-8. Characters that cannot be
-            encoded, which names of files may contain, are written as escapes.
-        durable: True waits until the file is stored on the disk.
+            encoded are written as escapes. They occur in names of files.
+        durable: True waits until the file is stored on the disk, so that it
+            survives a loss of power.
         previous: Path to which the old file is moved. None deletes the old file.
 
     Raises:
@@ -94,27 +98,28 @@ def remove_unfinished(folder: Path) -> None:
     """Remove the temporary files that a killed process left in a folder.
 
     Args:
-        folder: Folder to which no other process writes.
+        folder: Folder to which no other process writes now. The temporary files of
+            a running process would also be removed.
     """
     for unfinished in folder.glob(TEMPORARY):
         unfinished.unlink(missing_ok=True)
 
 
 def _require_replaceable(target: Path) -> None:
-    """Raise OSError if a path exists and is a folder, a device or a read-only file."""
+    """Raise `OSError` if a path is a folder, a device or a read-only file."""
     if not target.exists():
         return
     if not target.is_file():
         number = errno.EISDIR if target.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number))
-    # `os.replace` would also replace a read-only file. Opening the file for appending
-    # raises the error.
+    # `os.replace` would replace a read-only file. Opening the file for appending raises an
+    # error if the file is read-only, and changes nothing.
     with target.open("ab"):
         pass
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file, or the list of files in a folder, is stored on the disk."""
+    """Wait until a file is stored on the disk, or, for a folder, its list of files."""
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)

@@ -13,11 +13,11 @@ from torch import Tensor
 from renderer.errors import InputError, require_file
 from renderer.io.files import atomic_write
 
-# Suffixes of files that count as images in a folder.
+# Suffixes of the files in a folder that count as images.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-# `read_square` decodes large JPEG files at a reduced size, which is at least this many
-# times the size of the result.
-DECODED_SIZES = 16
+# A large JPEG file is decoded at a reduced size before it is resized to a small square. The
+# sides of the decoded image are at least this many times as long as those of the square.
+MIN_DECODED_RATIO = 16
 
 
 def read_image(path: str | Path, size: int) -> Tensor:
@@ -34,7 +34,7 @@ def read_image(path: str | Path, size: int) -> Tensor:
         InputError: If the file does not exist or cannot be read.
     """
     require_file(path, "give an image file")
-    # Pillow raises many classes of exceptions for damaged files.
+    # For a damaged file, Pillow can raise almost any exception.
     try:
         square = read_square(path, size)
     except Exception as error:
@@ -72,7 +72,7 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
     try:
         gray = float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
-        # The choice is not a number, so it may be a path.
+        # NaN means that the choice is not a number. It may be the path of a file.
         gray = math.nan
     if math.isnan(gray) and isinstance(choice, str | Path):
         try:
@@ -97,18 +97,20 @@ def read_square(path: str | Path, size: int) -> np.ndarray:
     Raises:
         Exception: If the file is damaged. The class depends on the format.
     """
-    image = read_rgb(path, DECODED_SIZES * size)
+    image = read_rgb(path, MIN_DECODED_RATIO * size)
     return np.asarray(central_square(image, size))
 
 
-def read_rgb(path: str | Path, least: int) -> Image.Image:
+def read_rgb(path: str | Path, min_side: int) -> Image.Image:
     """Read an image file as an upright RGB image on a white background.
+
+    A large JPEG file is decoded at 1/2, 1/4 or 1/8 of its size, which is several
+    times faster.
 
     Args:
         path: Image file. It may be rotated (EXIF) and have transparent parts.
-        least: Smallest width and height in pixels that are needed. A large JPEG
-            file is decoded at 1/2, 1/4 or 1/8 of its size, if this is at least
-            `least`. This is several times faster.
+        min_side: Width and height in pixels below which an image is not reduced
+            while it is decoded.
 
     Returns:
         RGB image with 8 bits per channel.
@@ -117,7 +119,8 @@ def read_rgb(path: str | Path, least: int) -> Image.Image:
         Exception: If the file is damaged. The class depends on the format.
     """
     with Image.open(path) as image:
-        image.draft(None, (least, least))
+        # `draft` makes Pillow decode a JPEG file at a reduced size.
+        image.draft(None, (min_side, min_side))
         upright = eight_bits(ImageOps.exif_transpose(image))
     if upright.has_transparency_data:
         upright = upright.convert("RGBA")
@@ -155,8 +158,8 @@ def eight_bits(image: Image.Image) -> Image.Image:
     if image.mode == "F":
         raise ValueError("the pixels are floating-point numbers, so the value of white is unknown")
     if image.mode.startswith("I"):
-        # The mode "I" means 16 bits per pixel. Pillow would clip the values to 8 bits
-        # instead of scaling them.
+        # In the mode "I", a pixel has 16 bits. `Image.convert` would clip such values at
+        # 255 instead of dividing them by 256.
         scaled = np.clip(np.asarray(image) // 256, 0, 255)
         return Image.fromarray(scaled.astype(np.uint8))
     image.load()
@@ -164,10 +167,12 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def write_image(path: Path, image: Image.Image, **options: object) -> None:
-    """Write an image file in the format of its suffix, see `atomic_write`.
+    """Write an image file in the format that its suffix names.
+
+    A reader never sees a part of the new file: see `atomic_write`.
 
     Args:
-        path: File to replace or to create.
+        path: File to replace or to create, such as "render.png".
         image: Image to write.
         **options: Options of Pillow's `Image.save`.
 

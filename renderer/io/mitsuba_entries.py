@@ -1,9 +1,10 @@
-"""Entries of Mitsuba scenes, as dictionaries.
+"""Describe cameras, lights and integrators as entries of a Mitsuba scene.
 
-A scene is a dictionary as `mitsuba.load_dict` takes it, except for two kinds of
-value. A to_world transform is an array (4, 4). An image is an array (H, W, 3)
-under "bitmap", or the name of a file under "filename". `renderer.mitsuba_scene`
-loads and writes such scenes.
+A Mitsuba scene is a dictionary, and so is each of its entries. `mitsuba.load_dict`
+takes such dictionaries, except for two kinds of value. A transformation
+("to_world") is an array (4, 4). An image is an array (H, W, 3) under "bitmap", or
+the name of a file under "filename". `renderer.mitsuba_scene` loads and writes
+such scenes.
 """
 
 from typing import Any
@@ -12,28 +13,29 @@ import numpy as np
 
 from renderer.camera import Camera, PerspectiveCamera
 
-# Type of an entry of a Mitsuba scene.
+# Type of a Mitsuba scene, and of an entry of the scene such as a camera: a dictionary.
 Scene = dict[str, Any]
 
-# Matrix from the axes of Mitsuba's environment maps to world axes. Mitsuba's maps have
-# y up, and +z is in the middle column. In our maps, z is up, and +x is in the middle.
+# Matrix from the axes of Mitsuba's environment maps to world axes. In Mitsuba's maps, y is
+# up and the middle column shows +z. In our maps, z is up and the middle column shows +x.
 TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
-    """Create the entry of an integrator, which says how Mitsuba follows light.
+    """Describe an integrator, which computes the light that reaches the camera, for Mitsuba.
 
     Args:
-        bounces: Number of bounces between surfaces. With 0, only light that comes
-            directly from emitters is rendered.
+        bounces: Number of bounces of light between surfaces. With 0, only light
+            that comes directly from emitters is rendered.
         emitter_samples: Number of rays from a surface point to emitters if
             `bounces` is 0. One more ray has a random direction.
 
     Returns:
-        Entry of the type "path" or "direct".
+        Entry for a Mitsuba scene, of the type "path" or "direct".
     """
     if bounces:
-        # Mitsuba also counts the emitter and the surface that the camera sees.
+        # Mitsuba's depth counts path segments: two more than the bounces between surfaces,
+        # from the emitter to the first surface and from the last surface to the camera.
         depth = bounces + 2
         return {"type": "path", "max_depth": depth, "rr_depth": depth, "hide_emitters": True}
     samples = {"emitter_samples": emitter_samples, "bsdf_samples": 1}
@@ -41,7 +43,7 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
 
 
 def environment(radiance: Scene, scale: float = 1.0) -> Scene:
-    """Create the entry of an environment map.
+    """Describe an environment map for Mitsuba.
 
     Args:
         radiance: Image of the map in the layout of `renderer.light.environment`,
@@ -49,25 +51,25 @@ def environment(radiance: Scene, scale: float = 1.0) -> Scene:
         scale: Factor for the radiance.
 
     Returns:
-        Entry of the emitter "envmap".
+        Entry for a Mitsuba scene, of the type "envmap".
     """
     return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
 def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
-    """Create the entry of a projector.
+    """Describe a projector for Mitsuba.
 
     Args:
-        pose: Matrix from the axes of the projector to world axes, from `pose_of`,
-            shape (4, 4).
+        pose: Matrix from the axes of the projector to world axes, as `pose_of`
+            returns it, shape (4, 4).
         fov: Angle between opposite sides of the pattern in degrees.
         pattern: Image of the pattern, as {"bitmap": array} or
-            {"filename": name}, with other options of the texture.
+            {"filename": name}, with other options of Mitsuba's bitmap texture.
         scale: Factor for the pattern. A white surface that faces the projector
             at distance 1 has the radiance pattern · scale.
 
     Returns:
-        Entry of the emitter "projector".
+        Entry for a Mitsuba scene, of the type "projector".
     """
     irradiance = {"type": "bitmap", **pattern, "raw": True}
     lens = {"fov": fov, "scale": scale, "to_world": pose}
@@ -82,30 +84,31 @@ def sensor(
     film_center: tuple[float, float] = (0.0, 0.0),
     pixel_aspect: float = 1.0,
 ) -> Scene:
-    """Create the entry of a camera.
+    """Describe a camera for Mitsuba, which calls it a sensor.
 
     Args:
-        pose: Matrix from the axes of the camera to world axes, from `pose_of`,
-            shape (4, 4).
-        size: Number of pixels along one side of the image.
-        fov: Angle between opposite sides of the image in degrees. None for a
-            camera without perspective, whose image shows [-1, 1] in the x and y
-            of the pose.
+        pose: Matrix from the axes of the camera to world axes, as `pose_of`
+            returns it, shape (4, 4).
+        size: Width of the image in pixels.
+        fov: Angle between the left and the right side of the image in degrees.
+            None for a camera without perspective, which shows x and y from -1 to 1
+            in the axes of the camera.
         pixel_format: Channels of the image, such as "rgba".
-        film_center: Center of the image of a perspective camera, to the right of
-            the principal point and below it, divided by the width and the height
-            of the image.
-        pixel_aspect: Vertical focal length divided by the horizontal one, both
-            in pixels. Mitsuba has square pixels, so the image gets another number
-            of rows instead.
+        film_center: Offset of the image center of a perspective camera from the
+            principal point: to the right as a fraction of the image width, and
+            down as a fraction of the image height.
+        pixel_aspect: Vertical focal length in pixels divided by the horizontal
+            one. Mitsuba has square pixels, so the image has size / pixel_aspect
+            rows.
 
     Returns:
-        Entry of the sensor "perspective" or "orthographic".
+        Entry for a Mitsuba scene, of the type "perspective" or "orthographic".
     """
+    row_count = max(1, round(size / pixel_aspect))
     film = {
         "type": "hdrfilm",
         "width": size,
-        "height": max(1, round(size / pixel_aspect)),
+        "height": row_count,
         "pixel_format": pixel_format,
         "rfilter": {"type": "box"},
     }
@@ -119,15 +122,15 @@ def sensor(
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
-    """Convert a camera of the renderer to an entry of a Mitsuba scene.
+    """Convert a camera of this renderer to a camera of Mitsuba.
 
     Args:
         camera: Camera to convert.
-        size: Number of pixels along one side of the image.
+        size: Width of the image in pixels.
         pixel_format: Channels of the image, such as "rgba".
 
     Returns:
-        Entry of the sensor, see `sensor`.
+        Entry of the camera for a Mitsuba scene, as `sensor` returns it.
     """
     if isinstance(camera, PerspectiveCamera):
         film_center = (-camera.principal_right / 2, camera.principal_up / 2)
@@ -144,14 +147,15 @@ def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
     cameras look along -z, and x points to the right.
 
     Args:
-        camera: Camera of the renderer.
-        scale: Number of world units per unit along x and y.
+        camera: Camera of this renderer.
+        scale: Length in world units of one unit along the x- and y-axis of
+            Mitsuba's camera.
 
     Returns:
         Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     pose = camera.pose()
-    # The first three columns are the axes x, y and z.
+    # The columns of the pose are the axes x, y and z and the position of the camera.
     pose[:3] *= [-scale, scale, -1, 1]
     return pose
 

@@ -1,9 +1,10 @@
 """Draw sheets of images with captions.
 
-A sheet is an image with a grid of tiles. A tile is an image with its caption
+A sheet is a picture with a grid of tiles. A tile is an image with its caption
 below.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, repeat, zip_longest
@@ -27,22 +28,22 @@ CAPTION_SIZE = 12
 TITLE_HEIGHT = 36
 LINE_HEIGHT = 16
 
-# Color of the background of a sheet.
+# Background color of a sheet of images.
 PAPER = "white"
-# Color of titles and of the first line of a caption, nearly black.
+# Color of titles and of the first line of a caption: nearly black.
 INK = "#1a1a1a"
-# Color of the second and further lines of a caption, a gray.
+# Color of the lines of a caption after the first line: gray.
 FAINT = "#6b6b6b"
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Image with lines of text below it.
+    """Image with a caption below it.
 
     Attributes:
         image: RGB values, uint8, shape (H, W, 3).
-        caption: Lines of text. The first line has the color INK, and the others
-            have the color FAINT.
+        caption: Lines of text. The first line is nearly black, and the other lines
+            are gray.
     """
 
     image: np.ndarray
@@ -52,8 +53,8 @@ class Tile:
         """Draw the image with its caption below.
 
         Returns:
-            Image of the tile. It is as wide as the image or as the longest line,
-            whichever is wider.
+            Picture of the tile. It is as wide as the image or as the longest line of
+            the caption, whichever is wider.
         """
         image = Image.fromarray(self.image)
         line_widths = [_text_width(line, CAPTION_SIZE) for line in self.caption]
@@ -81,8 +82,8 @@ def tiles_of(
     Args:
         images: RGB images with values in [0, 1], shape (3, H, W) each.
         captions: Lines of text below each image. The default is no text.
-        side: Smallest width of the enlarged images in pixels. An image is
-            enlarged by the smallest whole factor that makes it so wide.
+        side: Width in pixels that the images should have at least. An image is
+            enlarged by the smallest whole factor that gives at least this width.
 
     Returns:
         One tile for each image.
@@ -90,8 +91,7 @@ def tiles_of(
     tiles = []
     for image, caption in zip(images, captions, strict=False):
         pixels = to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy()
-        # side / width, rounded up: `//` rounds down, and the two signs reverse this.
-        factor = -(-side // image.shape[2])
+        factor = math.ceil(side / image.shape[2])
         enlarged = pixels.repeat(factor, 0).repeat(factor, 1)
         tiles.append(Tile(enlarged, caption))
     return tiles
@@ -116,15 +116,14 @@ def draw_grid(
     images = [[tile.captioned() for tile in row] for row in rows]
     row_heights = [max(image.height for image in row) for row in images]
     column_widths = _column_widths(images, titles)
-    # Left edge of each column, and the position where a further column would begin.
-    lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
     title_lines = bool(heading) + bool(titles)
     first_top = MARGIN + TITLE_HEIGHT * title_lines
-    # Top edge of each row, and the position where a further row would begin.
+    # Left edges of the columns and top edges of the rows. Each list has one more entry:
+    # the position at which another column or row would begin.
+    lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
     tops = list(accumulate((height + GAP for height in row_heights), initial=first_top))
 
-    # The last column ends one GAP before a further column would begin, and the last
-    # row ends one GAP before a further row would begin.
+    # Another column would begin one GAP after the right edge of the last column.
     right = max(lefts[-1] - GAP, MARGIN + _text_width(heading, TITLE_SIZE))
     bottom = max(tops[-1] - GAP, first_top)
     sheet = Image.new("RGB", (right + MARGIN, bottom + MARGIN), PAPER)
@@ -140,20 +139,20 @@ def draw_grid(
 
 
 def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str]) -> list[int]:
-    """Compute the width of each column of a sheet in pixels.
+    """Compute the width of each column of a sheet of images in pixels.
 
     Args:
-        images: Images of the tiles of each row. The last row may be shorter.
-        titles: Titles of the columns, possibly fewer than columns.
+        images: Images of each row of the sheet. The last row may be shorter.
+        titles: Titles of the columns. Some columns may have no title.
 
     Returns:
-        Width of the widest image or of the title of each column, whichever is
-        wider.
+        Width of each column: that of its widest image or of its title, whichever
+        is wider.
     """
+    columns = zip_longest(*images)
     widths = []
-    # The inner zip_longest turns rows into columns, with None for missing tiles. The
-    # outer one adds None for a missing title or column.
-    for column, title in zip_longest(zip_longest(*images), titles):
+    # zip_longest fills up with None: an image, a column or a title may be missing.
+    for column, title in zip_longest(columns, titles):
         title_width = _text_width(title or "", TITLE_SIZE)
         image_widths = [image.width for image in column or () if image]
         widths.append(max([title_width, *image_widths]))
