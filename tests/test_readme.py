@@ -93,14 +93,13 @@ def test_load_block_recognizes_an_orange(folder):
 
 
 def test_attack_block_fools_a_network_of_torchvision_in_three_views(folder):
+    torch.manual_seed(0)
     names = run("Attack a network")
     result = names["result"]
     assert result.logits_before.argmax(-1).eq(0).all()  # orange
     assert result.logits.argmax(-1).eq(1).all()
     assert result.success.all()
     assert (folder / "attack.png").is_file()
-    assert (folder / "adversaries" / "attack.jsonl").is_file()
-    assert (folder / "adversaries" / "example_000" / "light.json").is_file()
 
 
 def test_block_without_gradients_finds_an_adversary_with_few_queries():
