@@ -482,7 +482,7 @@ LIGHTS = [
         None,
         6,
     ),
-    *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT),
+    *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT, "light.exr"),
     *calls_of(
         "directions",
         lambda x: harmonics.basis(x, 2),

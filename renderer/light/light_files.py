@@ -48,8 +48,8 @@ def save_light(
         basis: Basis of the light. The default is SH of degree 6.
 
     Raises:
-        InputError: If the coefficients have another shape or hold NaN, or the
-            file cannot be written.
+        InputError: If the file is not a .json file or cannot be written, or the
+            coefficients have another shape or hold NaN.
 
     Example:
         >>> import torch
@@ -60,6 +60,11 @@ def save_light(
         True
     """
     path = as_path("path", path)
+    if path.suffix != ".json":
+        raise InputError(
+            f"path={path} is not a .json file: give a .json file, and let pnb-light write it as a "
+            "map (.hdr, .exr, .npy)"
+        )
     expected = "Harmonics(degree), or lamps or a projector"
     require_kind("basis", basis, Harmonics | LocalBasis, expected)
     coefficients = as_tensor("coefficients", coefficients)
