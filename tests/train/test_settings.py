@@ -65,7 +65,7 @@ def test_the_demonstration_has_one_epoch_of_three_rounds():
         seed=0,
         epoch=0,
         images_per_epoch=settings.train.images_per_epoch,
-        every=settings.augment.regenerate_every,
+        images_per_round=settings.augment.regenerate_every,
     )
     assert settings.train.epochs == 1
     # A round has 120 images and 480 renders.

@@ -1,7 +1,8 @@
 """The training batches of an epoch.
 
-An epoch has one or more rounds. A round shows some of the data and all of its renders, shuffled,
-shifted and flipped.
+An epoch has one or more rounds. Renders are made anew for each round. A round
+shows some images of the data set and all of its renders, in random order. Each
+image is shifted by some pixels, and some images are flipped.
 """
 
 import math
@@ -17,26 +18,29 @@ from augment.random_streams import generator
 from train.data.images import ImageFiles
 from train.data.sets import Split
 
-# Images of up to 64 pixels per side are shifted by up to this many pixels. Larger images are
-# shifted by up to a sixteenth of their side.
-PADDING = 4
-# Bytes of the batches that `_batches_in_memory` shifts and flips at a time.
+# A training image of up to 64 pixels per side is shifted by at most 4 pixels.
+# A larger image is shifted by at most a sixteenth of its side.
+SMALL_IMAGE_SHIFT = 4
+# `_batches_in_memory` shifts and flips batches of about this many bytes in one call.
 CHUNK_BYTES = 2**24
 
-# Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
+# Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether each
+# image is a render, bool, shape (B,).
 Batch = tuple[Tensor, Tensor, Tensor]
 
 
 class TrainingImages(NamedTuple):
-    """Images from which the batches of a round are drawn.
+    """Images of a data set and renders, from which training batches are made.
 
-    The N images of the data have the numbers 0 to N - 1. The renders have the
-    numbers from N.
+    They are numbered together: the N training images of the data set have the
+    numbers 0 to N - 1, and the renders have the numbers from N on.
 
     Attributes:
-        split: Data set, which also holds the images that validate.
-        rows: Rows of the data set that are trained on, shape (N,).
-        renders: Renders of the round.
+        split: Images of the data set. It may also have images that are held
+            out for validation.
+        rows: Indices into `split` of the N images that are trained on, shape
+            (N,).
+        renders: Renders with their labels.
     """
 
     split: Split
@@ -45,13 +49,13 @@ class TrainingImages(NamedTuple):
 
 
 class Round(NamedTuple):
-    """The training between two regenerations of the renders: an epoch, or a part of one.
+    """Part of an epoch that is trained on the same renders.
 
     Attributes:
-        number: Number of the round in the run, from 0.
-        epoch: Number of its epoch, from 0.
-        rows: Numbers of its images in `TrainingImages`, ascending, int64, shape
-            (M,).
+        number: Number of rounds of the training run before this round.
+        epoch: Number of epochs before the epoch of this round.
+        rows: Numbers of the images of the round, as `TrainingImages` numbers
+            them, in ascending order, int64, shape (M,).
     """
 
     number: int
@@ -66,12 +70,13 @@ class Draws:
     A round has N batches of B images.
 
     Attributes:
-        order: Number of each image in `TrainingImages`, shape (N, B).
+        order: Number of the image at each place of each batch, as
+            `TrainingImages` numbers the images, shape (N, B).
         shifts: Pixels by which each image is shifted, shape (2, N, B). The first
-            dimension has rows and columns.
-        flips: Whether each image is flipped, bool, shape (N, B).
+            entry is the vertical shift, the second the horizontal shift.
+        flips: Whether each image is flipped left to right, bool, shape (N, B).
         seeds: Seed of the random crop of each image, shape (N, B). None if the
-            images are in memory.
+            data set is in memory, because its images are not cropped.
     """
 
     order: Tensor
@@ -80,14 +85,15 @@ class Draws:
     seeds: Tensor | None = None
 
     def of_columns(self, first: int, columns: slice) -> "Draws":
-        """Return the draws of a part of each batch.
+        """Select some batches of a round, and some images of each of them.
 
         Args:
-            first: Number of the first batch that is kept.
-            columns: Images of each batch that are kept.
+            first: Index of the first selected batch. All later batches are
+                selected, too.
+            columns: Range of the places in a batch whose images are selected.
 
         Returns:
-            Draws of the kept images.
+            Draws for the selected images.
         """
         return Draws(
             order=self.order[first:, columns],
@@ -98,34 +104,35 @@ class Draws:
 
 
 def rounds_of_epoch(
-    images: int,
-    renders: int,
+    image_count: int,
+    render_count: int,
     seed: int,
     epoch: int,
     images_per_epoch: int | None,
-    every: int | None,
+    images_per_round: int | None,
 ) -> list[Round]:
-    """Divide an epoch into rounds. Each round shows all renders.
+    """Divide the training images of an epoch into rounds. Each round shows all renders.
 
     Args:
-        images: The number of training images.
-        renders: The number of renders.
-        seed: The seed of the run.
-        epoch: The epoch, from 0.
-        images_per_epoch: The number of images that an epoch shows. They are drawn anew for each
-            epoch. None shows all.
-        every: The number of images that a round shows. None makes one round.
+        image_count: Number of training images of the data set.
+        render_count: Number of renders.
+        seed: Seed of the training run.
+        epoch: Number of epochs before this epoch.
+        images_per_epoch: Number of images of the data set that the epoch shows.
+            They are drawn at random in each epoch. None shows all images.
+        images_per_round: Number of images of the data set that a round shows.
+            None makes a single round.
 
     Returns:
-        The rounds.
+        Rounds of the epoch.
     """
     draws = generator(seed, epoch, "rounds")
-    drawn = torch.randperm(images, generator=draws)[:images_per_epoch]
-    numbers_of_renders = torch.arange(images, images + renders)
-    parts = drawn.split(every or len(drawn))
+    shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
+    render_numbers = torch.arange(image_count, image_count + render_count)
+    parts = shown_images.split(images_per_round or len(shown_images))
     rounds = []
     for index, part in enumerate(parts):
-        rows = torch.cat([part.sort().values, numbers_of_renders])
+        rows = torch.cat([part.sort().values, render_numbers])
         rounds.append(Round(epoch * len(parts) + index, epoch, rows))
     return rounds
 
@@ -134,140 +141,169 @@ def training_batches(
     images: TrainingImages,
     batch_size: int,
     seed: int,
-    now: Round,
+    this_round: Round,
     flips: str = "random",
     first: int = 0,
 ) -> Iterator[Batch]:
-    """Yield the part of each batch of a round that this process trains on.
+    """Yield this process's images of each batch of a round.
 
-    All batches have the same size. The last one is filled up with the first
-    images of the round. All draws are made on the CPU. They are the same for
-    every device and every number of processes.
+    Each of P processes gets `batch_size` / P images of each batch. All batches
+    have the same size: the last batch is filled up with the first images of the
+    round. All random draws are made on the CPU, so they are the same for every
+    device and every number of processes.
 
     Args:
-        images: The data and the renders.
-        batch_size: The number of images of a batch, in all processes.
-        seed: The seed of the run.
-        now: The round.
-        flips: "random" flips half of the images. "alternating" flips each image in every other
-            epoch.
-        first: The batch to begin with.
+        images: Images of the data set, and renders.
+        batch_size: Number of images of a batch in all processes together.
+        seed: Seed of the training run.
+        this_round: Round whose images are shown.
+        flips: "random" flips each image with probability 0.5. "alternating"
+            flips each image in every other epoch.
+        first: Index of the first batch that is yielded.
 
     Yields:
-        The images, uint8, shape (B, 3, H, W), their labels (B,), and which are renders (B,).
+        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
+        each image is a render, bool, shape (B,). B is `batch_size` / P.
     """
-    draws = _draw(images, batch_size, seed, now, flips)
-    share = batch_size // distributed.world_size()
-    begin = distributed.rank() * share
-    draws = draws.of_columns(first, slice(begin, begin + share))
+    draws = _draw(images, batch_size, seed, this_round, flips)
+    own_size = batch_size // distributed.world_size()
+    begin = distributed.rank() * own_size
+    own_draws = draws.of_columns(first, slice(begin, begin + own_size))
     if isinstance(images.split.images, ImageFiles):
-        return _batches_from_files(images, images.split.images, draws)
-    return _batches_in_memory(images, share, draws)
+        return _batches_from_files(images, images.split.images, own_draws)
+    return _batches_in_memory(images, own_size, own_draws)
 
 
-def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips: str) -> Draws:
-    """Draw the order, the shifts, the flips and the crops of the images of a round.
+def _draw(
+    images: TrainingImages, batch_size: int, seed: int, this_round: Round, flips: str
+) -> Draws:
+    """Draw the order, shift, flip and crop of each image of a round at random.
 
     Args:
-        images: Data and renders.
-        batch_size: Number of images of a batch, in all processes.
-        seed: Seed of the run.
-        now: The round.
-        flips: "random" or "alternating", see `training_batches`.
+        images: Images of the data set, and renders.
+        batch_size: Number of images of a batch in all processes together.
+        seed: Seed of the training run.
+        this_round: Round whose images are shown.
+        flips: "random" flips each image with probability 0.5. "alternating"
+            flips each image in every other epoch.
 
     Returns:
         Draws for all batches of the round.
     """
-    shown = len(now.rows)
-    batches = math.ceil(shown / batch_size)
-    shuffled = now.rows[torch.randperm(shown, generator=generator(seed, now.number, "batches"))]
-    # The last batch is filled up with the first images of the round.
-    filled_up = torch.arange(batches * batch_size) % shown
-    order = shuffled[filled_up].view(-1, batch_size)
+    shown_count = len(this_round.rows)
+    permutation = torch.randperm(
+        shown_count, generator=generator(seed, this_round.number, "batches")
+    )
+    batch_count = math.ceil(shown_count / batch_size)
+    # After the last image, the places of the last batch start again at image 0.
+    places = torch.arange(batch_count * batch_size) % shown_count
+    order = this_round.rows[permutation][places].view(batch_count, batch_size)
 
-    most = max(PADDING, images.split.images.shape[-1] // 16)
-    draws = generator(seed, now.number, "shifts")
-    shifts = torch.randint(-most, most + 1, (2, *order.shape), generator=draws)
+    side = images.split.images.shape[-1]
+    max_shift = max(SMALL_IMAGE_SHIFT, side // 16)
+    draws = generator(seed, this_round.number, "shifts")
+    shifts = torch.randint(-max_shift, max_shift + 1, (2, *order.shape), generator=draws)
     if flips == "random":
-        draws = generator(seed, now.number, "flips")
+        draws = generator(seed, this_round.number, "flips")
         is_flipped = torch.randint(0, 2, order.shape, generator=draws, dtype=torch.bool)
     else:
-        count = len(images.rows) + len(images.renders)
-        draws = generator(seed, "flips")
-        # Whether each image is flipped in even epochs. In odd epochs, the other
-        # images are flipped.
-        by_image = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
-        is_flipped = by_image[order] ^ bool(now.epoch % 2)
-    seeds = None
+        is_flipped = _alternating_flips(images, seed, this_round.epoch)[order]
+    crop_seeds = None
     if isinstance(images.split.images, ImageFiles):
-        seeds = torch.randint(2**62, order.shape, generator=generator(seed, now.number, "crops"))
-    return Draws(order, shifts, is_flipped, seeds)
+        draws = generator(seed, this_round.number, "crops")
+        crop_seeds = torch.randint(2**62, order.shape, generator=draws)
+    return Draws(order, shifts, is_flipped, crop_seeds)
 
 
-def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round whose images are in memory.
+def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Tensor:
+    """Return whether each image is flipped in an epoch, if flips alternate.
+
+    A random half of the images is flipped in even epochs. The other images are
+    flipped in odd epochs.
 
     Args:
-        images: Data and renders.
-        share: Number of images of a batch in this process, B.
-        draws: Draws for the images of this process.
+        images: Images of the data set, and renders.
+        seed: Seed of the training run.
+        epoch: Number of epochs before this epoch.
+
+    Returns:
+        Whether each image is flipped, bool, shape (N,) for N images and renders.
+    """
+    count = len(images.rows) + len(images.renders)
+    draws = generator(seed, "flips")
+    is_flipped_in_even_epochs = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
+    return is_flipped_in_even_epochs ^ bool(epoch % 2)
+
+
+def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) -> Iterator[Batch]:
+    """Yield the batches of a round from a data set in memory.
+
+    A chunk of several batches is shifted and flipped in one call, which takes
+    less time than one call for each batch.
+
+    Args:
+        images: Images of the data set, and renders.
+        batch_size: Number of images of a batch in this process, B.
+        draws: Random draws for the images of this process.
 
     Yields:
-        Images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
+        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
+        each image is a render, bool, shape (B,).
     """
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
     device = pixels.device
-    # Number of images that are shifted and flipped in one call. It is a multiple
-    # of `share`, the number of images of this process in a batch, so that these
-    # images fill whole batches.
-    at_once = share * max(1, CHUNK_BYTES // (share * pixels[0].numel()))
+    batch_bytes = batch_size * pixels[0].numel()
+    chunk_size = batch_size * max(1, CHUNK_BYTES // batch_bytes)
 
-    # The draws of all batches are copied to the device together, so that no batch
-    # waits for a copy.
     order = draws.order.flatten()
     is_render_on_cpu = order >= len(rows)
-    parts = [slice(begin, begin + at_once) for begin in range(0, len(order), at_once)]
-    places_of_renders = [is_render_on_cpu[part].nonzero().squeeze(1).to(device) for part in parts]
-    # The rows of renders are wrong here. Renders replace these images below.
+    chunks = [slice(begin, begin + chunk_size) for begin in range(0, len(order), chunk_size)]
+    # The CPU finds the renders of all chunks before the first batch. On a GPU,
+    # `nonzero` would wait for all earlier work.
+    renders_in_chunk = [is_render_on_cpu[chunk].nonzero().squeeze(1).to(device) for chunk in chunks]
+    # `clamp` gives each render some valid row of the data set. The image at this
+    # row is replaced by the render below.
     row_of_image = rows[order.clamp(max=len(rows) - 1)].to(device)
     render_of_image = (order - len(rows)).to(device)
     shifts = draws.shifts.flatten(1).to(device)
     flips = draws.flips.flatten().to(device)
     is_render = is_render_on_cpu.to(device)
 
-    for part, places in zip(parts, places_of_renders, strict=True):
-        chosen = row_of_image[part]
-        shown = crop_and_flip(pixels, chosen, shifts[:, part], flips[part])
-        labels = split.labels[chosen]
-        if len(places):
-            number = render_of_image[part][places]
-            shown[places] = crop_and_flip(
+    for chunk, render_places in zip(chunks, renders_in_chunk, strict=True):
+        shown_rows = row_of_image[chunk]
+        shown = crop_and_flip(pixels, shown_rows, shifts[:, chunk], flips[chunk])
+        labels = split.labels[shown_rows]
+        if len(render_places):
+            shown_renders = render_of_image[chunk][render_places]
+            shown[render_places] = crop_and_flip(
                 cast(Tensor, renders.images),
-                number,
-                shifts[:, part][:, places],
-                flips[part][places],
+                shown_renders,
+                shifts[:, chunk][:, render_places],
+                flips[chunk][render_places],
             )
-            labels[places] = renders.labels[number]
-        batches = shown.split(share)
-        labels_of_batches = labels.split(share)
-        is_render_of_batches = is_render[part].split(share)
-        yield from zip(batches, labels_of_batches, is_render_of_batches, strict=True)
+            labels[render_places] = renders.labels[shown_renders]
+        image_batches = shown.split(batch_size)
+        label_batches = labels.split(batch_size)
+        is_render_batches = is_render[chunk].split(batch_size)
+        yield from zip(image_batches, label_batches, is_render_batches, strict=True)
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round whose images are read from files.
+    """Yield the batches of a round from a data set on disk.
 
-    The images are shown in random crops, which are flipped at random when they
-    are read. Renders are shifted and flipped in this function.
+    Worker processes read random crops of the images, and flip half of them.
+    Renders are in memory. They are shifted and flipped here.
 
     Args:
-        images: Data and renders.
-        files: Files of the data.
-        draws: Draws for the images of this process, in batches of B images.
+        images: Images of the data set, and renders.
+        files: Image files of the data set.
+        draws: Random draws for the images of this process, in batches of B
+            images.
 
     Yields:
-        Images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
+        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
+        each image is a render, bool, shape (B,).
     """
     split, rows, renders = images
     device = split.labels.device
@@ -283,45 +319,49 @@ def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws)
     for index, crops in enumerate(crops_of_batch):
         order = draws.order[index]
         is_render = is_render_in_batch[index]
-        pixels = torch.empty(len(order), *files.shape[1:], dtype=torch.uint8, device=device)
+        shown = torch.empty(len(order), *files.shape[1:], dtype=torch.uint8, device=device)
         labels = torch.empty(len(order), dtype=torch.int64, device=device)
-        pixels[~is_render] = crops.to(device)
+        shown[~is_render] = crops.to(device)
         labels[~is_render] = split.labels[rows_of_batch[index].to(device)]
         if is_render.any():
-            number = (order[is_render] - len(rows)).to(device)
-            pixels[is_render] = crop_and_flip(
+            shown_renders = (order[is_render] - len(rows)).to(device)
+            shown[is_render] = crop_and_flip(
                 cast(Tensor, renders.images),
-                number,
+                shown_renders,
                 draws.shifts[:, index, is_render].to(device),
                 draws.flips[index, is_render].to(device),
             )
-            labels[is_render] = renders.labels[number]
-        yield pixels, labels, is_render.to(device)
+            labels[is_render] = renders.labels[shown_renders]
+        yield shown, labels, is_render.to(device)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
-    """Take some images, flip some of them left to right, and shift each.
+    """Select images, shift each by whole pixels, and flip some of them left to right.
 
-    Pixels from outside an image are mirrored at its border.
+    A shift uncovers pixels at a border of the image. They are filled by
+    reflection at this border.
 
     Args:
         images: Images, shape (N, 3, H, W).
-        chosen: Indices of the images to take, shape (B,).
-        shifts: Rows and columns by which each image is shifted, shape (2, B).
-        flips: Whether each image is flipped left to right, bool, shape (B,).
+        chosen: Indices of the selected images, shape (B,).
+        shifts: Vertical and horizontal shift of each selected image in pixels,
+            shape (2, B). Positive shifts move the image up and to the left.
+        flips: Whether each selected image is then flipped, bool, shape (B,).
 
     Returns:
-        The images, shape (B, 3, H, W).
+        Shifted and flipped images, shape (B, 3, H, W).
     """
     height, width = images.shape[2:]
     device = images.device
-    # For each image, the rows (B, H) and the columns (B, W) that its pixels are
-    # taken from.
-    rows = _reflect(torch.arange(height, device=device) + shifts[0, :, None], height)
+    # `rows` has the source row of each pixel row, shape (B, H). `columns` has the
+    # source column of each pixel column, shape (B, W).
+    rows = torch.arange(height, device=device) + shifts[0, :, None]
+    rows = _reflect(rows, height)
     columns = torch.arange(width, device=device).expand(len(chosen), -1)
     columns = torch.where(flips[:, None], columns.flip(1), columns)
     columns = _reflect(columns + shifts[1, :, None], width)
     channels = torch.arange(3, device=device)
+    # The four index arrays broadcast to the shape (B, 3, H, W) of the result.
     return images[
         chosen[:, None, None, None],
         channels[:, None, None],
@@ -331,9 +371,14 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
 
 
 def _reflect(index: Tensor, size: int) -> Tensor:
-    """Mirror indices below 0 or above size - 1 at the border pixel.
+    """Reflect pixel indices outside an image at its border, as `torch.nn.ReflectionPad2d` does.
 
-    The index -1 becomes 1, and `size` becomes size - 2, as in the mode
-    "reflect" of torch.
+    The index -1 becomes 1, and the index `size` becomes `size` - 2.
+
+    Args:
+        index: Indices of rows or columns. Each is less than `size` outside the
+            image.
+        size: Number of rows or columns of the image.
     """
-    return (size - 1) - ((size - 1) - index.abs()).abs()
+    last = size - 1
+    return last - (last - index.abs()).abs()

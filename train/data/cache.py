@@ -1,8 +1,8 @@
-"""Tensors that are kept on disk from run to run, each under a hash of all that went into it.
+"""Cache of tensors on disk. The key of each file is a hash of all that the tensors depend on.
 
-A file has a checksum and then the tensors in the safetensors format. The tensors are read only if
-the checksum holds. A file may be damaged or deleted at any time, and processes may share the
-folder.
+A file has a checksum, followed by the tensors in the safetensors format. A file
+with a wrong checksum counts as missing, so files may be damaged or deleted at
+any time. Several processes may use the folder at once.
 """
 
 import hashlib
@@ -19,18 +19,20 @@ from renderer.io.files import atomic_write
 from train import console
 from train.system.hashing import content_hash
 
-# The length of the checksum, a SHA-256.
+# Each file of the cache begins with a SHA-256 checksum, which has 32 bytes.
 CHECKSUM_BYTES = 32
 
 
 def cache_folder(choice: str | None) -> Path | None:
-    """Return the folder of a cache.
+    """Return the folder of the cache that a user chooses.
 
     Args:
-        choice: "auto" for the user's own (in XDG_CACHE_HOME or ~/.cache), another folder, or None.
+        choice: Path of a folder; "auto" for a folder in the user's cache, which
+            is $XDG_CACHE_HOME or ~/.cache; or None for no cache.
 
     Returns:
-        The folder. None if nothing is to be kept, or if "auto" finds no home folder.
+        Folder of the cache. None without a cache, or if "auto" finds no home
+        folder.
     """
     if not choice:
         return None
@@ -41,28 +43,34 @@ def cache_folder(choice: str | None) -> Path | None:
 
 
 def source_key(*packages: Path) -> str:
-    """Hash the Python files of some folders, so that a cache notices when code has changed.
+    """Hash the source code of packages.
+
+    As part of the key of a cache, the hash makes cached results of other code
+    unused.
 
     Args:
-        packages: Folders of the files.
+        packages: Folders of the packages.
 
     Returns:
-        A hash of these files and of the versions of torch and NumPy.
+        Hash of all Python files in these folders, and of the versions of torch
+        and NumPy.
     """
     files = []
     for folder in packages:
         for path in folder.rglob("*.py"):
-            files.append((path.relative_to(folder).as_posix(), path))
+            name = path.relative_to(folder).as_posix()
+            files.append((name, path))
     sources = [(name, path.read_bytes()) for name, path in sorted(files)]
     return content_hash([torch.__version__, np.__version__, sources])
 
 
 class TensorCache:
-    """Named tensors in files of a folder.
+    """Cache of named tensors in the files of a folder.
 
     Args:
-        folder: The folder, which is made when it is first written to. If that fails, a warning is
-            logged once. None keeps nothing.
+        folder: Folder of the cache. It is created at the first write. If
+            writing fails, one warning is logged, and nothing more is written.
+            None caches nothing.
     """
 
     def __init__(self, folder: Path | None = None):
@@ -70,14 +78,13 @@ class TensorCache:
         self.writable = folder is not None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
-        """Read tensors.
+        """Read the tensors that were written under a key.
 
         Args:
-            key: The key, such as one of `content_hash`.
+            key: Name of the file, such as a hash of `content_hash`.
 
         Returns:
-            The tensors that were written under the key. None if there are none, or if a bit of
-            them has changed.
+            Tensors by name. None if there is no such file, or if it is damaged.
         """
         if self.folder is None:
             return None
@@ -92,11 +99,14 @@ class TensorCache:
         return safetensors.torch.load(tensors)
 
     def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors. Another process sees the old file or the new one.
+        """Write tensors under a key.
+
+        Other processes never read a partly written file: they read the old file
+        or the new one.
 
         Args:
-            key: The key.
-            tensors: The tensors by name, on the CPU.
+            key: Name of the file, such as a hash of `content_hash`.
+            tensors: Tensors by name, on the CPU.
         """
         if self.folder is None or not self.writable:
             return
@@ -110,5 +120,5 @@ class TensorCache:
 
 
 def _checksum(key: str, content: bytes) -> bytes:
-    """Return the SHA-256 of a key and of the tensors that are written under it."""
+    """Return the SHA-256 checksum of the key and the content of a file of the cache."""
     return hashlib.sha256(key.encode() + content).digest()

@@ -1,4 +1,4 @@
-"""Images that stay on disk. Worker processes read them whenever they are shown."""
+"""Images that stay on disk. Worker processes read an image each time that training shows it."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,34 +14,37 @@ from renderer.errors import InputError
 from renderer.io.images import central_square, read_rgb
 from train import console
 
-# Images of at most this many pixels per side are kept in memory instead.
-RESIDENT = 64
-# The smallest part of an image's area that a random crop shows. A smaller part of a photograph of
-# one thing often shows none of it.
-MINIMUM_AREA = 0.35
-# A large JPEG is decoded to at least this many times the final size.
-DECODED = 2
+# Data sets with at most 64 pixels per side are kept in memory. Larger ones stay
+# on disk.
+MAX_SIZE_IN_MEMORY = 64
+# Smallest fraction of the area of an image that a random crop shows. A smaller
+# crop of a photograph of one object often misses the object.
+MIN_CROP_AREA = 0.35
+# A large JPEG file is decoded at a fraction of its size, which is fast. The decoded
+# image has at least twice the size of the image that is shown.
+DECODED_SCALE = 2
 
-# Index of an image in `ImageFiles.paths`, and seed of its random crop. Without a
-# seed, the central square is read.
+# Index of an image in `ImageFiles.paths`, and seed of its random crop. If the seed
+# is None, the central square of the image is read instead of a crop.
 Key = tuple[int, int | None]
-# The reason why a file cannot be read, by path.
-Faults = dict[PurePosixPath, str]
+# For each file that cannot be read, the error message by the path of the file.
+ReadErrors = dict[PurePosixPath, str]
 
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """The images of a folder, as central squares or random crops.
+    """Image files of a data set, which are read as central squares or random crops.
 
-    It stands in for a tensor of images in `train.data.sets.Split`.
+    `train.data.sets.Split` has them instead of a tensor of images.
 
     Attributes:
-        folder: The folder.
-        paths: The paths of the images in it.
-        size: The pixels per side of a square or crop.
-        workers: The number of processes that read.
-        skip: Whether another image of the same folder is shown in place of one that cannot be
-            read. Otherwise that is an InputError.
+        folder: Folder of the data set.
+        paths: Paths of the images, relative to the folder.
+        size: Pixels per side of the squares and crops.
+        workers: Number of processes that read images.
+        skip: Whether an image that cannot be read is replaced by another image
+            of the same subfolder. If False, such an image raises an
+            InputError.
     """
 
     folder: Path
@@ -57,82 +60,85 @@ class ImageFiles:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """The shape that a tensor of the images would have."""
+        """Shape that a tensor of the images would have: (images, 3, size, size)."""
         return len(self), 3, self.size, self.size
 
     def __getitem__(self, rows: Tensor | slice) -> "ImageFiles":
-        """Return the files of some rows, by their numbers or a mask."""
-        chosen = torch.arange(len(self))[rows].tolist()
-        return replace(self, paths=tuple(self.paths[row] for row in chosen))
+        """Select images by a slice, an index array or a boolean mask."""
+        indices = torch.arange(len(self))[rows].tolist()
+        return replace(self, paths=tuple(self.paths[index] for index in indices))
 
-    def facts(self) -> list[tuple[str, int]]:
-        """Return each path with its size in bytes, which a hash takes in place of the pixels."""
+    def file_sizes(self) -> list[tuple[str, int]]:
+        """Return the path and the size in bytes of each image file."""
         return [(str(path), (self.folder / path).stat().st_size) for path in self.paths]
 
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Give the central squares of batches of rows.
+        """Read the central squares of images, batch by batch.
 
         Args:
-            rows: The rows of each batch, shape (B,).
+            rows: For each batch, the indices of its images in `paths`, shape
+                (B,).
 
         Returns:
-            The images of each batch, uint8, shape (B, 3, size, size).
+            For each batch, its images, uint8, shape (B, 3, size, size).
         """
         return self._read([(row, None) for row in batch.tolist()] for batch in rows)
 
     def crops(self, rows: Iterable[Tensor], seeds: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Give random crops of batches of rows. Half of them are flipped.
+        """Read random crops of images, batch by batch. A random half of the crops is flipped.
 
         Args:
-            rows: The rows of each batch, shape (B,).
-            seeds: A seed for each image of each batch, shape (B,).
+            rows: For each batch, the indices of its images in `paths`, shape
+                (B,).
+            seeds: For each batch, the seed of each crop, shape (B,).
 
         Returns:
-            The images of each batch, uint8, shape (B, 3, size, size).
+            For each batch, its images, uint8, shape (B, 3, size, size).
         """
         return self._read(
-            list(zip(batch.tolist(), batch_seeds.tolist(), strict=True))
-            for batch, batch_seeds in zip(rows, seeds, strict=True)
+            list(zip(batch_rows.tolist(), batch_seeds.tolist(), strict=True))
+            for batch_rows, batch_seeds in zip(rows, seeds, strict=True)
         )
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
-        """Yield the images of batches.
+        """Read batches of images in worker processes.
 
         Args:
-            batches: Keys of the images of each batch.
+            batches: For each batch, the index of each image in `paths`, with
+                the seed of its random crop, or None for its central square.
 
         Yields:
             Images of each batch, uint8, shape (B, 3, size, size).
 
         Raises:
-            InputError: If an image cannot be read, unless `self.skip` is set.
+            InputError: If an image cannot be read, and `self.skip` is False.
         """
-        broken: Faults = {}
+        errors: ReadErrors = {}
         loader: DataLoader = DataLoader(
             _Reader(self),
             batch_sampler=list(batches),
             num_workers=self.workers,
             collate_fn=_collate,
         )
-        for images, faults in loader:
-            broken |= faults
-            if broken and not self.skip:
-                path, fault = next(iter(broken.items()))
+        for images, errors_in_batch in loader:
+            errors |= errors_in_batch
+            if errors and not self.skip:
+                path, error = next(iter(errors.items()))
                 raise InputError(
-                    f"{self.folder / path} cannot be read ({fault}): "
-                    "replace it, or set skip_unreadable=True",
+                    f"{self.folder / path} cannot be read ({error}): "
+                    "replace the file, or set skip_unreadable=True",
                 )
             yield images
-        if broken:
-            first = next(iter(broken))
-            console.warning("%d images cannot be read, others were shown: %s", len(broken), first)
+        if errors:
+            first = next(iter(errors))
+            console.warning("%d images cannot be read, others were shown: %s", len(errors), first)
 
 
-class _Reader(Dataset[tuple[Tensor, Faults]]):
-    """Reads one image at a time, in a process of its own.
+class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
+    """PyTorch data set that reads image files in the worker processes of a DataLoader.
 
     Args:
-        files: The files.
+        files: Image files to read.
     """
 
     def __init__(self, files: ImageFiles):
@@ -141,72 +147,77 @@ class _Reader(Dataset[tuple[Tensor, Faults]]):
         self._files = files
         crop = v2.RandomResizedCrop(
             files.size,
-            scale=(MINIMUM_AREA, 1.0),
+            scale=(MIN_CROP_AREA, 1.0),
             interpolation=v2.InterpolationMode.BICUBIC,
         )
         self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
 
-    def __getitem__(self, key: Key) -> tuple[Tensor, Faults]:
-        """Read an image.
+    def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
+        """Read an image, or another image of its subfolder if it cannot be read.
 
         Args:
-            key: Index of the image, and seed of its random crop or None.
+            key: Index of the image in `ImageFiles.paths`, and seed of its
+                random crop. The seed None reads the central square.
 
         Returns:
-            The image, uint8, shape (3, size, size), and the reason by path for
-            each file that could not be read. If no file could be read, the
-            image is black.
+            The image, uint8, shape (3, size, size), and the error message for
+            each file that could not be read. The image is black if no file
+            could be read.
         """
-        row, seed = key
-        broken: Faults = {}
-        for path in self._candidates(row):
+        index, seed = key
+        errors: ReadErrors = {}
+        for path in self._candidates(index):
             try:
-                image = read_rgb(self._files.folder / path, DECODED * self._files.size)
-            except Exception as error:  # Pillow's decoders raise almost anything
-                broken[path] = str(error)
+                image = read_rgb(self._files.folder / path, DECODED_SCALE * self._files.size)
+            # Pillow raises errors of almost any type for a damaged file.
+            except Exception as error:
+                errors[path] = str(error)
                 if self._files.skip:
                     continue
                 break
-            pixels = np.array(self._shown(image, seed))
-            return torch.from_numpy(pixels).permute(2, 0, 1), broken
+            pixels = np.array(self._crop_image(image, seed))
+            return torch.from_numpy(pixels).permute(2, 0, 1), errors
         size = self._files.size
-        return torch.zeros(3, size, size, dtype=torch.uint8), broken
+        return torch.zeros(3, size, size, dtype=torch.uint8), errors
 
-    def _candidates(self, row: int) -> Iterator[PurePosixPath]:
-        """Yield the path of an image, and then the other paths of the same folder.
+    def _candidates(self, index: int) -> Iterator[PurePosixPath]:
+        """Yield the path of an image, and then the paths that can replace it.
+
+        These are the paths of the other images in the same subfolder. The next
+        one in the list of paths comes first.
 
         Args:
-            row: Index of the image.
+            index: Index of the image in `ImageFiles.paths`.
         """
         paths = self._files.paths
-        for ahead in range(len(paths)):
-            path = paths[(row + ahead) % len(paths)]
-            if path.parent == paths[row].parent:
+        for path in (*paths[index:], *paths[:index]):
+            if path.parent == paths[index].parent:
                 yield path
 
-    def _shown(self, image: Image.Image, seed: int | None) -> Image.Image:
-        """Return the central square of an image, or the random crop of a seed."""
+    def _crop_image(self, image: Image.Image, seed: int | None) -> Image.Image:
+        """Return the central square of an image, or a random crop if there is a seed."""
         if seed is None:
             return central_square(image, self._files.size)
         with torch.random.fork_rng(devices=[]):
-            # torch.manual_seed would seed the generators of GPUs, too.
+            # `torch.manual_seed` is not used, because it also seeds the generators of GPUs.
             torch.default_generator.manual_seed(seed)
             return self._crop(image)
 
 
-def _collate(items: Sequence[tuple[Tensor, Faults]]) -> tuple[Tensor, Faults]:
-    """Stack the images of a batch.
+def _collate(items: Sequence[tuple[Tensor, ReadErrors]]) -> tuple[Tensor, ReadErrors]:
+    """Stack the images of a batch, and join their error messages.
 
     Args:
-        items: For each image, a tensor (3, size, size) and the reasons by path
-            for files that could not be read.
+        items: For each image, a tensor of shape (3, size, size) and the error
+            message for each file that could not be read.
 
     Returns:
-        Images of shape (B, 3, size, size), and the reasons of all images by path.
+        Images of the batch, shape (B, 3, size, size), and all error messages by
+        the path of the file.
     """
-    faults: Faults = {}
-    for _, broken in items:
-        faults |= broken
+    all_errors: ReadErrors = {}
+    for _, errors in items:
+        all_errors |= errors
     if not items:
-        return torch.empty(0), faults
-    return torch.stack([image for image, _ in items]), faults
+        return torch.empty(0), all_errors
+    return torch.stack([image for image, _ in items]), all_errors

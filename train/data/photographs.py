@@ -35,30 +35,35 @@ SUFFIXES = (
     ".tiff",
     ".gif",
 )
-# macOS puts this folder into archives.
-MACS = "__MACOSX"
-# The name of a folder begins with this if the network lacks its class.
+# macOS adds a folder of this name to zip archives. It has no photographs.
+MACOS_FOLDER = "__MACOSX"
+# A folder whose name begins with "other_" has photographs of a class that the
+# network lacks.
 OTHER_PREFIX = "other_"
-# The table of sources and objects in a folder.
+# Table with the source and the object of each photograph of a folder.
 TABLE = "photos.csv"
-# The file in a folder that pnb-lab made.
+# pnb-lab writes a file of this name to its folder of renders.
 DESCRIPTION = "lab.json"
-# Separator of the sources in a cell of the column hard_negatives of photos.csv.
+# Separator of the names of sources in the column hard_negatives of photos.csv.
 SEPARATOR = ";"
-SKIP = ", or set skip_unreadable=True to skip them"
+# End of the error message about files that cannot be read.
+SKIP_ADVICE = ", or set skip_unreadable=True to skip them"
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image of a folder.
+    """An image file of a folder of photographs.
 
     Attributes:
-        path: The path in the folder.
-        label: The class, or a name that begins with "other_".
-        source: Where the image comes from, if that is known.
-        hard_negatives: The sources of negatives that the image is ranked against, in addition to
-            its own source.
-        mesh: The name of the object, if that is known.
+        path: Path relative to the folder.
+        label: Class of the photographed object. It begins with "other_" if the
+            network lacks the class.
+        source: Name of the collection that the image comes from. None if it is
+            unknown.
+        hard_negatives: Names of other sources. If the image is a positive, it
+            is ranked against the negatives of its own source and of these
+            sources.
+        mesh: Name of the photographed object. None if it is unknown.
     """
 
     path: PurePosixPath
@@ -70,7 +75,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of photos.csv."""
+    """A row of photos.csv, with the attributes that `Photograph` explains."""
 
     source: str | None = None
     hard_negatives: tuple[str, ...] = ()
@@ -78,9 +83,10 @@ class _Row:
 
 
 def require_outside(out: Path, folder: Path) -> None:
-    """Check that a folder for results does not lie inside a folder of photographs.
+    """Check that the folder for results does not lie inside the folder of photographs.
 
-    Otherwise the contact sheet would be scored as a photograph.
+    Otherwise the pictures among the results would later be scored as
+    photographs.
 
     Args:
         out: Folder for results.
@@ -90,40 +96,45 @@ def require_outside(out: Path, folder: Path) -> None:
         InputError: If `out` lies inside `folder`.
     """
     if out.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"out={out} lies inside the photographs' folder: choose another")
+        raise InputError(
+            f"out={out} lies inside the folder of the photographs, {folder}: "
+            "choose a folder outside of it"
+        )
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
-    """Find the images of a folder, each with its class.
+    """Find the images of a folder, and the class of each image.
 
     The folder has one of two layouts:
 
-    - A sub-folder for each class. Sub-folders of other names hold negatives, and
-      a warning names them unless their names begin with "other_".
+    - A subfolder for each class. All images in subfolders with other names are
+      negatives. A warning lists these subfolders, except if their names begin
+      with "other_".
     - Images only. All of them belong to the class `label`.
 
-    Sub-folders and symbolic links are searched to any depth. Hidden files and
-    files of other types (see `unsupported_files`) are skipped.
+    Subfolders and symbolic links are searched to any depth. Hidden files are
+    skipped, and so are files that are no images (see `unsupported_files`).
 
-    A file photos.csv may have these columns:
+    The folder may have a table photos.csv with these columns:
 
-    - path and source_tag: path of an image, and its source;
-    - hard_negatives: other sources, separated by ";", whose negatives the image
-      is ranked against;
-    - mesh: name of the object.
+    - path: path of an image;
+    - source_tag: name of the collection that the image comes from;
+    - hard_negatives: names of other sources, separated by ";". A positive image
+      is ranked against their negatives, too;
+    - mesh: name of the photographed object.
 
     Args:
-        folder: The folder.
+        folder: Folder of photographs.
         classes: Names of the classes of the network.
         label: Positive class, or a list of several.
 
     Returns:
-        The images, sorted by path.
+        Images, sorted by path.
 
     Raises:
         InputError: If the folder is missing, unreadable or empty, or mixes both
-            layouts; if `label` is not a class; if the name of a sub-folder is
-            not a class but resembles `label`; if no sub-folder is named after a
+            layouts; if `label` is not a class; if the name of a subfolder is
+            not a class but resembles `label`; if no subfolder is named after a
             class; or if photos.csv lacks a column, contradicts itself, or names
             only missing files or a source without images.
     """
@@ -135,7 +146,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if len(labels) > 1 and not has_class_folders:
         raise InputError(
             f"{folder} has no class folders, and label names several classes: "
-            "put its images into some",
+            "move its images into one subfolder per class",
         )
     rows = _read_table(folder / TABLE)
     _require_files_of_rows(folder / TABLE, rows, files, paths[0])
@@ -145,12 +156,13 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
         row = rows.get(path, _Row())
         name = path.parts[0] if has_class_folders else labels[0]
         photographs.append(Photograph(path, name, row.source, row.hard_negatives, row.mesh))
-    known = {item.source for item in photographs}
-    named = {name for item in photographs for name in item.hard_negatives}
-    if named - known:
-        source = min(named - known)
+    sources = {item.source for item in photographs}
+    hard_negatives = {name for item in photographs for name in item.hard_negatives}
+    unknown = hard_negatives - sources
+    if unknown:
         raise InputError(
-            f"{folder / TABLE} names hard_negatives of source {source!r}, which has no image",
+            f"{folder / TABLE} names the source {min(unknown)!r} in the column hard_negatives, "
+            "but no image has this source: correct the name, or remove it",
         )
     return photographs
 
@@ -161,141 +173,150 @@ def _require_files_of_rows(
     files: Sequence[PurePosixPath],
     example: PurePosixPath,
 ) -> None:
-    """Warn of rows of photos.csv whose file does not exist.
+    """Check that the rows of photos.csv name files that exist.
+
+    A warning tells how many rows name a missing file.
 
     Args:
         table: Path of photos.csv.
         rows: Rows of the table by the path of the image.
         files: Paths of all files in the folder.
-        example: Path of an image, for the error.
+        example: Path of an image, as an example for the error message.
 
     Raises:
-        InputError: If no row has a file that exists.
+        InputError: If all rows name missing files.
     """
-    unknown = sorted(rows.keys() - set(files))
-    if not unknown:
+    missing = sorted(rows.keys() - set(files))
+    if not missing:
         return
-    counts = f"{len(unknown)} of {len(rows)} rows"
-    problem = f"{table} has {counts} for no file of the folder, like {unknown[0]}"
-    if len(unknown) == len(rows):
-        raise InputError(f"{problem}; give paths such as {example}")
+    counts = f"{len(missing)} of {len(rows)} rows"
+    problem = f"{table} names a missing file in {counts}, such as {missing[0]}"
+    if len(missing) == len(rows):
+        raise InputError(f"{problem}: give paths relative to the folder, such as {example}")
     _warn_once(problem)
 
 
 def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
-    """List the classes that have a sub-folder.
+    """List the classes for which a folder has a subfolder.
 
     Args:
-        folder: The folder.
-        classes: The names of the network's classes.
+        folder: Folder of photographs.
+        classes: Names of the classes of the network.
 
     Returns:
-        The names of the classes, sorted.
+        Names of the classes that have a subfolder, sorted.
 
     Raises:
         InputError: If the folder is missing.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: name a folder of photographs")
+        raise InputError(f"{folder} is not a folder: give a folder of photographs")
     return [name for name in folder_names(folder) if name in classes]
 
 
 def folder_names(folder: Path) -> list[str]:
-    """Return the sorted names of the folders in a folder, without hidden ones."""
+    """Return the sorted names of the subfolders of a folder, without hidden ones."""
     folders = [entry.name for entry in folder.iterdir() if entry.is_dir()]
     return sorted(name for name in folders if not is_hidden(name))
 
 
 def find_unlabeled(folder: Path) -> list[Photograph]:
-    """Find all images of a folder and its sub-folders. They have no class.
+    """Find all images of a folder and its subfolders, without their classes.
 
     Args:
-        folder: The folder.
+        folder: Folder of the images.
 
     Returns:
-        The images, sorted by path.
+        Images, sorted by path. The label of each is empty.
 
     Raises:
-        InputError: If there is no such folder, or it holds no image.
+        InputError: If the folder is missing or holds no image.
     """
-    paths, _ = _image_files(folder)
-    return [Photograph(path, "", None) for path in paths]
+    image_paths, _ = _image_files(folder)
+    return [Photograph(path, label="", source=None) for path in image_paths]
 
 
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
-    """List the files of a folder and its sub-folders.
+    """List the image files, and all files, of a folder and its subfolders.
+
+    Hidden files are left out.
 
     Returns:
-        Sorted paths of the images, and paths of all files, relative to the
-        folder.
+        Two lists of paths relative to the folder: the images, sorted, and all
+        files.
 
     Raises:
         InputError: If the folder does not exist or holds no image.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: name a folder of photographs")
-    files = list(_files(folder))
-    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
-    if not paths:
+        raise InputError(f"{folder} is not a folder: give a folder of photographs")
+    all_paths = list(_files(folder))
+    image_paths = sorted(path for path in all_paths if path.suffix.lower() in SUFFIXES)
+    if not image_paths:
         raise InputError(
             f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})",
         )
-    return paths, files
+    return image_paths, all_paths
 
 
 def unsupported_files(folder: Path) -> list[PurePosixPath]:
-    """Find the files of a folder whose type is not supported.
+    """Find the files of a folder that are no images of a supported type.
+
+    Files that the library itself reads or writes there, photos.csv and
+    lab.json, are left out.
 
     Args:
-        folder: The folder.
+        folder: Folder of images.
 
     Returns:
         Sorted paths, relative to the folder.
     """
-    own = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
-    others = [path for path in _files(folder) if path not in own]
-    return sorted(path for path in others if path.suffix.lower() not in SUFFIXES)
+    own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
+    other_files = [path for path in _files(folder) if path not in own_files]
+    return sorted(path for path in other_files if path.suffix.lower() not in SUFFIXES)
 
 
+# `cache` runs the function only at the first call with each text.
 @cache
 def _warn_once(text: str) -> None:
-    """Print a warning, but not again."""
+    """Log a warning, unless it was logged before."""
     console.warning(text)
 
 
 def is_hidden(name: str) -> bool:
-    """Return whether a file or folder belongs to the system rather than to the user.
+    """Return whether a file or folder is hidden, or was added by macOS.
 
     Args:
-        name: The name of the file or folder.
+        name: Name of the file or folder.
 
     Returns:
-        Whether it is hidden.
+        Whether the name begins with a dot or is "__MACOSX".
     """
-    return name.startswith(".") or name == MACS
+    return name.startswith(".") or name == MACOS_FOLDER
 
 
 def _files(folder: Path) -> Iterator[PurePosixPath]:
     """Yield the paths of all files that are not hidden, relative to the folder.
 
-    Symbolic links are followed, except if they lead to a folder around them.
+    Symbolic links are followed. A link to a folder that contains the link is
+    not, because the search would not end.
     """
 
-    def refuse(error: OSError) -> NoReturn:
+    def raise_error(error: OSError) -> NoReturn:
         raise error
 
-    for root, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
-        real_root = Path(os.path.realpath(root))
+    for parent, subfolders, files in os.walk(folder, onerror=raise_error, followlinks=True):
+        real_parent = Path(os.path.realpath(parent))
         to_visit = []
-        for name in folders:
-            target = os.path.realpath(os.path.join(root, name))
-            leads_back = real_root.is_relative_to(target)
-            if not is_hidden(name) and not leads_back:
+        for name in subfolders:
+            target = os.path.realpath(os.path.join(parent, name))
+            contains_parent = real_parent.is_relative_to(target)
+            if not is_hidden(name) and not contains_parent:
                 to_visit.append(name)
-        # os.walk visits the folders in this list next.
-        folders[:] = to_visit
-        parent = PurePosixPath(Path(root).relative_to(folder).as_posix())
-        yield from (parent / name for name in files if not is_hidden(name))
+        # `os.walk` then visits only the subfolders that are left in its list.
+        subfolders[:] = to_visit
+        relative_parent = PurePosixPath(Path(parent).relative_to(folder).as_posix())
+        yield from (relative_parent / name for name in files if not is_hidden(name))
 
 
 def _has_class_folders(
@@ -304,7 +325,7 @@ def _has_class_folders(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> bool:
-    """Return whether the images lie in class folders, and check the names of the folders.
+    """Return whether a folder has a subfolder for each class, and check their names.
 
     Args:
         folder: Folder of photographs.
@@ -312,52 +333,60 @@ def _has_class_folders(
         classes: Names of the classes of the network.
         labels: Positive classes.
 
+    Returns:
+        False if the folder has no subfolders. Otherwise True.
+
     Raises:
-        InputError: If no folder is named after a class, if the name of a folder
-            that is no class resembles a label, or if images lie beside the
-            folders.
+        InputError: If no subfolder is named after a class; if the name of a
+            subfolder is no class but resembles a label; or if the folder has
+            both subfolders and images outside of them.
     """
     names = folder_names(folder)
-    others = [name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)]
-    for name in others:
-        # If `others` has all names, no folder is named after a class.
-        if others == names or any(_is_like(name, label) for label in labels):
+    no_classes = [
+        name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)
+    ]
+    has_no_class = no_classes == names
+    for name in no_classes:
+        if has_no_class or any(_is_like(name, label) for label in labels):
             suggestions = nearest(name, classes)
             raise InputError(
-                f"{folder / name} "
-                f"is not named after a class of the model (such as {suggestions}): "
-                f"rename it, to {OTHER_PREFIX}{name} if it shows hard negatives",
+                f"{folder / name} is not named after a class of the network "
+                f"(such as {suggestions}): rename it to its class, or to {OTHER_PREFIX}{name} "
+                "if it shows hard negatives",
             )
-    if others:
-        count = f"{len(others)} of {len(names)} folders in {folder}"
-        shown = ", ".join(others)
+    if no_classes:
+        count = f"{len(no_classes)} of {len(names)} folders in {folder}"
+        shown = ", ".join(no_classes)
         _warn_once(
             f"{count} are not named after a class of the model and count as negatives: {shown}"
         )
-    loose = [path for path in paths if len(path.parts) == 1]
-    if names and loose:
+    outside = [path for path in paths if len(path.parts) == 1]
+    if names and outside:
         raise InputError(
-            f"{folder / loose[0]} lies beside class folders: move it into the folder of its class",
+            f"{folder / outside[0]} lies beside class folders: "
+            "move it into the folder of its class",
         )
     return bool(names)
 
 
 def _is_like(name: str, label: str) -> bool:
-    """Return whether the name of a folder contains a label, or is almost the same."""
+    """Return whether the name of a folder contains the name of a class, or is similar to it."""
     return label in name.lower() or bool(get_close_matches(name.lower(), [label]))
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
-    """Read photos.csv.
+    """Read the table photos.csv, which has the source and the object of each photograph.
 
     Args:
-        table: Path of the file, which may be missing.
+        table: Path of the table. The file may be missing.
 
     Returns:
-        Rows by the path of the image. Empty without a file.
+        Rows of the table by the path of the photograph. Empty if the file is
+        missing.
 
     Raises:
-        InputError: If the file is damaged or contradicts itself.
+        InputError: If the table cannot be read, lacks a column, or has two
+            different rows for a photograph.
     """
     rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
@@ -374,10 +403,9 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
-        columns = "the columns path and source_tag, separated by commas"
         raise InputError(
-            f"{table} cannot be used ({single_line(error)}): "
-            f"make it UTF-8 with {columns}, and a row per file",
+            f"{table} cannot be read ({single_line(error)}): write it as a UTF-8 text file "
+            "with the columns path and source_tag, separated by commas, and one row per image",
         ) from error
     return rows
 
@@ -386,10 +414,10 @@ def split_sources(cell: str) -> tuple[str, ...]:
     """Split a cell of the column hard_negatives into the names of sources.
 
     Args:
-        cell: The cell, such as "lab;shop".
+        cell: Text of the cell, such as "lab;shop".
 
     Returns:
-        The names.
+        Names of the sources, such as ("lab", "shop").
     """
     return tuple(name.strip() for name in cell.split(SEPARATOR) if name.strip())
 
@@ -399,28 +427,32 @@ def load_photographs(
     photographs: Sequence[Photograph],
     size: int = 32,
     skip_unreadable: bool = False,
-    advice: str = SKIP,
+    advice: str = SKIP_ADVICE,
 ) -> tuple[list[Photograph], Tensor, list[str]]:
-    """Read photographs as a network sees them.
+    """Read photographs at the size of the input of a network.
 
-    Each image is turned as its EXIF orientation says and converted to RGB. Alpha is blended over
-    white, and 16 bits become 8. The central square is reduced with Pillow's Lanczos filter, which
-    widens with the reduction. Detail too fine for `size` then averages out instead of aliasing.
+    Each image is rotated as its EXIF orientation says. Transparent pixels are
+    blended with white, and 16-bit channels are converted to 8 bits. The central
+    square is reduced with Pillow's Lanczos filter. The filter is wider for a
+    larger reduction, which prevents aliasing.
 
     Args:
-        folder: The folder.
-        photographs: The photographs to read.
-        size: The pixels per side.
-        skip_unreadable: Whether broken and oversized images are skipped.
-        advice: How to skip them, in the words of the caller, which ends the error's sentence.
+        folder: Folder of the photographs.
+        photographs: Photographs to read.
+        size: Pixels per side of the returned images.
+        skip_unreadable: Whether images that are damaged or too large are
+            skipped.
+        advice: How to skip these images, as the end of the error message.
 
     Returns:
-        The photographs that could be read, their images (N, 3, size, size) as uint8 sRGB, and the
-        paths of the others.
+        Three values:
+        - the photographs that could be read;
+        - their images, uint8 sRGB, shape (N, 3, size, size);
+        - the paths of the photographs that could not be read.
 
     Raises:
-        InputError: If an image is broken or oversized and is not to be skipped, no image can be
-            read, or memory is too small.
+        InputError: If an image is damaged or too large, and `skip_unreadable`
+            is False; if no image can be read; or if memory is too small.
     """
     shape = (len(photographs), 3, size, size)
     cpu = torch.device("cpu")
@@ -429,22 +461,23 @@ def load_photographs(
     errors = _read_into(images, folder, photographs)
 
     readable = []
-    broken = []
-    for row, (photograph, error) in enumerate(zip(photographs, errors, strict=True)):
+    unreadable = []
+    for index, (photograph, error) in enumerate(zip(photographs, errors, strict=True)):
         if error is None:
-            readable.append(row)
+            readable.append(index)
         else:
-            broken.append((photograph.path, error))
-    if broken and not (readable and skip_unreadable):
-        path, error = broken[0]
+            unreadable.append((photograph.path, error))
+    if unreadable and not (readable and skip_unreadable):
+        path, error = unreadable[0]
         raise InputError(
-            f"{len(broken)} of {len(photographs)} photographs cannot be read, "
+            f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
             f"the first being {folder / path} ({error}): "
             f"replace them{advice if readable else ''}",
         )
-    if broken:
+    if unreadable:
         images = images[readable]
-    return [photographs[row] for row in readable], images, [str(path) for path, _ in broken]
+    unreadable_paths = [str(path) for path, _ in unreadable]
+    return [photographs[index] for index in readable], images, unreadable_paths
 
 
 def _read_into(
@@ -452,24 +485,25 @@ def _read_into(
     folder: Path,
     photographs: Sequence[Photograph],
 ) -> list[Exception | None]:
-    """Read photographs into the rows of a tensor.
+    """Read the central squares of photographs into a tensor, in several threads.
 
     Args:
-        images: Tensor that is filled, uint8, shape (N, 3, size, size).
+        images: Tensor to fill, uint8, shape (N, 3, size, size).
         folder: Folder of the photographs.
-        photographs: The N photographs.
+        photographs: N photographs to read.
 
     Returns:
-        For each photograph, the error that reading it raised, or None.
+        For each photograph, the error that occurred, or None.
     """
     paths = [folder / photograph.path for photograph in photographs]
-    # Pillow releases Python's lock while it decodes and resizes, so threads help.
+    # Threads read in parallel, because Pillow releases Python's global lock while
+    # it decodes and resizes.
     pool = ThreadPoolExecutor()
     try:
         errors = pool.map(_read_image, images, paths)
         return list(progress(errors, "photographs", len(paths)))
     finally:
-        # Ctrl-C then ends the command without reading the remaining images.
+        # After Ctrl-C, the images that no thread has begun to read are not read.
         pool.shutdown(cancel_futures=True)
 
 
@@ -477,17 +511,17 @@ def _read_image(image: Tensor, path: Path) -> Exception | None:
     """Read the central square of a photograph into a tensor.
 
     Args:
-        image: Tensor that is filled, uint8, shape (3, size, size).
+        image: Tensor to fill, uint8, shape (3, size, size).
         path: File of the photograph.
 
     Returns:
-        The error that reading the file raised. None without an error.
+        The error that occurred, or None.
     """
     try:
-        # The memory of Pillow is read-only, and np.array copies it.
+        # `np.array` copies the pixels, because the memory of Pillow is read-only.
         pixels = np.array(read_square(path, image.shape[-1]))
+    # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:
-        # The decoders of Pillow raise errors of almost any type.
         return error
     image.copy_(torch.from_numpy(pixels).permute(2, 0, 1))
     return None

@@ -1,6 +1,6 @@
-"""A small labeled data set of solids in soft, uniform lighting.
+"""A small labeled data set of renders of generated solids in soft front lighting.
 
-It is rendered when it is needed, so that training needs no download.
+It is rendered when it is first used, so that training needs no download.
 """
 
 import math
@@ -32,12 +32,11 @@ from train.system.hashing import content_hash
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
-# An instance of a solid is shown from each view before each background, every time in a light of
-# its own.
-VIEWS = 5
+# Each generated solid is rendered once for each pair of a camera and a background.
+CAMERAS = 5
 BACKGROUNDS = 4
-# Hash of the code that renders. It is part of the key of the cache, since other
-# code may render other images.
+# Hash of the code that renders the data set. It is part of the key in the cache,
+# so that the data set is rendered again after a change of the code.
 _MODULES = (renderer.__file__, augment.__file__, __file__)
 CODE = source_key(*(Path(module).parent for module in _MODULES))
 
@@ -49,14 +48,15 @@ def load_shapes(
     seed: int,
     cache: TensorCache | None = None,
 ) -> DataSet:
-    """Render images of every solid in soft front lighting, or read them from a cache.
+    """Render a data set with one class for each kind of solid, or read it from a cache.
 
     Args:
-        train: The number of training images of each class. An instance of a solid has 20.
-        test: The number of test images of each class.
-        size: The pixels per side.
-        seed: The seed of shapes, views and lights.
-        cache: Where the images are kept; None renders them every time.
+        train: Number of training images of each class. Every 20 images show
+            another shape of the solid.
+        test: Number of test images of each class.
+        size: Pixels per side of the images.
+        seed: Seed of the shapes, cameras, backgrounds and lights.
+        cache: Cache of the images. None renders the images every time.
 
     Returns:
         The data set.
@@ -64,81 +64,86 @@ def load_shapes(
     cache = cache or TensorCache()
     settings = replace(SETTINGS, size=size)
     splits = []
-    for part, count in (("train", train), ("test", test)):
-        key = content_hash([CODE, CLASSES, count, seed, part, settings])
+    for split_name, images_per_class in (("train", train), ("test", test)):
+        key = content_hash([CODE, CLASSES, images_per_class, seed, split_name, settings])
         cached = cache.read(key)
         if cached is None:
-            cached = {"images": _render(part, count, seed, settings)}
+            cached = {"images": _render(split_name, images_per_class, seed, settings)}
             cache.write(key, cached)
-        console.debug("%s images: %d", part, len(cached["images"]))
-        labels = torch.arange(len(CLASSES)).repeat_interleave(count)
+        console.debug("%s images: %d", split_name, len(cached["images"]))
+        labels = torch.arange(len(CLASSES)).repeat_interleave(images_per_class)
         splits.append(Split(cached["images"], labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
-def soft_front_light(back: Tensor, draws: torch.Generator) -> Tensor:
-    """Draw a light: a lamp near the camera, and bright surroundings.
+def soft_front_light(to_camera: Tensor, draws: torch.Generator) -> Tensor:
+    """Draw uniform ambient light plus a directional light from near the camera.
+
+    The direction, color and strength of the light are random.
 
     Args:
-        back: The direction towards the camera, shape (3,).
-        draws: The random generator.
+        to_camera: Unit vector from the object to the camera, shape (3,).
+        draws: Random number generator.
 
     Returns:
-        The coefficients of the light, shape (49, 3).
+        Spherical-harmonics coefficients of the light, linear RGB, shape (49, 3).
     """
-    direction = F.normalize(back + 0.5 * torch.randn(3, generator=draws), dim=0)
+    direction = F.normalize(to_camera + 0.5 * torch.randn(3, generator=draws), dim=0)
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
     strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
     return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
 
 
-def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
-    """Render the images of every class.
+def _render(split_name: str, images_per_class: int, seed: int, settings: ImageSettings) -> Tensor:
+    """Render the images of all classes for one split of the data set.
 
     Args:
-        part: "train" or "test", which decides the random draws.
-        per_class: Number of images of each class.
-        seed: Seed of shapes, views and lights.
-        settings: Settings of the images, with their size.
+        split_name: "train" or "test". The two splits have different random
+            draws.
+        images_per_class: Number of images of each class.
+        seed: Seed of the shapes, cameras, backgrounds and lights.
+        settings: Settings of the images, such as their size.
 
     Returns:
-        Images in the order of the classes, uint8, shape
-        (classes · per_class, 3, size, size).
+        Images, one class after the other, uint8, shape
+        (classes · images_per_class, 3, size, size).
     """
-    instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
-    draws = generator(seed, part)
+    solids_per_class = math.ceil(images_per_class / (CAMERAS * BACKGROUNDS))
+    draws = generator(seed, split_name)
     images = []
-    for name in progress(CLASSES, f"{part} images"):
-        portraits = []
-        for _ in range(instances):
+    for name in progress(CLASSES, f"{split_name} images"):
+        images_of_class = []
+        for _ in range(solids_per_class):
             mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
-            portraits.append(_portraits(mesh, settings, draws))
-        images.append(torch.cat(portraits)[:per_class])
+            images_of_class.append(_render_solid(mesh, settings, draws))
+        images.append(torch.cat(images_of_class)[:images_per_class])
     return torch.cat(images)
 
 
-def _portraits(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> Tensor:
-    """Render one instance of a solid from VIEWS views before BACKGROUNDS backgrounds.
+def _render_solid(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> Tensor:
+    """Render one solid for each pair of a random camera and a random background.
+
+    Each image has another light.
 
     Args:
         mesh: Mesh of the solid.
-        settings: Settings of the images.
-        draws: Random generator of cameras, backgrounds and lights.
+        settings: Settings of the images, such as their size.
+        draws: Random number generator of the cameras, backgrounds and lights.
 
     Returns:
-        Images, uint8, shape (VIEWS · BACKGROUNDS, 3, size, size).
+        Images, uint8, shape (CAMERAS · BACKGROUNDS, 3, size, size).
     """
-    polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64).tolist()
+    polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
     cameras = []
-    for view in range(VIEWS):
-        polar_angle = 40 + 45 * polar[view]
-        camera = OrthographicCamera(polar_angle, 360 * azimuth[view], 2 + width[view])
+    for index in range(CAMERAS):
+        polar_angle = 40 + 45 * polar[index]
+        camera = OrthographicCamera(polar_angle, 360 * azimuth[index], 2 + width[index])
         cameras.append(camera)
     backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
     lights = []
     for camera in cameras:
-        back = torch.tensor(camera.axes()[2], dtype=torch.float32)
-        lights += [soft_front_light(back, draws) for _ in backgrounds]
+        to_camera = torch.tensor(camera.axes()[2], dtype=torch.float32)
+        lights += [soft_front_light(to_camera, draws) for _ in backgrounds]
     scene = Scene.grid(
         [SceneObject("", normalize(mesh))],
         cameras,

@@ -14,7 +14,7 @@ from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, single_line
 from train import console
-from train.data.images import RESIDENT, ImageFiles
+from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
 from train.data.photographs import (
     Photograph,
     find_photographs,
@@ -25,20 +25,22 @@ from train.data.photographs import (
 )
 from train.system.hashing import content_hash
 
-# Names of folders that divide a data set. They are not names of classes.
-PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")
-# Largest number of unlabeled images that are held out from training. This many images
-# measure the agreement of two networks to a percent.
+# Folders with these names hold splits of a data set. All other folders hold the
+# images of a class.
+SPLIT_NAMES = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")
+# At most 1000 unlabeled images are held out from training. This number is enough to
+# measure to about 1% on which fraction of the images two networks agree.
 HELD_OUT = 1000
 
 
 @dataclass(frozen=True)
 class Split:
-    """Images and their labels.
+    """Images and their labels, such as the training split of a data set.
 
     Attributes:
-        images: The images, uint8 RGB, shape (N, 3, H, W), or the files that hold them.
-        labels: The class numbers, int64, shape (N,).
+        images: Images, uint8 RGB, shape (N, 3, H, W). If they stay on disk,
+            their files.
+        labels: Index of the class of each image, int64, shape (N,).
     """
 
     images: Tensor | ImageFiles
@@ -49,29 +51,51 @@ class Split:
 
     @cached_property
     def content_hash(self) -> str:
-        """Hash the images and labels with SHA-256. Of files, hash names and sizes instead."""
+        """SHA-256 hash of the images and labels.
+
+        For images on disk, the names and sizes of the files are hashed instead
+        of the pixels.
+        """
         images = self.images
-        content = images.facts() if isinstance(images, ImageFiles) else images
+        content = images.file_sizes() if isinstance(images, ImageFiles) else images
         return content_hash([content, self.labels])
 
     def to(self, device: torch.device) -> "Split":
-        """Return a copy on a device. Files stay where they are."""
+        """Copy the labels, and the images if they are in memory, to a device."""
         images = self.images
         if not isinstance(images, ImageFiles):
             images = images.to(device)
         return Split(images, self.labels.to(device))
 
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Give the images of batches of rows, uint8, shape (B, 3, H, W) each."""
+        """Yield images of the split, batch by batch.
+
+        Images on disk are reduced to their central squares.
+
+        Args:
+            rows: For each batch, the indices of its images in the split, shape
+                (B,).
+
+        Returns:
+            For each batch, its images, uint8, shape (B, 3, H, W).
+        """
         if isinstance(self.images, ImageFiles):
             return self.images.squares(rows)
         images = self.images
         return (images[batch] for batch in rows)
 
     def sample(self, count: int) -> Tensor:
-        """Return at most `count` evenly spaced images of the split, shape (count, 3, H, W)."""
-        rows = torch.linspace(0, len(self) - 1, min(count, len(self))).long()
-        return next(iter(self.squares([rows])))
+        """Return images at equal distances in the split.
+
+        Args:
+            count: Number of images to return. If the split has fewer, all are
+                returned.
+
+        Returns:
+            Images, uint8, shape (count, 3, H, W).
+        """
+        indices = torch.linspace(0, len(self) - 1, min(count, len(self))).long()
+        return next(iter(self.squares([indices])))
 
     def __getitem__(self, rows: Tensor | slice) -> "Split":
         return Split(self.images[rows], self.labels[rows])
@@ -79,15 +103,16 @@ class Split:
 
 @dataclass(frozen=True)
 class DataSet:
-    """Images for training and for one test.
+    """Data set with a training split and a test split.
 
     Attributes:
-        classes: The names of the classes, in label order.
-        train: The images to learn from.
-        test: The images to score on.
-        labeled: Whether the labels are known. Otherwise all labels are 0 at first. A run
-            replaces them with the predictions of its initial network.
-        rendered: Whether the images are renders of solids.
+        classes: Names of the classes. A label is an index into them.
+        train: Images for training.
+        test: Images for testing.
+        labeled: Whether the classes of the images are known. If False, all
+            labels are 0. Training replaces them by the predictions of the
+            network that it starts from.
+        rendered: Whether the images are renders of generated solids.
     """
 
     classes: tuple[str, ...]
@@ -98,104 +123,112 @@ class DataSet:
 
     @property
     def size(self) -> int:
-        """Pixels per side."""
+        """Pixels per side of the images."""
         return self.train.images.shape[-1]
 
 
 def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
-    """Return a copy of a data set whose labels are indices into other classes.
+    """Replace the labels of a data set by the class indices of a network.
 
     Args:
-        data: Data set. Each of its classes is one of `classes`.
-        classes: Names of the classes of a network.
-        subject: Name of the data set, with which the error begins.
+        data: Data set. Each of its classes must be a class of the network.
+        classes: Names of the classes of the network.
+        subject: Name of the data set at the start of the error message.
 
     Returns:
-        Data set with the same images and with `classes`.
+        Data set with the same images. Its labels are indices into `classes`.
 
     Raises:
         InputError: If a class of the data set is not in `classes`.
     """
-    indices = [class_index(classes, name, subject) for name in data.classes]
-    new_label_of_label = torch.tensor(indices)
-    train = Split(data.train.images, new_label_of_label[data.train.labels])
-    test = Split(data.test.images, new_label_of_label[data.test.labels])
+    # The new label of each old label.
+    new_labels = torch.tensor([class_index(classes, name, subject) for name in data.classes])
+    train = Split(data.train.images, new_labels[data.train.labels])
+    test = Split(data.test.images, new_labels[data.test.labels])
     return replace(data, classes=tuple(classes), train=train, test=test)
 
 
 def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fraction") -> Tensor:
-    """Choose a fraction of the images of every class at random.
+    """Draw a fraction of the images of every class at random, to hold them out.
 
-    A larger fraction chooses the same images and more.
+    With the same seed, a larger fraction holds out the same images and
+    additional ones.
 
     Args:
-        split: Images and labels.
-        fraction: Fraction between 0 and 1. For each class, it is rounded to
-            whole images.
-        seed: Seed of the choice.
-        argument: Name of the argument that holds the fraction, for the error.
+        split: N images and their labels.
+        fraction: Fraction of each class that is held out, between 0 and 1. The
+            number of images is rounded.
+        seed: Seed of the random draws.
+        argument: Name of the argument with the fraction, for error messages.
 
     Returns:
-        Mask of the chosen images, bool, shape (N,).
+        Whether each image is held out, bool, shape (N,).
 
     Raises:
-        InputError: If the fraction is out of range, or if it chooses none or
-            all of the images of a class.
+        InputError: If `fraction` is not between 0 and 1, or if it holds out
+            none or all of the images of a class.
     """
     if not 0 < fraction < 1:
         raise InputError(f"{argument}={fraction} must lie between 0 and 1", argument)
     is_held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(seed, "validation")
     for label in split.labels.unique():
-        members = torch.nonzero(split.labels == label).squeeze(1)
-        count = round(fraction * len(members))
-        if not 0 < count < len(members):
+        indices_of_class = torch.nonzero(split.labels == label).squeeze(1)
+        class_size = len(indices_of_class)
+        count = round(fraction * class_size)
+        if not 0 < count < class_size:
             raise InputError(
-                f"{argument}={fraction} of class {int(label)}, {len(members)} images, "
-                "is all or nothing",
+                f"{argument}={fraction} selects {count} of the {class_size} images of class "
+                f"{int(label)}: choose a fraction that leaves images of each class in both splits",
                 argument,
             )
-        order = torch.randperm(len(members), generator=draws)
-        is_held_out[members[order[:count]]] = True
+        order = torch.randperm(class_size, generator=draws)
+        is_held_out[indices_of_class[order[:count]]] = True
     return is_held_out
 
 
 def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
-    """Compute the mean and the standard deviation of each channel.
+    """Compute the mean and the standard deviation of the pixels of each color channel.
 
-    They are exact, since they come from histograms of the 256 values.
+    They are computed in float64 from a histogram of the 256 pixel values. This
+    makes rounding errors negligible.
 
     Args:
-        images: The images, uint8, shape (N, 3, H, W).
+        images: Images, uint8, shape (N, 3, H, W).
 
     Returns:
-        The means and the standard deviations of red, green and blue, in units of [0, 1]. A
-        standard deviation is at least .001.
+        Two lists for red, green and blue: the means and the standard
+        deviations. Pixel values are scaled to [0, 1]. A standard deviation is
+        at least 0.001.
     """
     values = torch.arange(256, dtype=torch.float64) / 255
     means = []
     deviations = []
     for channel in range(3):
-        counts = torch.bincount(images[:, channel].flatten(), minlength=256).double()
-        total = counts.sum()
-        mean = float(counts @ values / total)
-        deviation = float((counts @ (values - mean) ** 2 / total).sqrt())
+        pixels = images[:, channel].flatten()
+        histogram = torch.bincount(pixels, minlength=256).double()
+        pixel_count = histogram.sum()
+        mean = float(histogram @ values / pixel_count)
+        variance = histogram @ (values - mean) ** 2 / pixel_count
         means.append(mean)
-        deviations.append(max(deviation, 1e-3))
+        deviations.append(max(float(variance.sqrt()), 1e-3))
     return means, deviations
 
 
 def load_cifar100(path: str) -> DataSet:
-    """Load torchvision's CIFAR-100. It is downloaded if it is missing, and its checksums count.
+    """Load CIFAR-100 with torchvision.
+
+    If the folder lacks the data set, or if its checksum is wrong, it is
+    downloaded to the folder.
 
     Args:
-        path: The folder that holds it, or will hold it.
+        path: Folder of the data set.
 
     Returns:
         The data set.
 
     Raises:
-        InputError: If it is not there and cannot be downloaded.
+        InputError: If the data set cannot be downloaded.
     """
     from torchvision.datasets import CIFAR100  # torchvision takes a second to import
 
@@ -204,74 +237,85 @@ def load_cifar100(path: str) -> DataSet:
         test = CIFAR100(path, train=False, download=True)
     except (OSError, RuntimeError) as error:
         raise InputError(
-            f"path={path}: CIFAR-100 is not there and cannot be downloaded ({error})",
+            f"path={path} does not contain CIFAR-100, and the download failed ({error}): "
+            "give the folder of a copy, or connect to the internet",
             "path",
         ) from error
     splits = []
-    for part in (train, test):
-        images = torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous()
-        splits.append(Split(images, torch.tensor(part.targets)))
+    for cifar in (train, test):
+        images = torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous()
+        splits.append(Split(images, torch.tensor(cifar.targets)))
     return DataSet(tuple(train.classes), splits[0], splits[1])
 
 
 def load_npz(path: str) -> DataSet:
-    """Load a data set from an .npz file.
+    """Load a data set from a NumPy .npz file.
 
-    The file holds train_images and test_images (N, 3, S, S) uint8, train_labels and test_labels
-    (N,), and classes (C,), the names.
+    The file has these arrays:
+
+    - train_images and test_images: uint8 RGB, shape (N, 3, S, S);
+    - train_labels and test_labels: index of the class of each image, shape (N,);
+    - classes: names of the C classes, shape (C,).
 
     Args:
-        path: The file.
+        path: The .npz file.
 
     Returns:
         The data set.
 
     Raises:
-        InputError: If it is not such a file, or it would need pickle, which runs code.
+        InputError: If the file is missing or damaged, if an array has another
+            type or shape, or if an array is pickled. A pickled array could run
+            code.
     """
     if not Path(path).is_file():
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return _read_npz(archive)
-    # zipfile, zlib and NumPy raise many kinds of errors for a damaged or foreign file.
+    # zipfile, zlib and NumPy raise errors of many types for a damaged file.
     except Exception as error:
         raise InputError(
-            f"path={path} is not an .npz file of labeled images: {single_line(error)}",
+            f"path={path} is not an .npz file of labeled images ({single_line(error)}): "
+            "give a file with the arrays train_images, train_labels, test_images, test_labels "
+            "and classes",
             "path",
         ) from error
 
 
 def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
-    """Read a data set from the arrays of an .npz file.
+    """Read a data set from the arrays of an open .npz file.
 
     Args:
-        archive: File with the arrays that `load_npz` describes.
+        archive: The open file, with the arrays train_images, train_labels,
+            test_images, test_labels and classes.
 
     Raises:
-        ValueError: If an array has another type or shape.
+        ValueError: If an array has a wrong type or shape.
     """
     classes = archive["classes"]
     splits = []
-    for part in progress(("train", "test"), "reading the data"):
-        images = archive[f"{part}_images"]
-        labels = archive[f"{part}_labels"]
+    for split_name in progress(("train", "test"), "reading the data"):
+        images = archive[f"{split_name}_images"]
+        labels = archive[f"{split_name}_labels"]
         splits.append(_npz_split(images, labels, classes.size))
+    train, test = splits
     names = classes.tolist()
     if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(names)) != len(classes):
         raise ValueError("classes must be distinct strings, one per class")
-    if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
+    if train.images.shape[1:] != test.images.shape[1:]:
         raise ValueError("train_images and test_images differ in size")
-    return DataSet(tuple(names), splits[0], splits[1])
+    return DataSet(tuple(names), train, test)
 
 
-def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
-    """Convert the arrays of images and labels to a split.
+def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
+    """Check arrays of images and labels, and convert them to a `Split`.
 
     Args:
         images: Images, which must be uint8 of shape (N, 3, S, S).
-        labels: Labels, which must be whole numbers of shape (N,).
-        classes: Number of classes.
+        labels: Labels, which must be integers from 0 to `class_count` - 1,
+            shape (N,). At least one is needed.
+        class_count: Number of classes.
 
     Raises:
         ValueError: If a shape, a type or a label is wrong.
@@ -283,8 +327,8 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
     if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
         given = f"labels are {labels.dtype} of shape {labels.shape}"
         raise ValueError(f"{given}; they must be integers ({len(images)},)")
-    if not len(labels) or labels.min() < 0 or labels.max() >= classes:
-        raise ValueError(f"labels must be 0 to {classes - 1}, one at least")
+    if not len(labels) or labels.min() < 0 or labels.max() >= class_count:
+        raise ValueError(f"labels must be 0 to {class_count - 1}, one at least")
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
 
 
@@ -295,24 +339,28 @@ def load_folder(
     skip_unreadable: bool = False,
     workers: int = 0,
 ) -> DataSet:
-    """Load class folders of images, or folders `train` and `test` of class folders.
+    """Load a data set from a folder with a subfolder of images for each class.
 
-    The central square of each image is reduced. Images of more than `RESIDENT` pixels per side
-    stay on disk, and are read in random crops.
+    The folder may instead have two subfolders, `train` and `test`, each with a
+    subfolder for each class.
+
+    If `size` is at most `MAX_SIZE_IN_MEMORY`, the central squares of all images
+    are read and reduced to this size. Otherwise the images stay on disk.
 
     Args:
-        path: The folder.
-        size: The pixels per side.
-        test_fraction: The fraction of every class that is the test split, if there is no folder
-            `test`.
-        skip_unreadable: Whether broken images are skipped.
-        workers: The number of processes that read images from disk.
+        path: Folder of the data set.
+        size: Pixels per side of the images.
+        test_fraction: Fraction of the images of each class that becomes the
+            test split, in (0, 1). It is not used with a subfolder `test`.
+        skip_unreadable: Whether images that cannot be read are skipped.
+        workers: Number of processes that read images which stay on disk.
 
     Returns:
         The data set.
 
     Raises:
-        InputError: If the folder holds no such folders, or an image is broken.
+        InputError: If the folder has neither of the two layouts, or if an image
+            cannot be read.
     """
     root = Path(path)
     if not root.is_dir():
@@ -320,30 +368,31 @@ def load_folder(
             f"path={path} is not a folder: give a folder with one folder of images per class",
             "path",
         )
-    parts = [name for name in folder_names(root) if name.lower() in PARTS]
-    if parts not in ([], ["test", "train"]):
+    split_names = [name for name in folder_names(root) if name.lower() in SPLIT_NAMES]
+    if split_names not in ([], ["test", "train"]):
         raise InputError(
-            f"path={path} holds {', '.join(parts)}: divide it into train and test, or not at all",
+            f"path={path} holds the folders {', '.join(split_names)}: "
+            "give a folder with the two folders train and test, or with class folders only",
             "path",
         )
-    train_root = root / "train" if parts else root
+    train_root = root / "train" if split_names else root
     classes = tuple(folder_names(train_root))
     if len(classes) < 2:
         raise InputError(
             f"path={path} holds {len(classes)} class folders: it needs two or more",
             "path",
         )
-    unread = unsupported_files(root)
-    if unread:
-        shown = ", ".join(map(str, unread[:3]))
-        console.warning("%d files in %s are not images: %s", len(unread), root, shown)
+    other_files = unsupported_files(root)
+    if other_files:
+        shown = ", ".join(map(str, other_files[:3]))
+        console.warning("%d files in %s are not images: %s", len(other_files), root, shown)
 
     train = _folder_split(train_root, classes, size, skip_unreadable, workers)
-    empty = set(range(len(classes))).difference(train.labels.tolist())
-    if empty:
-        name = classes[min(empty)]
+    empty_classes = set(range(len(classes))).difference(train.labels.tolist())
+    if empty_classes:
+        name = classes[min(empty_classes)]
         raise InputError(f"{train_root / name} holds no image: put some there or remove the folder")
-    if parts:
+    if split_names:
         test = _folder_split(root / "test", classes, size, skip_unreadable, workers)
         return DataSet(classes, train, test)
     is_test = held_out_rows(train, test_fraction, seed=0, argument="test_fraction")
@@ -357,20 +406,21 @@ def load_unlabeled(
     skip_unreadable: bool,
     workers: int,
 ) -> DataSet:
-    """Load all images of a folder and its sub-folders. Their classes are not known.
+    """Load all images of a folder and its subfolders as an unlabeled data set.
 
     Args:
-        path: The folder.
-        size: The pixels per side.
-        test_fraction: The fraction that is the test split, of at most `HELD_OUT` images.
-        skip_unreadable: Whether broken images are skipped.
-        workers: The number of processes that read images from disk.
+        path: Folder of the images.
+        size: Pixels per side of the images.
+        test_fraction: Fraction of the images that becomes the test split, in
+            (0, 1). The test split has at most `HELD_OUT` images.
+        skip_unreadable: Whether images that cannot be read are skipped.
+        workers: Number of processes that read images which stay on disk.
 
     Returns:
-        The data set, without classes. Every label is 0.
+        The data set. It has no classes, and every label is 0.
 
     Raises:
-        InputError: If the folder holds no image, or an image is broken.
+        InputError: If the folder holds no image, or if an image cannot be read.
     """
     found = find_unlabeled(Path(path))
     _, images = _read(Path(path), found, size, skip_unreadable, workers)
@@ -387,14 +437,14 @@ def _folder_split(
     skip_unreadable: bool,
     workers: int,
 ) -> Split:
-    """Read the images of class folders.
+    """Load the images of a folder that has a subfolder for each class.
 
     Args:
-        root: Folder with a sub-folder for each class.
+        root: The folder.
         classes: Names of the classes. A label is an index into them.
         size: Pixels per side of the images.
-        skip_unreadable: Whether broken images are skipped.
-        workers: Number of processes that read images from disk.
+        skip_unreadable: Whether images that cannot be read are skipped.
+        workers: Number of processes that read images which stay on disk.
     """
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)
@@ -405,22 +455,22 @@ def _folder_split(
 def _read(
     root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
 ) -> tuple[list[Photograph], Tensor | ImageFiles]:
-    """Read photographs, or prepare to read them later if they are large.
+    """Read photographs into memory if `size` is small. Otherwise leave them on disk.
 
     Args:
         root: Folder of the photographs.
         found: Photographs in the folder.
-        size: Pixels per side of the images.
-        skip_unreadable: Whether broken images are skipped.
-        workers: Number of processes that read images from disk.
+        size: Pixels per side of the images. If it is more than
+            MAX_SIZE_IN_MEMORY, the photographs stay on disk.
+        skip_unreadable: Whether images that cannot be read are skipped.
+        workers: Number of processes that read images which stay on disk.
 
     Returns:
-        Photographs and their images. Images of more than RESIDENT pixels per
-        side stay on disk, and whether they can be read is not known yet. Other
-        images are uint8 of shape (N, 3, size, size), and photographs that
-        cannot be read are left out.
+        Photographs, and their images: uint8 of shape (N, 3, size, size), or
+        files on disk. Skipped images are missing in both. Files on disk are not
+        read, so it is not yet known which of them must be skipped.
     """
-    if size > RESIDENT:
+    if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
         return found, ImageFiles(root, paths, size, workers, skip_unreadable)
     readable, images, broken = load_photographs(root, found, size, skip_unreadable)

@@ -5,7 +5,7 @@ from scipy.stats import binomtest, chisquare
 
 from train.data import batches
 from train.data.batches import (
-    PADDING,
+    SMALL_IMAGE_SHIFT,
     Round,
     TrainingImages,
     crop_and_flip,
@@ -41,17 +41,17 @@ def gray_images(count: int) -> torch.Tensor:
 def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_flipped):
     height, width = shape
     images = noise(3, 3, height, width)
-    steps = torch.arange(-PADDING, PADDING + 1)
+    steps = torch.arange(-SMALL_IMAGE_SHIFT, SMALL_IMAGE_SHIFT + 1)
     shifts = torch.cartesian_prod(steps, steps)
     rows = torch.arange(len(shifts)) % len(images)
     flips = torch.full((len(rows),), is_flipped)
 
     cropped = crop_and_flip(images, rows, shifts.T, flips)
 
-    padded = F.pad(images.double(), (PADDING,) * 4, mode="reflect").to(torch.uint8)
+    padded = F.pad(images.double(), (SMALL_IMAGE_SHIFT,) * 4, mode="reflect").to(torch.uint8)
     for image, row, (down, right) in zip(cropped, rows, shifts, strict=True):
-        top = PADDING + down
-        left = PADDING + right
+        top = SMALL_IMAGE_SHIFT + down
+        left = SMALL_IMAGE_SHIFT + right
         expected = padded[row, :, top : top + height, left : left + width]
         if is_flipped:
             expected = expected.flip(2)
@@ -60,7 +60,7 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_fli
 
 @pytest.mark.parametrize(
     ("size", "largest_shift", "count"),
-    [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)],
+    [(11, SMALL_IMAGE_SHIFT, 6000), (65, SMALL_IMAGE_SHIFT, 1200), (129, 8, 1500)],
 )
 def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift, count):
     # The first two channels of a pixel are its row and its column.
@@ -152,7 +152,7 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
 
 class TestRounds:
     def test_divide_the_images_of_an_epoch_and_each_has_all_renders(self):
-        rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, every=20)
+        rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, images_per_round=20)
         assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
         images = []
         for part, image_count in zip(rounds, [20, 20, 10], strict=True):

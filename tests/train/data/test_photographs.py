@@ -163,7 +163,7 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
         found = find_photographs(tmp_path, CLASSES, "orange")
     assert [photograph.source for photograph in found] == ["sun", "web", "lab", None]
     assert [photograph.hard_negatives for photograph in found] == [("lab", "web"), (), (), ()]
-    assert "photos.csv has 1 of 5 rows for no file of the folder, like fig/gone.jpg" in caplog.text
+    assert "photos.csv names a missing file in 1 of 5 rows, such as fig/gone.jpg" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -171,16 +171,16 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
     [
         (
             b"path;source_tag\na.jpg;web\n",
-            "make it UTF-8 with the columns path and source_tag, separated by commas",
+            "UTF-8 text file with the columns path and source_tag, separated by commas",
         ),
         (
             b"path,source_tag\nb/a.jpg,web\n",
-            "1 of 1 rows for no file of the folder, .*; give paths such as a.jpg$",
+            "a missing file in 1 of 1 rows, .*: give paths relative to the folder, such as a.jpg$",
         ),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
         (
             b"path,source_tag,hard_negatives\na.jpg,web,lib\n",
-            "names hard_negatives of source 'lib', which has no image$",
+            "names the source 'lib' in the column hard_negatives, but no image has this source",
         ),
     ],
 )

@@ -130,9 +130,9 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
         ),
         (
             ["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"],
-            "holds test, train, val: divide it",
+            "holds the folders test, train, val: give",
         ),
-        (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 of class 0, 1 images, is all or nothing"),
+        (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 selects 0 of the 1 images of class 0"),
     ],
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
