@@ -1,6 +1,6 @@
-"""Settings of renders that are kept aside from training.
+"""Settings of the test renders that a training run makes after training.
 
-They show the classes of the training as other instances in other light.
+They show the same classes as the training, but other objects in other lighting.
 """
 
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photographs import OTHER_PREFIX
 from train.settings import ExperimentSettings, label_names, simplified
 
-# Seed of the first instance of a solid. The next instances have the next seeds.
-# Training draws its seeds from far larger numbers, or names lower ones.
+# The generated solids for testing have the seeds 2001, 2002 and so on. Training uses
+# lower seeds, or draws seeds that are far larger.
 FIRST_SEED = 2001
-# Number of instances of each class under study.
-INSTANCES = 6
-# Number of instances of each solid in OTHERS.
-OTHER_INSTANCES = 2
-# Generated solids that a network may confuse with the class under study: fruit, a
-# vegetable and a ball.
-OTHERS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
+# Number of generated solids of each positive class.
+POSITIVE_COUNT = 6
+# Number of generated solids for each name in NEGATIVES.
+NEGATIVE_COUNT = 2
+# Solids that a network may confuse with the positive class: fruit, a vegetable and a
+# ball. A solid of a positive class is left out.
+NEGATIVES = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
 
 
 def kept_aside_settings(
@@ -31,31 +31,32 @@ def kept_aside_settings(
     size: int,
     out: Path,
 ) -> LabSettings:
-    """Choose objects, patterns and seeds of renders that training does not use.
+    """Choose objects and lighting for test renders that training does not use.
 
-    A class that can be generated has generated instances of its own. Another
-    class has the meshes of training, in other light.
+    If a positive class is the name of a generated solid, new solids are
+    generated. Otherwise the meshes of training are rendered in other lighting.
 
     Args:
-        settings: Settings of the run. `evaluate.laboratory_setups` is a multiple of 5.
+        settings: Settings of the training run. `evaluate.laboratory_setups` is
+            a multiple of 5, because there are 5 patterns.
         classes: Names of the classes of the network.
         size: Pixels per side of the renders.
         out: Folder of the renders.
 
     Returns:
-        Settings of `write_laboratory`.
+        Settings for `write_laboratory`.
     """
     labels = label_names(settings.label)
     meshes: list[Any] = []
     for label in labels:
-        meshes += _objects(settings, label)
-    names_in_use = {simplified(label) for label in labels}
-    by_name = {simplified(name): name for name in classes}
-    for other in OTHERS:
-        if simplified(other) in names_in_use:
+        meshes += _positives(settings, label)
+    simplified_labels = {simplified(label) for label in labels}
+    class_of_simplified = {simplified(name): name for name in classes}
+    for solid_name in NEGATIVES:
+        if simplified(solid_name) in simplified_labels:
             continue
-        label = by_name.get(simplified(other), OTHER_PREFIX + other)
-        meshes += _instances(other, label, OTHER_INSTANCES)
+        label = class_of_simplified.get(simplified(solid_name), OTHER_PREFIX + solid_name)
+        meshes += _generated(solid_name, label, NEGATIVE_COUNT)
     return LabSettings(
         out=str(out),
         label=settings.label,
@@ -68,30 +69,31 @@ def kept_aside_settings(
     )
 
 
-def _objects(settings: ExperimentSettings, label: str) -> list[Any]:
-    """Choose the objects of a class under study.
+def _positives(settings: ExperimentSettings, label: str) -> list[Any]:
+    """Choose the objects of a positive class for the test renders.
 
     Args:
-        settings: Settings of the run, with the meshes of the training.
-        label: The class.
+        settings: Settings of the training run, with its meshes.
+        label: Positive class.
 
     Returns:
-        Settings of INSTANCES generated solids, if the class is one that can be
-        generated. Otherwise the settings of its meshes in the training.
+        Settings of POSITIVE_COUNT generated solids, if there is a solid with
+        the name of the class. Otherwise settings of the meshes of this class
+        that the training uses.
     """
     name = simplified(label).replace(" ", "_")
     if name in SOLIDS or name in HARD_NEGATIVES:
-        return _instances(name, label, INSTANCES)
+        return _generated(name, label, POSITIVE_COUNT)
     return [asdict(item) for item in settings.objects.values() if item.label == label]
 
 
-def _instances(name: str, label: str, count: int) -> list[Any]:
-    """Return the settings of generated instances of a solid.
+def _generated(name: str, label: str, count: int) -> list[Any]:
+    """Return the settings of generated solids of the same kind with different seeds.
 
     Args:
-        name: Name of the solid.
-        label: Class of the instances.
-        count: Number of instances.
+        name: Name of the solid, such as "sweet_pepper".
+        label: Class of the objects.
+        count: Number of objects.
     """
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     return [{"mesh": f"solid:{name}:{seed}", "label": label} for seed in seeds]

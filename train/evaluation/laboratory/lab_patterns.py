@@ -1,15 +1,17 @@
-"""Draw the patterns that the projectors of pnb-lab project.
+"""Draw the random patterns that the projectors of pnb-lab project onto objects.
 
-A family of patterns is a function of points and a random number generator.
+A pattern mixes two colors of light. One function for each kind of pattern
+computes the weight of the first color at each pixel. The second color has the
+remaining weight.
 
-- The points have shape (2, H, W). They are positions (x, y) in the image of the
-  projector, which spans [-1, 1] in both directions. An object in the center of
-  the image spans about [-0.3, 0.3].
-- The function returns weights in [0, 1], shape (1, H, W), or (3, H, W) with a
-  weight for each channel. A weight of 1 is the first of two random colors of
-  light, and a weight of 0 is the second one.
+- `points` has the position (x, y) of each pixel of the projected image, shape
+  (2, H, W). The image spans [-1, 1] in both directions. The object in its
+  center spans about [-0.3, 0.3].
+- The weights are in [0, 1], shape (1, H, W), or (3, H, W) if each color channel
+  has its own weight.
 
-The order of the draws decides the patterns of all saved renders.
+Saved renders can be reproduced only if the order of the random draws stays as
+it is.
 """
 
 import math
@@ -24,18 +26,18 @@ from torch import Tensor
 from augment.scene import patterns
 from train.command_settings import SLIDES
 
-# Pixels per side of the image of a projector.
+# Pixels per side of the image that a projector projects.
 RESOLUTION = 512
-# Sum of the areas of all spots or leaves. The image has an area of 4, and about
-# half of it is covered because they overlap.
+# The areas of all spots, or of all leaves, of a pattern have this sum. They overlap
+# and cover about half of the projected image, whose area is 4.
 TOTAL_AREA = 2.8
-# Leaves are ellipses that are this many times as long as wide.
+# The pattern "leaves" consists of ellipses that are 3 times as long as wide.
 LEAF_RATIO = 3
-# `_text` draws the characters of a line of text from these.
+# The pattern "text" consists of lines of these characters in random order.
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ "
 # Number of characters of a line of text.
 LINE_LENGTH = 24
-# Distance between two lines of text, in heights of a letter.
+# Distance between two lines of text, divided by the height of a letter.
 LINE_SPACING = 1.2
 
 
@@ -43,37 +45,43 @@ def _solid(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Light the whole image in the first color.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 everywhere.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 everywhere.
     """
     return patterns.solid(points)[None]
 
 
 def _gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a linear ramp along x. At the center, its value is 0.5.
+    """Draw a linear ramp along x, whose value at the center of the image is 0.5.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): from 0 to 1 along x.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): from 0 to 1 along x.
     """
     return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
 def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw stripes along y, with a random width and position.
+    """Draw stripes along y with a random width and a random position.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on stripes, 0 between.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the stripes, 0 between them.
     """
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
@@ -81,14 +89,16 @@ def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the squares of a chessboard, with a random size and position.
+    """Draw a checkerboard with a random size and a random position.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 0 or 1.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on every other square, 0 on the others.
     """
     scaled = points / rng.uniform(0.12, 0.5)
     shift = torch.from_numpy(rng.uniform(size=2))
@@ -96,27 +106,31 @@ def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _half(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light one side of a line through the object.
+    """Light the pixels on one side of a vertical line that crosses the object.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on this side.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the lit side, 0 on the other side.
     """
     return patterns.half(points, 0.5 + rng.uniform(-0.12, 0.12)).double()[None]
 
 
 def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw random discs of one size that cover about half of the image.
+    """Draw discs at random places. All have one size and cover about half of the image.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on the discs.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the discs, 0 elsewhere.
     """
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
@@ -127,14 +141,16 @@ def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw rings of one width around a random point.
+    """Draw concentric rings of the same width around a random center.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on rings, 0 between.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the rings, 0 between them.
     """
     center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
@@ -144,108 +160,123 @@ def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the light through the panes of a window. The bars and the wall around it are dark.
+    """Draw the light that falls through the panes of a window into a dark room.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on the panes.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the panes, 0 on the bars between them and outside of
+        the window.
     """
+    # Each of these three tensors has one value for x and one for y, shape (2, 1, 1).
     pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
     pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
     center = torch.from_numpy(rng.uniform(-0.15, 0.15, 2))[:, None, None]
-    # Positions in units of panes, from a corner of the window.
+    # The position (0, 0) is a corner of the window. A pane has the size 1.
     positions = (points - center) / pane_size + pane_counts / 2
     is_in_window = (positions > 0) & (positions < pane_counts)
-    is_in_pane = (positions % 1 - 0.5).abs() < rng.uniform(0.3, 0.45)
+    distance_from_middle = (positions % 1 - 0.5).abs()
+    is_in_pane = distance_from_middle < rng.uniform(0.3, 0.45)
     return (is_in_window & is_in_pane).all(dim=0).double()[None]
 
 
 def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the shadows of leaves: random ellipses that cover about half of the image.
+    """Draw the shadows of leaves: ellipses at random places, which cover about half of the image.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 0 on the leaves.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 0 on the leaves, 1 elsewhere.
     """
-    length = rng.uniform(0.15, 0.35)
+    half_length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
-    leaf_area = math.pi * length**2 / LEAF_RATIO
+    leaf_area = math.pi * half_length**2 / LEAF_RATIO
     for _ in range(round(TOTAL_AREA / leaf_area)):
         angle = rng.uniform(0, math.pi)
         center = torch.from_numpy(rng.uniform(-1, 1, 2))
         offset = points - center[:, None, None]
-        # Coordinates along the length and along the width of the leaf.
+        # `along` is the coordinate along the long axis of the leaf, `across` along
+        # its short axis.
         along, across = patterns.turned(offset, math.cos(angle), -math.sin(angle))
-        is_lit &= (along / length) ** 2 + (across / length * LEAF_RATIO) ** 2 > 1
+        is_lit &= (along / half_length) ** 2 + (across / half_length * LEAF_RATIO) ** 2 > 1
     return is_lit.double()[None]
 
 
 def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw lines of random capital letters, bright on a dark slide.
+    """Draw bright lines of random capital letters on a dark background.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color, shape (1, H, W): 1 on letters.
+        Weight of the first of two colors of light at each pixel, shape
+        (1, H, W): 1 on the letters, 0 between them.
     """
-    height = int(rng.integers(40, 120))
-    slide = Image.new("L", (RESOLUTION, RESOLUTION))
-    font = ImageFont.load_default(float(height))
-    for top in range(0, RESOLUTION, int(LINE_SPACING * height)):
+    letter_height = int(rng.integers(40, 120))
+    image = Image.new("L", (RESOLUTION, RESOLUTION))
+    font = ImageFont.load_default(float(letter_height))
+    for top in range(0, RESOLUTION, int(LINE_SPACING * letter_height)):
         line = "".join(rng.choice(list(LETTERS), LINE_LENGTH))
-        # The first letter of a line may be cut off.
-        left = -int(rng.integers(height))
-        ImageDraw.Draw(slide).text((left, top), line, 255, font)
-    values = np.asarray(slide, dtype=np.float32)[..., None] / 255
-    return _sample(values, points, order=1)
+        # The line starts at or left of the border, which cuts off a random part of
+        # its first letter.
+        left = -int(rng.integers(letter_height))
+        ImageDraw.Draw(image).text((left, top), line, 255, font)
+    weights = np.asarray(image, dtype=np.float32)[..., None] / 255
+    return _sample(weights, points, order=1)
 
 
 def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a smooth field of colors, with independent channels.
+    """Draw smoothly varying colors: random values on a coarse grid, interpolated by cubic splines.
 
     Args:
-        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        points: Positions (x, y) of the pixels in the projected image, which
+            spans [-1, 1], shape (2, H, W).
         rng: Random number generator.
 
     Returns:
-        Weight of the first color for each channel, shape (3, H, W), in [0, 1].
+        Weight of the first of two colors of light for each color channel and
+        pixel, shape (3, H, W), in [0, 1].
     """
     grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
     return _sample(grid, points, order=3).clamp(0, 1)
 
 
 def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
-    """Interpolate an image by splines of an order.
+    """Interpolate an image at given positions with splines.
 
     Args:
-        image: Image that spans [-1, 1] in both directions, shape (H, W, C). It
-            is mirrored at its borders.
-        points: Positions (x, y), shape (2, H', W').
-        order: Order of the splines. 1 interpolates linearly.
+        image: Image with C channels, shape (H, W, C). It spans [-1, 1] in x and
+            in y, and is mirrored at its borders.
+        points: Positions (x, y) at which the image is interpolated, shape
+            (2, H', W').
+        order: Order of the splines. 1 interpolates linearly, 3 cubically.
 
     Returns:
         Interpolated values, shape (C, H', W').
     """
-    size = np.array(image.shape[:2])[:, None, None]
-    # (x, y) in [-1, 1] become rows and columns, in pixels.
-    places = (points.flip(0).numpy() + 1) / 2 * size - 0.5
+    height_and_width = np.array(image.shape[:2])[:, None, None]
+    # `flip` swaps (x, y) to (y, x). The interval [-1, 1] becomes [-0.5, size - 0.5],
+    # so that whole numbers are centers of pixels.
+    rows_and_columns = (points.flip(0).numpy() + 1) / 2 * height_and_width - 0.5
     channels = []
     for channel in np.moveaxis(image, -1, 0):
-        channels.append(map_coordinates(channel, places, order=order, mode="reflect"))
+        channels.append(map_coordinates(channel, rows_and_columns, order=order, mode="reflect"))
     return torch.from_numpy(np.stack(channels))
 
 
-# Functions that draw patterns, by the names of the families. PATTERNS in train/command_settings.py
-# lists the same names.
-FAMILIES = {
+# For each name of a pattern, the function that draws it. PATTERNS in
+# train/command_settings.py lists the same names.
+PATTERN_FUNCTIONS = {
     "solid": _solid,
     "gradient": _gradient,
     "stripes": _stripes,
@@ -258,51 +289,57 @@ FAMILIES = {
     "text": _text,
     "colors": _colors,
 }
-# Families with two colors of light. The second color of the others is black.
+# Patterns that mix two random colors. In all other patterns, the second color is
+# black.
 TWO_COLORED = ("gradient", "stripes", "checkers")
 
 
 def draw_pattern(
-    family: str,
+    name: str,
     rng: np.random.Generator,
     slides: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """Draw a pattern of random colors, at a random angle, scale and position.
+    """Draw an image for a projector: a pattern with random colors, angle, scale and position.
 
     Args:
-        family: Key of FAMILIES, or SLIDES for one of the pictures.
+        name: Name of the pattern, a key of PATTERN_FUNCTIONS. "slides" chooses
+            one of the pictures in `slides` instead.
         rng: Random number generator.
-        slides: Pictures for the family SLIDES, linear RGB, shape (H, W, 3).
+        slides: Pictures for the pattern "slides", linear RGB, shape (H, W, 3).
 
     Returns:
-        Linear RGB in [0, 1], shape (RESOLUTION, RESOLUTION, 3), float32.
+        Projected image, linear RGB in [0, 1], shape
+        (RESOLUTION, RESOLUTION, 3), float32.
     """
-    first = torch.from_numpy(draw_color(rng))[:, None, None]
-    second = torch.from_numpy(draw_color(rng))[:, None, None]
-    # For families that are not in TWO_COLORED, the second color is black.
-    second = second * rng.uniform() * (family in TWO_COLORED)
+    first_color = torch.from_numpy(draw_color(rng))[:, None, None]
+    second_color = torch.from_numpy(draw_color(rng))[:, None, None]
+    # The brightness is drawn for all patterns, so that later draws are the same.
+    second_brightness = rng.uniform()
+    if name not in TWO_COLORED:
+        second_brightness = 0.0
+    second_color = second_color * second_brightness
     angle = rng.uniform(0, 2 * math.pi)
     centers = patterns.pixel_centers(RESOLUTION)[:, 0].double()
     points = patterns.turned(centers, math.cos(angle), -math.sin(angle))
-    if family == SLIDES:
+    if name == SLIDES:
         picture = slides[int(rng.integers(len(slides)))]
         scaled = points * rng.uniform(0.3, 1)
         shift = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
-        light = _sample(picture, scaled + shift[:, None, None], order=1)
+        image = _sample(picture, scaled + shift[:, None, None], order=1)
     else:
-        weight = FAMILIES[family](points, rng)
-        light = patterns.two_colors(weight, first, second).expand(3, -1, -1)
-    return light.permute(1, 2, 0).contiguous().float().numpy()
+        weight = PATTERN_FUNCTIONS[name](points, rng)
+        image = patterns.two_colors(weight, first_color, second_color).expand(3, -1, -1)
+    return image.permute(1, 2, 0).contiguous().float().numpy()
 
 
 def draw_color(rng: np.random.Generator) -> np.ndarray:
-    """Draw a color of light with `augment.scene.patterns.random_colors`.
+    """Draw a color of light with a random hue and a random saturation.
 
     Args:
         rng: Random number generator.
 
     Returns:
-        Linear RGB, shape (3,), whose largest channel is 1.
+        Linear RGB, shape (3,). The largest channel is 1.
     """
     hue_and_saturation = torch.from_numpy(rng.uniform(size=(1, 2)))
     return patterns.random_colors(hue_and_saturation).flatten().numpy()

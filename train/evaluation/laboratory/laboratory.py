@@ -37,23 +37,26 @@ from train.runs.run_lock import LOCK, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
 
-# Pattern of the renders below the folder: LABEL/SETUP_FAMILY.png.
+# Glob pattern of the renders in the folder of the test set. Their paths are
+# LABEL/NUMBER_LIGHTING.png.
 RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"
-# Columns of the table of renders.
+# Columns of photos.csv, the table of all renders.
 COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
-# Packages whose versions may change a pixel.
+# Another version of one of these packages may render other pixels. The versions are
+# therefore recorded with the renders.
 PACKAGES = ("mitsuba", "numpy", "torch")
-# A projector lights a square around the object with this half-width, in world
+# Half of the width of the square around the object that a projector lights, in world
 # units.
 PROJECTOR_HALF_WIDTH = 2.6
-# Rows of the map of a built-in light.
-PROBE_HEIGHT = 64
-# The table and the wall are squares of this half-width, in world units.
+# A built-in light is rendered to an environment map with this many rows.
+BUILT_IN_MAP_HEIGHT = 64
+# Half of the width of the table and of the wall, which are squares, in world units.
 PLANE_HALF_WIDTH = 100.0
-# Smallest cosine between the normals of a face and of a vertex at which the
-# shading is smooth. At a right-angled edge, the cosine is at most 0.82.
+# A corner of a face is shaded with the smooth normal of its vertex only if the cosine
+# between this normal and the normal of the face is at least 0.85. At an edge with a
+# right angle, the cosine is at most 0.82, so that the edge looks sharp.
 MIN_SMOOTH_COSINE = 0.85
-# Mitsuba's seeds are below this number.
+# Mitsuba takes seeds from 0 to 2^32 - 1.
 SEED_COUNT = 2**32
 
 
@@ -61,9 +64,9 @@ class Subject(NamedTuple):
     """A mesh to render.
 
     Attributes:
-        label: Class of the mesh, and name of the folder of its renders.
-        mesh: File of the mesh, or name of the solid.
-        parts: Parts of the mesh. Each part has one texture, or none.
+        label: Class of the mesh. Its renders are in a folder of this name.
+        mesh: File of the mesh, or name of the generated solid.
+        parts: Parts of the mesh, split such that each has one texture or none.
     """
 
     label: str
@@ -72,16 +75,18 @@ class Subject(NamedTuple):
 
 
 def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
-    """Split a mesh by texture, and convert its colors to linear RGB.
+    """Split a mesh by texture, and convert its colors from sRGB to linear RGB.
 
-    The shading is smooth, except at sharp edges.
+    The parts have smooth normals, except at sharp edges.
 
     Args:
-        mesh: Mesh with colors and textures in sRGB.
-        albedo_scale: Factor of all colors. The product is limited to [0, 1].
+        mesh: Mesh with vertex colors and textures in sRGB.
+        albedo_scale: Factor by which all linear colors are multiplied. The
+            products are limited to [0, 1].
 
     Returns:
-        Parts with linear colors, and linear textures of shape (H, W, 3).
+        Parts with one texture or none. Textures are linear RGB, shape
+        (H, W, 3).
     """
     normals = corner_normals(mesh.vertices, mesh.faces, "smooth", MIN_SMOOTH_COSINE)
     parts = []
@@ -96,7 +101,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
 
 
 def _scale_albedo(albedo: np.ndarray, factor: float) -> np.ndarray:
-    """Multiply an albedo by a factor, and limit it to [0, 1]."""
+    """Multiply the albedo of a surface by a factor, and limit the products to [0, 1]."""
     return np.clip(factor * albedo, 0, 1).astype(np.float32)
 
 
@@ -115,12 +120,13 @@ def path_traced(
     and this choice would cause most of the noise.
 
     Args:
-        parts: Parts of the object, see `lab_parts`.
-        shot: Lighting, camera, pose and table.
+        parts: Parts of the object, each with one texture or none, as
+            `lab_parts` returns them.
+        shot: Lighting, camera, pose and surroundings of the object.
         size: Pixels per side of the image.
-        spp: Paths per pixel and light source.
+        spp: Number of paths for each pixel and each light source.
         bounces: Maximum number of reflections of a path.
-        seed: Seed of the paths.
+        seed: Seed of the random paths.
 
     Returns:
         Radiance in linear RGB, shape (size, size, 3), float32.
@@ -137,33 +143,32 @@ def path_traced(
         }
         if shot.wall is not None:
             scene["wall"] = _plane(look_at(shot.wall, shot.center), shot.table)
-        for index, part in enumerate(_object(module, parts, shot)):
-            scene[f"part_{index}"] = part
-        scenes = [load(module, {**scene, "light": light}) for light in _lights(shot)]
+        for index, part_shape in enumerate(_object_shapes(module, parts, shot)):
+            scene[f"part_{index}"] = part_shape
+        scenes = [load(module, {**scene, "light": light}) for light in _light_sources(shot)]
         images = [np.array(module.render(scene, spp=spp, seed=seed)) for scene in scenes]
         return np.sum(images, axis=0)
 
 
 def _rgb(color: np.ndarray) -> dict[str, Any]:
-    """Describe a linear color (3,) for Mitsuba."""
+    """Convert a linear RGB color of shape (3,) to the dictionary that Mitsuba takes."""
     return {"type": "rgb", "value": [float(channel) for channel in color]}
 
 
-def _lights(shot: Shot) -> list[dict[str, Any]]:
-    """Describe the light sources of a shot for Mitsuba.
+def _light_sources(shot: Shot) -> list[dict[str, Any]]:
+    """Describe the light sources of a shot by dictionaries that Mitsuba takes.
 
     Returns:
-        Entries of a Mitsuba scene: the environment map, if the shot has one.
-        Otherwise a projector for each pattern, and even light from all
-        around.
+        The environment map, if the shot has one. Otherwise a projector for each
+        pattern, and uniform ambient light.
     """
     if shot.environment is not None:
         return [environment({"bitmap": shot.environment})]
     lights = []
     for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
         distance = float(np.linalg.norm(position - shot.center))
-        # At the object, the light covers a square of this half-width.
-        fov = 2 * float(np.degrees(np.arctan(PROJECTOR_HALF_WIDTH / distance)))
+        half_angle = np.arctan(PROJECTOR_HALF_WIDTH / distance)
+        fov = 2 * float(np.degrees(half_angle))
         # The irradiance of a projector falls with the square of the distance.
         power = shot.brightness * distance**2
         pose = look_at(position, shot.center)
@@ -173,11 +178,14 @@ def _lights(shot: Shot) -> list[dict[str, Any]]:
 
 
 def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
-    """Describe a large diffuse square, the table or the wall, for Mitsuba.
+    """Describe a large diffuse square by a dictionary that Mitsuba takes.
+
+    The table and the wall are such squares.
 
     Args:
-        pose: Matrix from the coordinates of the square to the world, shape
-            (4, 4). The square lies in its plane z = 0, and its front faces +z.
+        pose: Matrix from the coordinates of the square to world coordinates,
+            shape (4, 4). In its coordinates, the square lies in the plane
+            z = 0, and its front side faces +z.
         color: Albedo in linear RGB, shape (3,).
     """
     scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
@@ -185,36 +193,36 @@ def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": pose @ scale, "bsdf": surface}
 
 
-def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
-    """Make a Mitsuba shape of each part of the object in the pose of a shot.
+def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
+    """Create a Mitsuba shape for each part of an object in the pose of a shot.
 
-    The object is scaled and rotated. Its lowest point then touches the table
-    z = 0.
+    The object is scaled and rotated, and moved such that its lowest point
+    touches the table at z = 0.
 
     Args:
-        module: The module `mitsuba`.
-        parts: Parts of the object.
-        shot: Shot with scale, rotation and roughness.
+        module: The Python module `mitsuba`.
+        parts: Parts of the object, each with one texture or none.
+        shot: Shot with the scale, rotation and roughness of the object.
     """
     positions_by_part = []
     for part in parts:
         positions = shot.scale * part.positions @ shot.rotation.T
         positions_by_part.append(positions.reshape(-1, 3))
-    lowest = min(positions[:, 2].min() for positions in positions_by_part)
+    min_height = min(positions[:, 2].min() for positions in positions_by_part)
     shapes = []
     for part, positions in zip(parts, positions_by_part, strict=True):
         albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
         if part.texture is not None:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
         surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
-        # Each face has three vertices of its own.
+        # Faces share no vertices: face i has the vertices 3i, 3i + 1 and 3i + 2.
         faces = np.arange(len(positions)).reshape(-1, 3)
         normals = (part.normals @ shot.rotation.T).reshape(-1, 3)
         shapes.append(
             shape(
                 module,
                 {"type": "twosided", "surface": surface},
-                positions - [0, 0, lowest],
+                positions - [0, 0, min_height],
                 faces,
                 normals,
                 part.uvs.reshape(-1, 2),
@@ -225,11 +233,12 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
 
 
 def write_laboratory(settings: LabSettings) -> int:
-    """Render the test set, and write it to the folder `settings.out`.
+    """Render a test set of objects in random lighting, and write it to `settings.out`.
 
-    The folder gets a subfolder of PNG files for each class, photos.csv and
-    lab.json. `train.data.photographs` reads such a folder. The settings and the
-    versions of the packages decide every byte.
+    The folder gets a subfolder of PNG files for each class, the table
+    photos.csv and the settings lab.json. `find_photographs` of
+    `train.data.photographs` reads such a folder. The same settings and the same
+    versions of the packages give the same bytes.
 
     Args:
         settings: Settings of pnb-lab.
@@ -252,14 +261,15 @@ def write_laboratory(settings: LabSettings) -> int:
     slides = [_read_slide(path) for path in settings.slides]
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
-        _clear(out, settings.overwrite)
+        _require_empty(out, settings.overwrite)
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             for group in groups:
+                # Successive shots show successive meshes of a group.
                 subject = group[number % len(group)]
                 path = _write_render(out, settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
-                rows.append((path, shot.family, number, subject.mesh, brightness))
+                rows.append((path, shot.lighting, number, subject.mesh, brightness))
         table = io.StringIO()
         csv.writer(table).writerows([COLUMNS, *sorted(rows)])
         atomic_write(out / TABLE, table.getvalue())
@@ -271,52 +281,57 @@ def write_laboratory(settings: LabSettings) -> int:
 
 
 def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[list[Subject]]:
-    """Group the meshes by label.
+    """Group meshes by their class.
+
+    With several positive classes, the meshes of each are the negatives of the
+    others. With a single positive class, meshes of another class are needed.
 
     Args:
         subjects: Meshes with their labels.
         labels: Positive classes.
 
     Returns:
-        The meshes of each label. The last group has the meshes of all other
-        classes, if there are any.
+        The meshes of each positive class. The last group has the meshes of all
+        other classes, if there are any.
 
     Raises:
-        InputError: If a label has no mesh, or if there is a single label and no
-            mesh of another class.
+        InputError: If a positive class has no mesh, or if there is a single
+            positive class and no mesh of another class.
     """
     negatives = [subject for subject in subjects if subject.label not in labels]
+    needs_negatives = len(labels) == 1
     groups = []
     for label in labels:
         group = [subject for subject in subjects if subject.label == label]
-        # If there are several labels, the meshes of a label are negatives of the
-        # other labels.
-        needs_negatives = len(labels) == 1
         if not group or (needs_negatives and not negatives):
-            raise InputError(f"meshes: name at least one of label={label} and one of another class")
+            raise InputError(
+                f"meshes has {len(group)} meshes of the class label={label} and "
+                f"{len(negatives)} of other classes: name at least one of each"
+            )
         groups.append(group)
     if negatives:
         groups.append(negatives)
     return groups
 
 
-def _clear(out: Path, overwrite: bool) -> None:
-    """Prepare the folder of the test set.
+def _require_empty(out: Path, overwrite: bool) -> None:
+    """Check that the folder of the test set is empty, or remove earlier renders.
 
     Args:
-        out: The folder.
-        overwrite: Whether earlier renders in the folder are removed.
+        out: Folder of the test set.
+        overwrite: Whether earlier renders in the folder are removed. Other
+            files then stay.
 
     Raises:
-        InputError: If the folder has files, and `overwrite` is false.
+        InputError: If the folder has files, and `overwrite` is False.
     """
     if overwrite:
         for render in out.glob(RENDERS):
             render.unlink()
     elif any(path.name != LOCK for path in out.iterdir()):
         raise InputError(
-            f"out={out} holds other files, and a laboratory needs an empty folder: "
-            "choose another, or set overwrite=true to write over its results",
+            f"out={out} holds files, but the renders need an empty folder: "
+            "choose another folder, or set overwrite=true to replace earlier renders in it",
         )
 
 
@@ -327,68 +342,72 @@ def _write_render(
     shot: Shot,
     number: int,
 ) -> str:
-    """Render a mesh in a shot, and write the image as sRGB of 8 bits.
+    """Render a mesh in a shot, and write the image as an 8-bit sRGB file.
 
     Args:
         out: Folder of the test set.
         settings: Settings of pnb-lab.
-        subject: The mesh.
-        shot: Lighting, camera and pose.
-        number: Number of the shot, from 0.
+        subject: Mesh to render.
+        shot: Lighting, camera, pose and surroundings of the mesh.
+        number: Number of the shot, from 0. It is part of the file name and
+            decides the seed of the path tracer.
 
     Returns:
-        Path of the image in `out`: LABEL/NUMBER_FAMILY.png.
+        Path of the image in `out`: LABEL/NUMBER_LIGHTING.png.
     """
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
-    values = (encode(exposed, "srgb") * 255).round().byte()
-    path = Path(subject.label) / f"{number:04d}_{shot.family}.png"
+    pixels = (encode(exposed, "srgb") * 255).round().byte()
+    path = Path(subject.label) / f"{number:04d}_{shot.lighting}.png"
     (out / path).parent.mkdir(parents=True, exist_ok=True)
-    write_image(out / path, Image.fromarray(values.numpy()))
+    write_image(out / path, Image.fromarray(pixels.numpy()))
     return path.as_posix()
 
 
 def _read_slide(path: str) -> np.ndarray:
-    """Read the picture of a slide as linear RGB (RESOLUTION, RESOLUTION, 3)."""
+    """Read a picture for a projector as linear RGB, shape (RESOLUTION, RESOLUTION, 3)."""
     return decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy()
 
 
 def _read_environment(path: Path) -> np.ndarray:
-    """Read the radiance of an environment map, or of a built-in light.
+    """Read an environment map from a file, or render a built-in light to such a map.
 
     Args:
-        path: File of the map, or name of a built-in light. Negative radiance of
-            a built-in light is removed.
+        path: File of the map, or name of a built-in light. The spherical
+            harmonics of a built-in light may have negative radiance, which is
+            removed.
 
     Returns:
-        Linear RGB, shape (H, W, 3). The upper half is above the horizon.
+        Radiance in linear RGB, shape (H, W, 3). The upper half of the rows is
+        above the horizon.
 
     Raises:
         InputError: If no light comes from above the horizon.
     """
     if str(path) in PROBES:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
-        return to_map(light, PROBE_HEIGHT).clamp(min=0).numpy()
+        return to_map(light, BUILT_IN_MAP_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
     upper_half = radiance[: len(radiance) // 2]
-    # With `not`, the condition is also true if the largest radiance is NaN.
+    # `not ... > 0` is also true for NaN, which `... <= 0` is not.
     if not upper_half.max() > 0:
         raise InputError(
-            f"environments: {path} is dark above: give a map with light from above the horizon",
+            f"environments: {path} has no light above the horizon: "
+            "give an environment map whose upper half is not black",
         )
     return radiance
 
 
 def read_subject(item: str | dict[str, Any], index: int) -> Subject:
-    """Read an entry of `meshes`.
+    """Load a mesh of the setting `meshes`, and choose its label.
 
-    A solid without a label gets its own name as its label. For a hard negative,
-    OTHER_PREFIX precedes the name.
+    A generated solid without a label gets its own name as its label. A solid
+    that serves as a hard negative gets the label "other_NAME".
 
     Args:
         item: File of a mesh, name of a solid, or settings of an object.
-        index: Index of the entry, for error messages.
+        index: Index of the item in `meshes`, for error messages.
 
     Returns:
         The mesh with its label.
@@ -404,12 +423,13 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
         label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
     if not label:
         raise InputError(
-            f"meshes[{index}] has no label: "
-            f"give {{mesh: {settings.mesh}, label: CLASS or {OTHER_PREFIX}NAME}}",
+            f"meshes[{index}] has no label: write {{mesh: {settings.mesh}, label: CLASS}}, "
+            f"or label: {OTHER_PREFIX}NAME for an object of another class",
         )
     if Path(label).name != label or label == "..":
         raise InputError(
-            f"meshes[{index}]: the label {label!r} names the renders' folder: leave out slashes",
+            f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder: "
+            "remove slashes and dots",
         )
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)

@@ -1,8 +1,9 @@
-"""Draw the lighting, the camera and the pose of the renders of pnb-lab at random.
+"""Draw the lighting, the camera and the pose of each render of pnb-lab at random.
 
-World units: a mesh is normalized to [-1, 1]³ and then scaled. It stands on the
-table z = 0 over the origin. Azimuths and elevations are in degrees. Radiance
-and albedo are linear RGB. A radiance of 1 is white at an exposure of 1.
+A mesh is normalized to [-1, 1]³ and then scaled. These are the world units. It
+stands on the table z = 0, above the origin. Azimuths and elevations are in
+degrees. Radiance and albedo are linear RGB. At an exposure of 1, a radiance of 1
+is white in the image.
 """
 
 import math
@@ -19,58 +20,65 @@ from renderer.light.harmonics import equirectangular
 from train.command_settings import LabSettings
 from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
 
-# Field of view of the camera in degrees.
+# Vertical and horizontal field of view of the camera in degrees.
 FOV = 25.0
-# Pattern of which a shot is drawn before an environment replaces its lighting.
+# A setup in an environment map is drawn with projectors of this pattern first. The
+# environment map then replaces the projectors.
 PLAIN_PATTERN = "solid"
-# Range of the half-width of the image at the object, in world units.
+# Half of the width that the camera sees at the object: range of the random draw, in
+# world units.
 HALF_WIDTHS = (1.2, 1.9)
-# Range of the largest coordinate of the object, in world units.
+# Factor by which the normalized object is scaled: range of the random draw.
 SCALES = (0.75, 1)
-# Height of the point that the projectors face, in units of the scale.
+# The projectors face a point above the origin. Its height is 0.8 times the scale of
+# the object.
 CENTER_HEIGHT = 0.8
-# Largest offset of the point that the camera faces, per coordinate.
+# The camera faces a random point near the object. Each coordinate differs by at most
+# this from the point that the projectors face, in world units.
 MAX_AIM_OFFSET = 0.25
-# Range of the distance of a projector from the point that it faces, in world units.
+# Distance of a projector from the point that it faces: range of the random draw, in
+# world units.
 PROJECTOR_DISTANCES = (5, 8)
-# Range of the elevation of the camera in degrees.
+# Elevation of the camera above the table: range of the random draw, in degrees.
 CAMERA_ELEVATIONS = (18, 60)
-# Largest Euler angles of the object's rotation about z, x and z in degrees.
+# The object is rotated by three random Euler angles, about z, x and z. Each is drawn
+# between 0 and its maximum, in degrees.
 MAX_EULER_ANGLES = (360, 60, 360)
-# Largest angle between the wall and the direction away from the camera, in
-# degrees of azimuth.
+# The wall stands behind the object. The azimuth of its direction from the object
+# differs by at most this from the direction opposite to the camera, in degrees.
 MAX_WALL_TURN = 30
-# Range of the distance of a wall from the object, in world units.
+# Distance of the wall from the object: range of the random draw, in world units.
 WALL_DISTANCES = (1.8, 3.5)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """Lighting, camera, pose and table of a render of any object.
+    """Lighting, camera, pose and surroundings in which an object is rendered.
 
     Attributes:
-        family: Name of the pattern or of the environment.
+        lighting: Name of the projected patterns, or of the environment map.
         brightness: Radiance of a white surface. With projectors, the surface
-            faces all of them and their images are white. In an environment,
-            the surface faces up.
+            faces all of them and their images are white. In an environment
+            map, the surface faces up.
         patterns: Image of each projector, linear RGB, shape (H, W, 3).
-        ambient: Radiance from all directions, linear RGB, shape (3,).
-        table: Albedo of the table and the wall, linear RGB, shape (3,).
+        ambient: Radiance of uniform light from all directions, linear RGB,
+            shape (3,).
+        table: Albedo of the table and of the wall, linear RGB, shape (3,).
         projectors: Position of each projector, shape (3,).
         camera: Position of the camera, shape (3,).
         center: Point that the projectors face, shape (3,).
         aim: Point that the camera faces, shape (3,).
         rotation: Rotation matrix of the object, shape (3, 3).
-        scale: Largest coordinate of the object.
+        scale: Factor by which the normalized object is scaled.
         roughness: Roughness of the surface of the object, in [0, 1].
         wall: Point of the wall that is nearest to `center`, shape (3,). None
             without a wall.
-        environment: Radiance on the grid of `equirectangular`, shape
-            (H, W, 3). It replaces the projectors and `ambient`. None if the
-            projectors light the object.
+        environment: Radiance of an environment map, linear RGB, shape
+            (H, W, 3). Its pixels have the directions of `equirectangular`. It
+            replaces the projectors and `ambient`. None with projectors.
     """
 
-    family: str
+    lighting: str
     brightness: float
     patterns: Sequence[np.ndarray]
     ambient: np.ndarray
@@ -91,34 +99,37 @@ def draw_shots(
     environments: Mapping[str, np.ndarray],
     slides: Sequence[np.ndarray] = (),
 ) -> Iterator[Shot]:
-    """Draw equally many shots of each pattern, and then of each environment.
+    """Draw the same number of random shots for each pattern and each environment map.
 
-    Within a pattern or an environment, the logarithms of the brightness are
-    spread evenly over `settings.brightness`. An environment is rotated about
-    the vertical axis by a random angle.
+    The shots of a pattern, or of an environment map, have evenly spread
+    logarithms of the brightness. An environment map is rotated about the
+    vertical axis by a random angle.
 
     Args:
-        settings: Settings of pnb-lab. `settings.setups` is the number of shots.
-        environments: Radiance by name, shape (H, W, 3).
-        slides: Pictures of the pattern "slides", see `draw_pattern`.
+        settings: Settings of pnb-lab. `settings.setups` is the number of shots
+            in total, and `settings.brightness` the range of the brightness.
+        environments: Environment maps by name, linear RGB, shape (H, W, 3).
+        slides: Pictures that the projector projects in the pattern "slides",
+            linear RGB, shape (H, W, 3).
 
     Yields:
-        The shots.
+        The shots of each pattern, and then of each environment map.
     """
     dimmest, brightest = settings.brightness
-    kinds = [*settings.patterns, *environments]
-    per_kind = settings.setups // len(kinds)
-    for kind, index in product(kinds, range(per_kind)):
-        rng = np.random.default_rng(stream_seed(settings.seed, "shot", kind, index))
-        extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", kind, index))
-        # Each shot has its own part of the range of log(brightness).
-        position = (index + rng.uniform()) / per_kind
+    lightings = [*settings.patterns, *environments]
+    shots_per_lighting = settings.setups // len(lightings)
+    for lighting, index in product(lightings, range(shots_per_lighting)):
+        rng = np.random.default_rng(stream_seed(settings.seed, "shot", lighting, index))
+        extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", lighting, index))
+        # The range of log(brightness) is divided into equal intervals. Each shot draws
+        # its brightness from one of them.
+        position = (index + rng.uniform()) / shots_per_lighting
         brightness = dimmest * (brightest / dimmest) ** position
-        pattern = PLAIN_PATTERN if kind in environments else kind
-        shot = _draw_shot(pattern, brightness, settings, slides, rng, extra_rng)
-        if kind in environments:
-            radiance = _scale_environment(environments[kind], brightness, rng)
-            shot = replace(shot, family=kind, environment=radiance, wall=None)
+        patterns = PLAIN_PATTERN if lighting in environments else lighting
+        shot = _draw_shot(patterns, brightness, settings, slides, rng, extra_rng)
+        if lighting in environments:
+            radiance = _scale_environment(environments[lighting], brightness, rng)
+            shot = replace(shot, lighting=lighting, environment=radiance, wall=None)
         yield shot
 
 
@@ -131,66 +142,70 @@ def _scale_environment(
 
     Args:
         radiance: Environment map, linear RGB, shape (H, W, 3).
-        brightness: Radiance of a white diffuse surface that faces up in the
+        brightness: Radiance of a white diffuse surface that faces up, in the
             scaled lighting.
         rng: Random number generator.
 
     Returns:
-        Scaled map, float32, shape (H, W, 3).
+        Rotated and scaled map, linear RGB, shape (H, W, 3), float32.
     """
     directions, solid_angles = equirectangular(*radiance.shape[:2])
-    weights = directions[..., 2].clamp(min=0) * solid_angles
+    cosines = directions[..., 2].clamp(min=0)
+    weights = cosines * solid_angles
     irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
     white_radiance = float(irradiance.mean()) / math.pi
+    # To move the columns of the map is to rotate it about the vertical axis.
     column_offset = rng.integers(radiance.shape[1])
     rotated = np.roll(radiance, column_offset, axis=1)
     return (brightness / white_radiance * rotated).astype(np.float32)
 
 
 def _draw_shot(
-    family: str,
+    pattern_names: str,
     brightness: float,
     settings: LabSettings,
     slides: Sequence[np.ndarray],
     rng: np.random.Generator,
     extra_rng: np.random.Generator,
 ) -> Shot:
-    """Draw a shot under the light of projectors.
+    """Draw a random shot of an object in the light of projectors.
 
     Args:
-        family: Names of the projected patterns, joined by "+". Each pattern has
-            a projector.
-        brightness: Brightness of the projected light, see `Shot`.
-        settings: Settings of pnb-lab, with the ranges of the draws.
-        slides: Pictures of the pattern "slides".
-        rng: Random number generator.
-        extra_rng: Random number generator of the things that earlier versions
-            of the laboratory did not have, such as the wall. With a generator
-            of their own, they leave all other draws as they were.
+        pattern_names: Names of the projected patterns, joined by "+". Each
+            pattern has its own projector.
+        brightness: Radiance of a white surface that faces all projectors, if
+            their images are white.
+        settings: Settings of pnb-lab, with the ranges of the random draws.
+        slides: Pictures that the projector projects in the pattern "slides".
+        rng: Random number generator for all that the first version of the
+            library drew.
+        extra_rng: Random number generator for all that was added later, such as
+            the wall. Additions thus do not change the older draws.
     """
-    first_family, *other_families = family.split("+")
+    first_pattern, *other_patterns = pattern_names.split("+")
     azimuth = rng.uniform(0, 360)
     half_width = rng.uniform(*HALF_WIDTHS)
     scale = rng.uniform(*SCALES)
     center = np.array([0, 0, CENTER_HEIGHT * scale])
     aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
     roughness = _draw_between(settings.roughness, extra_rng)
-    patterns = [draw_pattern(first_family, rng, slides)]
-    patterns += [draw_pattern(name, extra_rng, slides) for name in other_families]
+    patterns = [draw_pattern(first_pattern, rng, slides)]
+    patterns += [draw_pattern(name, extra_rng, slides) for name in other_patterns]
     ambient = _draw_between(settings.ambient, rng) * draw_color(rng)
     table = _draw_between(settings.albedo, rng) * draw_color(rng)
     projectors = [center + _draw_projector(settings, azimuth, rng)]
-    projectors += [center + _draw_projector(settings, azimuth, extra_rng) for _ in other_families]
+    projectors += [center + _draw_projector(settings, azimuth, extra_rng) for _ in other_patterns]
     camera_distance = half_width / math.tan(math.radians(FOV / 2))
     camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
     angles = rng.uniform(0, MAX_EULER_ANGLES)
     rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
-    wall = _draw_wall(azimuth, extra_rng)
-    has_wall = extra_rng.uniform() < settings.walls
-    # The wall is left out if it would stand between a projector and the object.
-    is_hidden = any((position - center) @ wall >= wall @ wall for position in projectors)
+    to_wall = _draw_wall(azimuth, extra_rng)
+    wants_wall = extra_rng.uniform() < settings.walls
+    # `to_wall` is normal to the wall, so its dot product with a vector is larger than
+    # its squared length only if the vector ends behind the wall.
+    is_behind_wall = [(position - center) @ to_wall >= to_wall @ to_wall for position in projectors]
     return Shot(
-        family=family,
+        lighting=pattern_names,
         brightness=brightness,
         patterns=patterns,
         ambient=ambient,
@@ -202,7 +217,8 @@ def _draw_shot(
         rotation=rotation,
         scale=scale,
         roughness=roughness,
-        wall=center + wall if has_wall and not is_hidden else None,
+        # A wall between a projector and the object would block the light.
+        wall=center + to_wall if wants_wall and not any(is_behind_wall) else None,
     )
 
 
@@ -210,8 +226,8 @@ def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Genera
     """Draw the position of a projector, relative to the point that it faces.
 
     Args:
-        settings: Settings of pnb-lab. The range of azimuths is relative to the
-            azimuth of the camera.
+        settings: Settings of pnb-lab, with the ranges of the elevation and of
+            the azimuth relative to the camera.
         azimuth: Azimuth of the camera in degrees.
         rng: Random number generator.
 
@@ -224,7 +240,7 @@ def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Genera
 
 
 def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the place of a wall behind the object, as seen from the camera.
+    """Draw the position of a vertical wall behind the object, as seen from the camera.
 
     Args:
         azimuth: Azimuth of the camera in degrees.
@@ -239,12 +255,21 @@ def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw a number uniformly between two limits."""
+    """Draw a number uniformly between two limits, the lowest and the highest number."""
     return rng.uniform(limits[0], limits[1])
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """Convert an azimuth and an elevation in degrees and a distance to a position, shape (3,)."""
+    """Convert spherical to Cartesian coordinates, with z up.
+
+    Args:
+        azimuth: Angle from +x toward +y in degrees.
+        elevation: Angle above the plane z = 0 in degrees.
+        distance: Distance from the origin.
+
+    Returns:
+        Position (x, y, z), shape (3,).
+    """
     azimuth_radians = math.radians(azimuth)
     elevation_radians = math.radians(elevation)
     horizontal = math.cos(elevation_radians)

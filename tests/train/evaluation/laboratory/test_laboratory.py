@@ -20,7 +20,7 @@ from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
 from train.evaluation.laboratory import lab_patterns as patterns
 from train.evaluation.laboratory import laboratory as lab
-from train.evaluation.laboratory.lab_patterns import FAMILIES, draw_pattern
+from train.evaluation.laboratory.lab_patterns import PATTERN_FUNCTIONS, draw_pattern
 from train.evaluation.laboratory.laboratory import lab_parts, path_traced
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
 
@@ -169,9 +169,9 @@ UNSAFE_LABEL = {"mesh": "solid:orange", "label": "other_../../x"}
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"meshes": ["solid:orange"]}, "meshes: .*label=orange"),
-        ({"label": ["orange", "apple"]}, "meshes: .*label=apple"),
-        ({"meshes": [UNSAFE_LABEL]}, r"meshes\[0\]: the label '.*x'"),
+        ({"meshes": ["solid:orange"]}, "meshes has .*label=orange"),
+        ({"label": ["orange", "apple"]}, "meshes has .*label=apple"),
+        ({"meshes": [UNSAFE_LABEL]}, r"meshes\[0\] has the label '.*x'"),
         ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label"),
         ({"setups": 5}, "setups=5 must be a multiple of the 2 patterns"),
         ({"patterns": ["stripes+slides"]}, "patterns has slides"),
@@ -213,11 +213,11 @@ class TestAnEnvironment:
 
     def test_is_refused_if_it_is_dark_above(self, path, lab_settings):
         np.save(path, np.zeros((8, 16, 3), np.float32))
-        with pytest.raises(InputError, match=r"noon\.npy is dark above"):
+        with pytest.raises(InputError, match=r"noon\.npy has no light above"):
             lab.write_laboratory(lab_settings)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", PATTERN_FUNCTIONS)
 @pytest.mark.parametrize("seed", range(3))
 class TestAPattern:
     def test_is_an_image_that_the_seed_decides(self, family, seed):
@@ -261,11 +261,11 @@ def horizontal_cosine(first: np.ndarray, second: np.ndarray) -> float:
 
 
 class TestShots:
-    SHOTS: ClassVar = draw(220, FAMILIES, seed=3)
+    SHOTS: ClassVar = draw(220, PATTERN_FUNCTIONS, seed=3)
 
     def test_are_equally_many_of_each_family(self):
-        expected = [name for name in FAMILIES for _ in range(20)]
-        assert [shot.family for shot in self.SHOTS] == expected
+        expected = [name for name in PATTERN_FUNCTIONS for _ in range(20)]
+        assert [shot.lighting for shot in self.SHOTS] == expected
 
     def test_of_a_family_are_evenly_from_dim_to_bright(self):
         edges = np.geomspace(0.2, 2.5, 21)
@@ -274,7 +274,7 @@ class TestShots:
         assert (brightness <= edges[1:]).all()
 
     def test_all_have_different_cameras(self):
-        shots = [*self.SHOTS, *draw(11, FAMILIES, seed=4)]
+        shots = [*self.SHOTS, *draw(11, PATTERN_FUNCTIONS, seed=4)]
         assert len({tuple(shot.camera) for shot in shots}) == 231
 
     def test_have_the_object_in_view(self):
@@ -501,7 +501,7 @@ def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_e
     sky = np.zeros((64, 128, 3), np.float32)
     sky[16, 40] = 1e4
     (shot,) = draw(1, [], (0.7, 0.7), seed, {"lamp": sky})
-    assert shot.family == "lamp"
+    assert shot.lighting == "lamp"
     shot = replace(shot, scale=1e-4)
     image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)
     expected = np.broadcast_to(0.7 * shot.table, image.shape)
