@@ -504,6 +504,11 @@ class ExperimentSettings(NetworkSettings):
     compare: list[str] = setting(
         [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."
     )
+    photographs_first: bool = setting(
+        False,
+        "First train with experiment=photographs, in the sub-folder `photographs`, and begin with "
+        "its result instead of train.init_from.",
+    )
     data: DataSettings = setting(DataSettings, "The data set.")
     augment: AugmentationSettings = setting(
         AugmentationSettings,

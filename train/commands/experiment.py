@@ -6,19 +6,20 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import cast
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from augment import distributed
 from augment.settings import MODES
 from train import console
-from train.command import program, read_settings
+from train.command import compose, program, read_settings
 from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import report_of
 from train.report.results import require_new_run
-from train.report.summary import summarize
+from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
 from train.runs.run_config import CONFIG, given_command, require_same_run, resumed
 from train.runs.run_lock import sole_writer
@@ -33,6 +34,14 @@ from train.training.run import load_runs
 CHOICES = ("experiment", "augment", "data", "launcher")
 # File with the lines that a run prints.
 LOG = "train.log"
+# Sub-folder of the training on photographs, see `photographs_first`.
+PHOTOGRAPHS = "photographs"
+# Settings that the training on photographs has in common with the training after it.
+SHARED = ("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light")
+SHARED_IN_TRAIN = (
+    *("init_from", "precision", "device", "threads", "deterministic", "checkpoint_every"),
+    *("resume", "cache"),
+)
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -67,29 +76,86 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
         config: Configuration of the command. Its `run` becomes an absolute path.
         overrides: Overrides of the command.
     """
-    run = broadcast(str(config.run))
-    is_first = distributed.rank() == 0
     command = given_command(overrides)
-    folder = Path(run).absolute()
+    folder = Path(broadcast(str(config.run))).absolute()
     config.run = str(folder)
     # A chosen file sets many values. Only single values can change when a run
     # continues with the settings that it began with.
     if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
     settings = with_label(read_settings(ExperimentSettings, config))
+    if settings.photographs_first:
+        settings = _train_on_photographs(settings, folder, command)
+    _train_in(folder, settings, command, program("train", as_called=True))
+
+
+def _train_on_photographs(
+    settings: ExperimentSettings, folder: Path, command: str
+) -> ExperimentSettings:
+    """Train on photographs as the setting `photographs_first` asks.
+
+    A training that an earlier command finished is not repeated.
+
+    Args:
+        settings: Settings of the command.
+        folder: Folder of the run.
+        command: Command that was given.
+
+    Returns:
+        Settings of the training that begins with the result.
+    """
+    first = folder / PHOTOGRAPHS
+    values = asdict(settings)
+    changes = {name: values[name] for name in SHARED}
+    changes["run"] = str(first)
+    changes["train"] = {name: values["train"][name] for name in SHARED_IN_TRAIN}
+    config = OmegaConf.merge(compose("train", ["experiment=photographs"]), changes)
+    on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
+    if settings.train.resume and is_finished(first):
+        require_same_run(first, on_photographs, finished=True)
+    else:
+        # The folder of the run has no settings yet, which a short command could read.
+        _train_in(first, on_photographs, command, shlex.split(command), folder)
+    begun = replace(settings.train, init_from=str(first))
+    own = {"weights": None, "classes": None, "normalization": None}
+    return replace(settings, photographs_first=False, train=begun, **own)
+
+
+def _train_in(
+    folder: Path,
+    settings: ExperimentSettings,
+    command: str,
+    resuming: Sequence[str],
+    whole: Path | None = None,
+) -> None:
+    """Train the baselines and the main run in a folder.
+
+    Args:
+        folder: Folder of the main run.
+        settings: Settings of the main run.
+        command: Command that was given, which each run records.
+        resuming: Words before run=FOLDER and train.resume=true in the command
+            that continues the training.
+        whole: This FOLDER. None for `folder`.
+    """
     methods = _list_methods(settings, folder)
     for path, method_settings in methods.items():
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, method_settings)
         require_new_run(path, "run", settings.overwrite, settings.train.resume)
-    log = logged_to(writable_folder(run, "run") / LOG) if is_first else nullcontext()
+    is_first = distributed.rank() == 0
+    log = logged_to(writable_folder(str(folder), "run") / LOG) if is_first else nullcontext()
     with log:
         try:
             with sole_writer("run", *methods) if is_first else nullcontext():
                 _train_methods(methods, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
-            console.info("%s%s", cause, _advise_to_resume(methods, folder))
+            advice = "no checkpoint yet: start again"
+            if any(map(checkpoint.exists, methods)):
+                words = [*resuming, f"run={whole or folder}", "train.resume=true"]
+                advice = f"to go on: {shlex.join(words)}"
+            console.info("%s%s", cause, advice)
             raise
 
 
@@ -112,22 +178,6 @@ def _list_methods(settings: ExperimentSettings, folder: Path) -> dict[Path, Expe
             methods[folder / method] = replace(settings, compare=[], augment=augment)
     methods[folder] = settings
     return methods
-
-
-def _advise_to_resume(methods: Mapping[Path, ExperimentSettings], folder: Path) -> str:
-    """Say how to continue a command that was interrupted.
-
-    Args:
-        methods: Settings of each run by its folder.
-        folder: Folder of the main run.
-
-    Returns:
-        The command to give. If no run has a checkpoint, advice to start again.
-    """
-    if not any(map(checkpoint.exists, methods)):
-        return "no checkpoint yet: start again"
-    words = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
-    return f"to go on: {shlex.join(words)}"
 
 
 def _train_methods(

@@ -56,6 +56,8 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     """
     runs = _expand([word for word in overrides if not word.startswith("-")])
     first = compose("train", runs[0])
+    if first.photographs_first:
+        raise InputError("photographs_first is not for sweeps: start the runs one by one")
     overwrite = bool(first.overwrite)
     parent = writable_folder(str(first.sweep), "sweep")
     # The folder may hold the page that an earlier call wrote about the same sweep.

@@ -96,7 +96,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         methods=methods,
         title=_title(found, methods),
         screen=_first_screen(groups),
-        lead=_accuracy_sentences(methods),
+        lead=[*_accuracy_sentences(methods), *_relit_sentences(methods)],
         tables=[table for table in summary.run_tables(methods, {}) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
@@ -371,7 +371,7 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
             agreement = fmean(agreements_known)
             sentences.append(
                 f"{method}: on images of any kind that training did not use, its agreement with "
-                f"the original network is {agreement:.1%}."
+                f"the network that it began with is {agreement:.1%}."
             )
             continue
         initial = [run.before.accuracy for run in runs if run.before]
@@ -383,6 +383,30 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
         images = runs[0].config.get("test_images", "the test images")
         change = f"accuracy went from {before:.1%} to {after:.1%}"
         sentences.append(f"{method}: {change} on {images}.")
+    return sentences
+
+
+def _relit_sentences(methods: Methods) -> list[str]:
+    """Say what each training on relit photographs did.
+
+    Args:
+        methods: Runs of each method.
+
+    Returns:
+        A sentence for each method that was trained with `experiment=photographs`.
+    """
+    sentences = []
+    for method, runs in methods.items():
+        scores = [run.scores for run in runs if "test/relit_agreement_after" in run.scores]
+        if not scores:
+            continue
+        before = fmean(item["test/relit_agreement_before"] for item in scores)
+        after = fmean(item["test/relit_agreement_after"] for item in scores)
+        sentences.append(
+            f"{method}: trained on photographs in the light of a projector. In this light, "
+            f"{after:.1%} of the predictions are those for the unchanged photographs, "
+            f"and {before:.1%} before."
+        )
     return sentences
 
 

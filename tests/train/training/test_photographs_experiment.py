@@ -14,10 +14,13 @@ from renderer.errors import InputError
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
+from train.commands.experiment import PHOTOGRAPHS, train
+from train.report.report_page import PAGE
 from train.runs.checkpoint import BEST, LAST, PREVIOUS, load
 from train.runs.run_log import read_metrics
 from train.runs.saved_networks import load_run
 from train.settings import TrainSettings
+from train.training import run
 from train.training.interpolation import FACTORS, INTERPOLATION, mix
 from train.training.loss import TrainingLoss
 from train.training.relit_batches import RelitBatches
@@ -157,34 +160,91 @@ def test_other_arms_run(settings_of, tmp_path, words):
     assert read_metrics(folder)
 
 
+@pytest.fixture(scope="module")
+def chain(weights, photographs):
+    """Return a function that trains on photographs first and then on renders, by one command."""
+
+    def start(folder, *overrides):
+        words = [
+            "experiment=classifier",
+            f"train.init_from=torchvision:{NAME}",
+            f"weights={weights}",
+            f"data.path={photographs}",
+            f"data.size={SIZE}",
+            "data.test_fraction=0.25",
+            "data.validation=0.25",
+            "label='950'",
+            "scene.meshes=[solid:orange]",
+            "scene.hard_negatives=[solid:lemon]",
+            "scene.backgrounds=[0.5]",
+            "scene.views=1",
+            "train.device=cpu",
+            "train.precision=float32",
+            "train.threads=1",
+            "train.batch_size=8",
+            "train.epochs=1",
+            "evaluate.laboratory_setups=0",
+            "photographs_first=true",
+            f"run={folder}",
+            *overrides,
+        ]
+        train(train_command.compose(words), words)
+
+    return start
+
+
 @pytest.mark.slow
-def test_the_last_layer_of_the_result_can_be_hardened_with_meshes(finished, photographs, tmp_path):
-    folder, _ = finished
-    hardened = tmp_path / "run"
-    words = [
-        "experiment=classifier",
-        f"train.init_from={folder}",
-        f"data.path={photographs}",
-        f"data.size={SIZE}",
-        "data.test_fraction=0.25",
-        "data.validation=0.25",
-        "scene.meshes=[solid:orange]",
-        "scene.hard_negatives=[solid:lemon]",
-        "scene.backgrounds=[0.5]",
-        "scene.views=1",
-        "train.device=cpu",
-        "train.precision=float32",
-        "train.threads=1",
-        "train.batch_size=8",
-        "train.epochs=1",
-        "evaluate.laboratory_setups=0",
-        f"run={hardened}",
-    ]
-    completed_run(train_command.read(words), hardened)
-    before = torch.load(folder / "weights.pt")
-    after = torch.load(hardened / "weights.pt")
-    changed = {name for name in before if not torch.equal(before[name], after[name])}
+def test_one_command_trains_on_photographs_and_then_the_last_layer_on_renders(
+    chain, weights, tmp_path
+):
+    folder = tmp_path / "run"
+    chain(folder)
+    original = torch.load(weights)
+    relit = torch.load(folder / PHOTOGRAPHS / "weights.pt")
+    hardened = torch.load(folder / "weights.pt")
+    first_epochs = [line for line in read_metrics(folder / PHOTOGRAPHS) if "epoch" in line]
+    assert len(first_epochs) == train_command.compose(["experiment=photographs"]).train.epochs
+    factor = load(folder / PHOTOGRAPHS / BEST)[INTERPOLATION]
+    trained = load(folder / PHOTOGRAPHS / LAST)["model"]
+    changed = set()
+    for name, value in original.items():
+        if value.is_floating_point():
+            expected = torch.lerp(value, trained[f"network.{name}"], factor)
+            torch.testing.assert_close(relit[name], expected, atol=1e-6, rtol=1e-5)
+        if not torch.equal(relit[name], hardened[name]):
+            changed.add(name)
     assert changed == {"fc.weight", "fc.bias"}
+    page = (folder / PAGE).read_text()
+    for stage in (folder / PHOTOGRAPHS, folder):
+        assert f"{stage}:" in page
+    after = read_metrics(folder / PHOTOGRAPHS)[-1]["test/relit_agreement_after"]
+    assert f"{after:.1%} of the predictions" in page
+
+
+@pytest.mark.slow
+def test_a_command_that_was_stopped_in_its_first_training_ends_as_one_that_was_not(
+    chain, tmp_path, monkeypatch
+):
+    whole = tmp_path / "whole"
+    chain(whole)
+    stopped = tmp_path / "stopped"
+    interpolated = run.interpolate
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "interpolate", stop)
+    with pytest.raises(KeyboardInterrupt):
+        chain(stopped)
+    monkeypatch.setattr(run, "interpolate", interpolated)
+    chain(stopped, "train.resume=true")
+    expected = torch.load(whole / "weights.pt")
+    for name, value in torch.load(stopped / "weights.pt").items():
+        assert torch.equal(value, expected[name])
+    # Both trainings are finished. The command repeats neither.
+    trained_at = (stopped / PHOTOGRAPHS / LAST).stat().st_mtime_ns
+    chain(stopped, "train.resume=true")
+    assert (stopped / PHOTOGRAPHS / LAST).stat().st_mtime_ns == trained_at
 
 
 def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
