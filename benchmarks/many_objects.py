@@ -13,7 +13,8 @@ pip download --no-deps -d packages robosuite pybullet
 python -m benchmarks.many_objects make --data DATA --packages packages --out OBJECTS
 python -m benchmarks.many_objects score efficientnet_lite0 RUNS/hardened --objects OBJECTS
 
-DATA has meshes/ and hdri/. docs/results.md has the commands of the training.
+RUNS/hardened/0,RUNS/hardened/1 is one column with the mean over two seeds. DATA
+has meshes/ and hdri/. docs/results.md has the commands of the training.
 """
 
 import argparse
@@ -29,7 +30,6 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.stats import bootstrap
 
 from augment.classifiers import Classifier
 from augment.photographs.projected_light import relight_photographs
@@ -39,6 +39,7 @@ from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
+from train.settings import MAX_IMAGES
 
 TEST = "test"
 SAME = "objects trained on"
@@ -345,39 +346,46 @@ def interpolate(original: Classifier, trained: Classifier, factor: float) -> Cla
     return result
 
 
-def load_networks(options: argparse.Namespace) -> dict[str, Classifier]:
+def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
     """Load the networks of the command line, and those that are derived from them.
 
     Args:
         options: Parsed command line.
 
     Returns:
-        Networks by the titles of their columns. The original network is the
-        first, and the second is the same with normalized light.
+        Networks of all seeds by the titles of their columns. The original
+        network is the first, and the second is the same with normalized light.
     """
-    first, *runs = options.networks
+    first, *words = options.networks
     original = load(first, options.network_size)
-    networks = {first: original, "normalized light": original.normalizing_light()}
-    for run in runs:
-        trained = load(run, options.network_size)
-        networks[Path(run).name] = trained
+    networks = {first: [original], "normalized light": [original.normalizing_light()]}
+    for word in words:
+        folders = word.split(",")
+        # The last part of the path of each seed is its number.
+        path = Path(folders[0])
+        title = path.name if len(folders) == 1 else path.parent.name
+        seeds = [load(folder, options.network_size) for folder in folders]
+        networks[title] = seeds
         for factor in options.interpolate:
-            between = interpolate(original, trained, factor)
-            networks[f"{Path(run).name} × {factor:g}"] = between
+            between = [interpolate(original, trained, factor) for trained in seeds]
+            networks[f"{title} × {factor:g}"] = between
     return networks
 
 
 def mean_with_interval(values: np.ndarray, setups: np.ndarray) -> Estimate:
-    """Return the mean of values with its 95% bootstrap interval over setups.
+    """Return the mean of values with its 95% bootstrap interval over setups and seeds.
 
     Args:
-        values: Value of each image, shape (N,).
+        values: Value of each image, shape (N,), or for several seeds (S, N).
         setups: Number of the setup of each image, shape (N,).
     """
-    means = np.array([values[setups == number].mean() for number in np.unique(setups)])
+    by_seed = np.atleast_2d(values)
+    means = np.stack([by_seed[:, setups == number].mean(1) for number in np.unique(setups)])
+    setup_count, seed_count = means.shape
     rng = np.random.default_rng(0)
-    drawn = bootstrap((means,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng)
-    low, high = drawn.confidence_interval
+    rows = rng.integers(setup_count, size=(RESAMPLES, setup_count, 1))
+    columns = rng.integers(seed_count, size=(RESAMPLES, 1, seed_count))
+    low, high = np.quantile(means[rows, columns].mean((1, 2)), [0.025, 0.975])
     return Estimate(float(means.mean()), float(low), float(high))
 
 
@@ -386,8 +394,8 @@ def compare(hits: Mapping[str, np.ndarray], setups: np.ndarray) -> list[str]:
 
     Args:
         hits: 1 for each image that a network is right about, otherwise 0, shape
-            (N,), by the name of the network. The gain is that over the first
-            network.
+            (S, N) with S seeds, by the name of the network. The gain is that
+            over the first network, which has one seed.
         setups: Number of the setup of each image, shape (N,).
     """
     first, *others = hits.values()
@@ -406,19 +414,51 @@ def score(options: argparse.Namespace) -> None:
     """
     networks = load_networks(options)
     rows = []
+    # Hits and setups of each group, by the kind of light.
+    by_light: dict[str, list[tuple[dict[str, np.ndarray], np.ndarray]]] = {}
     for part in find_renders(options.objects / options.split):
-        labels = np.array(part.labels)
         images = read_images(part.paths, options.network_size)
-        hits = {
-            name: (predict(network, images) == labels).astype(float)
-            for name, network in networks.items()
-        }
-        rows.append([part.group, part.light, len(labels), *compare(hits, part.setups)])
-    title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups"
+        hits = find_hits(networks, images, part.labels)
+        rows.append([part.group, part.light, len(part.labels), *compare(hits, part.setups)])
+        by_light.setdefault(part.light, []).append((hits, part.setups))
+    for light, parts in by_light.items():
+        pooled_hits = {}
+        for name in networks:
+            pooled_hits[name] = np.concatenate([hits[name] for hits, _ in parts], axis=1)
+        # The groups have setups of their own, which get numbers of their own.
+        setups = np.concatenate([numbers + MAX_IMAGES * i for i, (_, numbers) in enumerate(parts)])
+        rows.append(["all", light, len(setups), *compare(pooled_hits, setups)])
+    title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups and seeds"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:
         paths = sorted(options.photographs.iterdir())
-        print(photograph_table(networks, paths, options.network_size))
+        each_seed = {}
+        for name, seeds in networks.items():
+            for number, network in enumerate(seeds):
+                each_seed[f"{name}/{number}" if len(seeds) > 1 else name] = network
+        print(photograph_table(each_seed, paths, options.network_size))
+
+
+def find_hits(
+    networks: Mapping[str, Sequence[Classifier]], images: torch.Tensor, labels: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Find the images that networks are right about.
+
+    Args:
+        networks: Networks of all seeds by their names.
+        images: Images, uint8, shape (N, 3, size, size).
+        labels: Class of each image.
+
+    Returns:
+        1 for each image with the right class, otherwise 0, shape (S, N) with S
+        seeds, by the names of the networks.
+    """
+    wanted = np.array(labels)
+    hits = {}
+    for name, seeds in networks.items():
+        right = [predict(network, images) == wanted for network in seeds]
+        hits[name] = np.stack(right).astype(float)
+    return hits
 
 
 def photograph_table(networks: Mapping[str, Classifier], paths: Sequence[Path], size: int) -> Table:

@@ -5,8 +5,9 @@ The name of each photograph begins with the index of its class, such as
 
     python -m benchmarks.relit_photographs FOLDER efficientnet_lite0 run:runs/relit
 
-It prints a Markdown table. Differences are from the first network, with 95%
-intervals of a bootstrap over photographs.
+A row of the table is a network, or the mean over the seeds of a training, whose
+networks are separated by commas. Differences are from the first row, with 95%
+intervals of a bootstrap over photographs and seeds.
 """
 
 import argparse
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Score each network, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of photographs")
-    parser.add_argument("networks", nargs="+", help="names of classifiers, the original first")
+    parser.add_argument("networks", nargs="+", help="the original, and NETWORK or NETWORK,NETWORK")
     parser.add_argument("--every", type=int, default=10, help="classes whose index it divides")
     parser.add_argument("--slides", type=int, default=4, help="random slides of each photograph")
     parser.add_argument("--passes", type=int, default=11, help="passes of each search")
@@ -42,14 +43,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     original = options.networks[0]
     first: dict[str, Tensor] = {}
-    for name in options.networks:
-        columns = load_or_score(name, original, options)
+    for row in options.networks:
+        seeds = [load_or_score(name, original, options) for name in row.split(",")]
+        columns = {title: torch.stack([seed[title] for seed in seeds]) for title in seeds[0]}
         if not first:
             first = columns
             print(f"|network|{'|'.join(columns)}|")
             print("|-" * (1 + len(columns)) + "|")
         cells = [cell(column, first[title]) for title, column in columns.items()]
-        print(f"|{name}|{'|'.join(cells)}|", flush=True)
+        print(f"|{row}|{'|'.join(cells)}|", flush=True)
 
 
 def load_or_score(name: str, original: str, options: argparse.Namespace) -> dict[str, Tensor]:
@@ -152,25 +154,40 @@ def predict(classifier: Classifier, photographs: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
-def cell(column: Tensor, first: Tensor) -> str:
-    """Write a mean, and its difference from the first network with an interval.
+def cell(columns: Tensor, first: Tensor) -> str:
+    """Write a mean, and its difference from the first row with an interval.
 
     Args:
-        column: Numbers of the photographs, shape (N,).
-        first: Numbers of the first network, shape (N,).
+        columns: Numbers of the photographs for each seed, shape (S, N).
+        first: Numbers of the first row, shape (1, N).
 
     Returns:
         Text such as "0.710, +0.050 [0.010, 0.090]".
     """
-    text = f"{column.mean():.3f}"
-    difference = column - first
+    text = f"{columns.mean():.3f}"
+    difference = columns - first
     if not difference.any():
         return text
-    draws = torch.Generator().manual_seed(0)
-    rows = torch.randint(len(column), (DRAWS, len(column)), generator=draws)
-    means = difference[rows].mean(1)
-    low, high = means.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    low, high = interval(difference)
     return f"{text}, {difference.mean():+.3f} [{low:.3f}, {high:.3f}]"
+
+
+def interval(values: Tensor) -> tuple[float, float]:
+    """Return the 95% interval of a mean, by a bootstrap over photographs and seeds.
+
+    Args:
+        values: Numbers of the photographs for each seed, shape (S, N).
+    """
+    draws = torch.Generator().manual_seed(0)
+    seed_count, count = values.shape
+    means = []
+    for _ in range(DRAWS):
+        seeds = torch.randint(seed_count, (seed_count,), generator=draws)
+        rows = torch.randint(count, (count,), generator=draws)
+        means.append(values[seeds][:, rows].mean())
+    ends = torch.tensor([0.025, 0.975], dtype=torch.float64)
+    low, high = torch.stack(means).quantile(ends).tolist()
+    return low, high
 
 
 if __name__ == "__main__":

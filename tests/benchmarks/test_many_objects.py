@@ -86,6 +86,13 @@ def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
     assert alone.high - alone.low == pytest.approx(2 * error, rel=0.15)
 
 
+def test_the_interval_of_one_image_is_that_over_seeds():
+    # The mean of two seeds that are drawn anew is 0, 0.5 or 1, with 1/4, 1/2 and 1/4.
+    values = np.array([[0.0] * 9, [1.0] * 9])
+    found = many_objects.mean_with_interval(values, np.arange(9))
+    assert (found.low, found.value, found.high) == (0.0, 0.5, 1.0)
+
+
 def test_weights_between_two_networks_of_one_layer_give_logits_between():
     networks = []
     for seed in (0, 1):
