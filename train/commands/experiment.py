@@ -116,9 +116,15 @@ def _train_on_photographs(
     else:
         # The folder of the run has no settings yet, which a short command could read.
         _train_in(first, on_photographs, command, shlex.split(command), folder)
-    begun = replace(settings.train, init_from=str(first))
-    own = {"weights": None, "classes": None, "normalization": None}
-    return replace(settings, photographs_first=False, train=begun, **own)
+    return replace(
+        settings,
+        photographs_first=False,
+        train=replace(settings.train, init_from=str(first)),
+        # The first network has these.
+        weights=None,
+        classes=None,
+        normalization=None,
+    )
 
 
 def _train_in(
