@@ -98,7 +98,7 @@ class ByHand:
     the library, equal pixels are multiplied once if most pixels are equal.
 
     Args:
-        operator: Operator of P covered pixels from the light to the image. U of
+        operator: Operator of P covered pixels from the light to the image. D of
             them are multiplied.
         background: Gray value in [0, 1].
 
@@ -108,12 +108,12 @@ class ByHand:
             (3, P).
         coefficients: Indices of the K coefficients that reach the surface,
             shape (K,).
-        source: For each channel and covered pixel, the index of the equal pixel
-            that is multiplied, shape (3, P). None if all pixels are multiplied.
-        transfer: Transfer matrix of the multiplied pixels, shape (K, U).
-        albedo: Albedo of the multiplied pixels, shape (3, U).
+        distinct: Distinct pixels and their copies, as indices in the image.
+            None if all pixels are multiplied.
+        transfer: Transfer matrix of the multiplied pixels, shape (K, D).
+        albedo: Albedo of the multiplied pixels, shape (3, D).
         background_part: What the background contributes to the multiplied
-            pixels, shape (U,).
+            pixels, shape (D,).
         empty_image: Image of the background alone, shape (3, size²).
     """
 
@@ -122,18 +122,15 @@ class ByHand:
         self.shape = (3, size, size)
         self.pixels = operator.pixels.expand(3, -1)
         self.coefficients = operator.nonzero
-        self.source = None
-        self.transfer = operator.transfer[0]
+        self.distinct = None
+        self.transfer = operator.distinct_transfer[0]
         self.albedo = operator.albedo
         self.background_part = (1 - operator.coverage) * background
         self.empty_image = operator.coverage.new_full((3, size**2), background)
         if operator.distinct is not None:
-            self.source = operator.distinct.pixel_to_group.expand(3, -1)
-            self.transfer = self.transfer.index_select(1, operator.distinct.first_pixel)
-            self.albedo = self.albedo.index_select(1, operator.distinct.first_pixel)
-            self.background_part = self.background_part.index_select(
-                0, operator.distinct.first_pixel
-            )
+            self.distinct = operator.distinct.at(operator.pixels)
+            self.albedo = self.albedo[:, operator.distinct.distinct]
+            self.background_part = self.background_part[operator.distinct.distinct]
 
     def step(self, light: Tensor, loss: Loss) -> tuple[Tensor, Tensor]:
         """Render a light, and compute the gradient of the loss by the light.
@@ -151,13 +148,17 @@ class ByHand:
         clamped = values.clamp(0, 1)
         # Operations in place reuse the memory of the values.
         is_unclamped = values.eq_(clamped)
-        shown = clamped if self.source is None else clamped.gather(1, self.source)
-        image = self.empty_image.clone().scatter_(1, self.pixels, shown)
+        image = self.empty_image.clone()
+        if self.distinct is None:
+            image.scatter_(1, self.pixels, clamped)
+        else:
+            self.distinct.write(clamped, image)
         image = image.view(self.shape)
-        image_gradient = loss.gradient(image).reshape(3, -1).gather(1, self.pixels)
-        if self.source is not None:
-            sums = torch.zeros_like(clamped)
-            image_gradient = sums.scatter_add_(1, self.source, image_gradient)
+        image_gradient = loss.gradient(image).reshape(3, -1)
+        if self.distinct is None:
+            image_gradient = image_gradient.gather(1, self.pixels)
+        else:
+            image_gradient = self.distinct.add_up(image_gradient)
         irradiance_gradient = image_gradient.mul_(is_unclamped).mul_(self.albedo)
         reaching_gradient = torch.nn.functional.linear(irradiance_gradient, self.transfer)
         gradient = torch.zeros_like(light)

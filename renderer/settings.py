@@ -17,7 +17,7 @@ import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, Field, dataclass, field, fields
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from renderer.errors import (
@@ -85,8 +85,9 @@ class Facts:
     may_be_empty: bool = False
     checks_type: bool = True
 
+    @cached_property
     def limits(self) -> list[Limit]:
-        """List the limits of the field's range that are set, at most four."""
+        """Limits of the field's range that are set, at most four."""
         ends = (
             Limit("at least", "≥", operator.ge, self.minimum),
             Limit("above", ">", operator.gt, self.above),
@@ -313,13 +314,13 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     if facts.is_pair:
         _check_pair(name, value, facts)
         return
-    if not facts.choices and not facts.limits():
+    if not facts.choices and not facts.limits:
         return
     items = value if isinstance(value, list | tuple) else [value]
     for item in items:
         if facts.choices:
             require_choice(name, item, facts.choices)
-        _check_range(name, item, facts.limits())
+        _check_range(name, item, facts.limits)
 
 
 def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:

@@ -130,7 +130,7 @@ def _format_value(value: Any) -> str:
 def format_facts(kind: type, name: str) -> str:
     """Format the explanation, the choices, the unit and the range of a field."""
     facts = facts_of(kind, name)
-    limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits()]
+    limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
     given = "; ".join(note for note in notes if note)
     return f"{facts.about} [{given}]" if given else facts.about

@@ -71,7 +71,7 @@ class TransferOperators(Sequence[TransferOperator]):
         first = self._operators[0]
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
-            if not is_same or operator.transfer.dtype != first.transfer.dtype:
+            if not is_same or operator.distinct_transfer.dtype != first.distinct_transfer.dtype:
                 raise InputError(
                     "operators differ in image settings, basis of light or dtype: compute all "
                     "operators with the same settings, basis and dtype"
@@ -209,7 +209,7 @@ class TransferOperators(Sequence[TransferOperator]):
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
         """All operators in stacks of at most `_operators_per_stack`, on their device."""
-        device = self._operators[0].transfer.device
+        device = self._operators[0].distinct_transfer.device
         stacks = []
         for start in range(0, len(self), self._operators_per_stack):
             operators = self._operators[start : start + self._operators_per_stack]
@@ -254,7 +254,7 @@ class TransferOperators(Sequence[TransferOperator]):
         encoding = self._operators[0].settings.encoding
         # One light for each of N images, all images of the first view first,
         # shape (N, coefficients, 3).
-        lights = view_lights.flatten(0, -3).to(self._operators[0].transfer.dtype)
+        lights = view_lights.flatten(0, -3).to(self._operators[0].distinct_transfer.dtype)
         lights_per_view = len(lights) // len(self)
         # Shape (1, 3, size²) for one background, or (N, 3, size²).
         backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
@@ -399,8 +399,8 @@ class OperatorStack:
         # Padding appends the coefficient 0 if their number is odd. The row of this
         # coefficient in `transfer` stays zero.
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
-        channel_count = max(len(operator.transfer) for operator in operators)
-        like = operators[0].transfer
+        channel_count = max(len(operator.distinct_transfer) for operator in operators)
+        like = operators[0].distinct_transfer
         shape = (len(operators), channel_count, len(coefficients), len(pixels))
         transfer = like.new_zeros(shape)
         albedo = like.new_ones(len(operators), COLORS, len(pixels))
@@ -412,7 +412,7 @@ class OperatorStack:
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
             if channel_count < COLORS:
-                channels = transfer[index][: len(operator.transfer)]
+                channels = transfer[index][: len(operator.distinct_transfer)]
                 channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:

@@ -8,8 +8,9 @@ gloss (`renderer.shading.gloss`), and shadows and bounces (the package
 `renderer.transport`).
 
 Shapes use these letters: a view has S covered samples in P pixels, which show G
-faces of the mesh. K coefficients of the light reach a pixel. The dots (...) are
-any axes of a batch of lights.
+faces of the mesh. D of the pixels are distinct, and the others are copies of
+them (`renderer.transport.distinct_pixels`). K coefficients of the light reach a
+pixel. The dots (...) are any axes of a batch of lights.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import torch
 from scipy.sparse import csr_array
 from torch import Tensor
@@ -36,6 +36,11 @@ from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, L
 from renderer.settings import ImageSettings
 from renderer.shading.gloss import Gloss, SampleGloss, at_samples
 from renderer.surface.albedo import shared_albedo, surface_albedo
+from renderer.transport.distinct_pixels import (
+    DistinctPixels,
+    find_distinct_pixels,
+    indices_of_true,
+)
 from renderer.transport.lamp_paths import SparseTransfer, concatenate_entries, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface
@@ -46,8 +51,8 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Names of the tensors of a `TransferOperator`, which `TransferOperator.to` moves.
-TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")
+# Names of the tensors that `TransferOperator.to` moves.
+TENSORS = ("albedo", "coverage", "pixels", "nonzero")
 # Number of pixels that `_box_filter` processes at once. The sums of so many pixels stay
 # in the cache of the processor.
 BLOCK = 2**12
@@ -56,9 +61,6 @@ BLOCK = 2**12
 GLOSSY = 2**20
 # Number of color channels.
 COLORS = 3
-# An operator computes equal pixels only once if this saves at least so many pixels. With
-# fewer pixels, copying the results would take more time than it saves.
-FEWEST_SAVED_PIXELS = 2**12
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,13 @@ class TransferOperator:
     have the same dtype.
 
     Attributes:
-        transfer: Radiance per unit of each of K coefficients, in C channels,
-            shape (C, K, P). C = 3 is one channel for each color. C = 1 is one
-            channel that all colors share. It takes a third of the memory and
-            the time, but is only possible if no pixel mixes albedos (one sample
-            per pixel, or a mesh of one color). C = 2 is a shared channel, and a
-            channel of specular reflection that is added to all colors.
+        distinct_transfer: Radiance of the D distinct pixels per unit of each of K
+            coefficients, in C channels, shape (C, K, D). C = 3 is one channel for
+            each color. C = 1 is one channel that all colors share. It takes a
+            third of the memory and the time, but is only possible if no pixel
+            mixes albedos (one sample per pixel, or a mesh of one color). C = 2
+            is a shared channel, and a channel of specular reflection that is
+            added to all colors.
         albedo: Factor of each color for the shared channel, shape (3, P). Ones
             if C = 3.
         coverage: Fraction of the samples of each pixel that show the mesh, in
@@ -90,8 +93,10 @@ class TransferOperator:
         sparse: Nonzero entries of further rows of the matrix, in three channels.
             These are rows of projected patterns, which are mostly zero. None
             without such rows.
-        distinct: Groups of equal pixels. The products are computed once for each
-            group. None if most pixels differ.
+        distinct: The D covered pixels that differ from each other, and their
+            copies. Products are computed for the distinct pixels alone. None if
+            most pixels differ. All pixels are then treated as distinct, and
+            D = P.
 
     Example:
         >>> import torch
@@ -104,7 +109,7 @@ class TransferOperator:
         True
     """
 
-    transfer: Float[Tensor, "channels K P"]
+    distinct_transfer: Float[Tensor, "channels K D"]
     albedo: Float[Tensor, "3 P"]
     coverage: Float[Tensor, " P"]
     pixels: Int[Tensor, " P"]
@@ -256,9 +261,9 @@ class TransferOperator:
                 f"radiance_gradient has shape {given}, but the operator needs (..., 3, P) for its "
                 f"P = {expected[1]} covered pixels: give a gradient of this shape"
             )
-        if self._compact is None:
-            return self._light_gradient(radiance_gradient)
-        return self._compact._light_gradient(self._sum_equal_pixels(radiance_gradient))
+        if self.distinct is not None:
+            radiance_gradient = self.distinct.add_up(radiance_gradient)
+        return self._light_gradient(radiance_gradient)
 
     def _images(
         self, lights: Tensor, background: _PreparedBackground
@@ -273,30 +278,29 @@ class TransferOperator:
             A tuple of
 
             - the images in [0, 1], shape (..., 3, size, size);
-            - 1 for values of pixels that clamping did not change, and 0 for other
-              values, shape (..., 3, U). U is the number of groups of equal pixels
-              (`distinct`), or P without such groups;
-            - the clamped linear values of these pixels, shape (..., 3, U).
+            - 1 for values that clamping did not change, and 0 for other values, for
+              the D distinct pixels, shape (..., 3, D);
+            - the clamped linear values of the distinct pixels, shape (..., 3, D).
         """
-        operator = self._compact or self
-        unclamped = operator._radiance(lights).add_(background.term)
+        unclamped = self._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
         # Values at the limits 0 and 1 have a gradient, as in `renderer.image.clamp`.
         is_unclamped = unclamped.eq_(clamped)
-        pixel_index = self._pixels_by_color
+        encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
         canvas = background.images
+        pixel_index = self._pixels_by_color
         image_shape: tuple[int, ...] = self._image_shape
         if lights.ndim > 2:
             batch_shape = lights.shape[:-2]
-            pixel_index = pixel_index.expand(*batch_shape, -1, -1)
             canvas = canvas.expand(*batch_shape, -1, -1)
+            pixel_index = pixel_index.expand(*batch_shape, -1, -1)
             image_shape = (*batch_shape, *image_shape)
         images = canvas.clone(memory_format=torch.contiguous_format)
-        encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
-        if self._compact is not None:
-            encoded = self._copy_to_equal_pixels(encoded)
-        # On a CPU, scatter_ takes half the time of index_copy_.
-        images.scatter_(-1, pixel_index, encoded)
+        if self._distinct_in_image is not None:
+            self._distinct_in_image.write(encoded, images)
+        else:
+            # On a CPU, scatter_ takes half the time of index_copy_.
+            images.scatter_(-1, pixel_index, encoded)
         return images.view(image_shape), is_unclamped, clamped
 
     def _gradient_of_images(
@@ -306,24 +310,24 @@ class TransferOperator:
 
         Args:
             image_gradient: Gradient by the images, shape (..., 3, size, size).
-            is_unclamped: Second result of `_images`, shape (..., 3, U).
-            clamped: Third result of `_images`, shape (..., 3, U).
+            is_unclamped: Second result of `_images`, shape (..., 3, D).
+            clamped: Third result of `_images`, shape (..., 3, D).
 
         Returns:
             Gradient by the lights, shape (..., coefficients, 3).
         """
-        pixel_index = self._pixels_by_color
-        if is_unclamped.ndim > 2:
-            pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
-        # gather is faster than index_select, most of all for tensors with three axes.
-        pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
-        operator = self
-        if self._compact is not None:
-            operator = self._compact
-            pixel_gradient = self._sum_equal_pixels(pixel_gradient)
+        flat_gradient = image_gradient.flatten(-2)
+        if self._distinct_in_image is not None:
+            pixel_gradient = self._distinct_in_image.add_up(flat_gradient)
+        else:
+            pixel_index = self._pixels_by_color
+            if is_unclamped.ndim > 2:
+                pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
+            # gather is faster than index_select, most of all for tensors with three axes.
+            pixel_gradient = flat_gradient.gather(-1, pixel_index)
         if not self._is_linear:
             pixel_gradient = encode_gradient(clamped, pixel_gradient, self.settings.encoding)
-        gradient = operator._light_gradient(pixel_gradient.mul_(is_unclamped))
+        gradient = self._light_gradient(pixel_gradient.mul_(is_unclamped))
         # The few numbers of the result are checked first, which is fast. If one is not
         # finite, `require_bounded` checks all pixels and raises the error.
         if not math.isfinite(gradient.sum().item()):
@@ -354,27 +358,27 @@ class TransferOperator:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
-        """Compute `radiance` without autograd and without checks.
+        """Compute the radiance of the D distinct pixels, without autograd and without checks.
 
         Args:
             lights: Coefficients, shape (..., coefficients, 3).
 
         Returns:
             Radiance times coverage, in a new tensor with the dtype of the lights,
-            shape (..., 3, P).
+            shape (..., 3, D).
         """
-        dtype = self.transfer.dtype
+        dtype = self.distinct_transfer.dtype
         # The K coefficients that have columns in the matrix, shape (..., K, 3).
         used_lights = lights.index_select(-2, self.nonzero)
         # In small images, even a call of `to` that converts nothing takes notable time.
         if lights.dtype != dtype:
             used_lights = used_lights.to(dtype)
         if self._shared is not None:
-            radiance = (used_lights.mT @ self._shared).mul_(self.albedo)
+            radiance = (used_lights.mT @ self._shared).mul_(self._distinct_albedo)
             if self._white is not None:
                 radiance.add_(used_lights.mT @ self._white)
         else:
-            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
+            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.distinct_transfer)
         if self.sparse is not None:
             # Contribution of each entry to its pixel, shape (..., entries, 3).
             light_of_entry = lights.to(radiance.dtype).index_select(-2, self.sparse.function)
@@ -383,25 +387,25 @@ class TransferOperator:
         return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
     def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """Compute `light_gradient` without checks.
+        """Convert the gradient by the radiance of the D distinct pixels, without checks.
 
         Args:
-            radiance_gradient: Gradient by the radiance, shape (..., 3, P).
+            radiance_gradient: Gradient by the radiance, shape (..., 3, D).
 
         Returns:
             Gradient by the lights, shape (..., coefficients, 3).
         """
         upstream = radiance_gradient
-        dtype = self.transfer.dtype
+        dtype = self.distinct_transfer.dtype
         if upstream.dtype != dtype:
             upstream = upstream.to(dtype)
         # Gradient by the K used coefficients, shape (..., 3, K). `linear(a, b)` is a bᵀ.
         if self._shared is not None:
-            used_gradient = linear(upstream * self.albedo, self._shared)
+            used_gradient = linear(upstream * self._distinct_albedo, self._shared)
             if self._white is not None:
                 used_gradient = used_gradient + linear(upstream, self._white)
         else:
-            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
+            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.distinct_transfer)
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
             # Contribution of each entry to its coefficient, shape (..., entries, 3).
@@ -411,33 +415,6 @@ class TransferOperator:
         return (
             gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
         )
-
-    def _copy_to_equal_pixels(self, values: Tensor) -> Tensor:
-        """Copy the values of each group of equal pixels to all pixels of the group.
-
-        Args:
-            values: Values of the U groups, shape (..., U).
-
-        Returns:
-            Values of the P covered pixels, shape (..., P).
-        """
-        assert self.distinct is not None
-        pixel_to_group = self.distinct.pixel_to_group.expand(*values.shape[:-1], -1)
-        return values.gather(-1, pixel_to_group)
-
-    def _sum_equal_pixels(self, values: Tensor) -> Tensor:
-        """Add up the values of the pixels of each group of equal pixels.
-
-        Args:
-            values: Values of the P covered pixels, shape (..., P).
-
-        Returns:
-            Sums of the U groups, shape (..., U).
-        """
-        assert self.distinct is not None
-        sums = values.new_zeros(*values.shape[:-1], len(self.distinct.first_pixel))
-        pixel_to_group = self.distinct.pixel_to_group.expand(values.shape)
-        return sums.scatter_add_(-1, pixel_to_group, values)
 
     def _prepare_background(
         self, background: float | Tensor, lights: Tensor
@@ -475,15 +452,14 @@ class TransferOperator:
         Returns:
             Background images, and linear values to add to the radiance.
         """
-        operator = self._compact or self
         flat_images = images.flatten(-2)
-        at_pixels = flat_images.index_select(-1, operator.pixels)
+        at_pixels = flat_images.index_select(-1, self._select_distinct(self.pixels))
         if self.settings.encoding != "linear":
             # The last bit of a power depends on the position of a number in memory. To
             # get the same bits as `composite`, the background is repeated for each
             # light before it is decoded.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
-        coverage = operator.coverage.to(images)[None]
+        coverage = self._select_distinct(self.coverage).to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
         return _PreparedBackground(images=flat_images, term=term)
 
@@ -497,49 +473,72 @@ class TransferOperator:
             InputError: If there is no such device.
         """
         device = as_device(device)
-        if device == self.transfer.device:
+        if device == self.distinct_transfer.device:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
         # On a GPU, the gradients of equal pixels would be added up in another order in
-        # each run, so equal pixels are not grouped.
-        return replace(self, **tensors, sparse=sparse, distinct=None)
+        # each run, so the copy treats all pixels as distinct.
+        transfer = self.transfer.to(device)
+        return replace(self, distinct_transfer=transfer, **tensors, sparse=sparse, distinct=None)
+
+    @cached_property
+    def transfer(self) -> Tensor:
+        """Transfer of all covered pixels, shape (C, K, P).
+
+        If pixels are equal, the transfer of the distinct pixels is copied to all
+        pixels when this property is first read.
+        """
+        if self.distinct is None:
+            return self.distinct_transfer
+        shape = (*self.distinct_transfer.shape[:-1], len(self.pixels))
+        empty = self.distinct_transfer.new_empty(shape)
+        return self.distinct.write(self.distinct_transfer, empty)
 
     @property
     def by_channel(self) -> Tensor:
         """Transfer in three channels, which include the albedo, shape (3, K, P)."""
         if self._shared is None:
             return self.transfer
-        colored = self._shared * self.albedo[:, None]
-        return colored if self._white is None else colored + self._white
+        shared, *white = self.transfer
+        colored = shared * self.albedo[:, None]
+        return colored + white[0] if white else colored
 
     # These properties are cached, because in images of 32² pixels even an indexing
     # operation or a comparison of dtypes takes notable time.
 
     @cached_property
     def _shared(self) -> Tensor | None:
-        """Channel of `transfer` that all colors share, shape (K, P), or None."""
-        return self.transfer[0] if len(self.transfer) < COLORS else None
+        """Channel of `distinct_transfer` that all colors share, shape (K, D), or None."""
+        return self.distinct_transfer[0] if len(self.distinct_transfer) < COLORS else None
 
     @cached_property
     def _white(self) -> Tensor | None:
-        """Channel of specular reflection that is added to all colors, shape (K, P), or None."""
-        return self.transfer[1] if len(self.transfer) == 2 else None
+        """Channel of specular reflection that is added to all colors, shape (K, D), or None."""
+        return self.distinct_transfer[1] if len(self.distinct_transfer) == 2 else None
 
     @cached_property
-    def _compact(self) -> TransferOperator | None:
-        """Operator with one pixel for each group of equal pixels, or None without groups."""
+    def _distinct_albedo(self) -> Tensor:
+        """Albedo of the distinct pixels, shape (3, D)."""
+        return self._select_distinct(self.albedo)
+
+    @cached_property
+    def _distinct_in_image(self) -> DistinctPixels | None:
+        """The same as `distinct`, with row-major indices in the image."""
+        return None if self.distinct is None else self.distinct.at(self.pixels)
+
+    def _select_distinct(self, values: Tensor) -> Tensor:
+        """Select the values of the D distinct pixels from those of the P covered pixels.
+
+        Args:
+            values: Values of the covered pixels, shape (..., P).
+
+        Returns:
+            Values of the distinct pixels, shape (..., D).
+        """
         if self.distinct is None:
-            return None
-        first_pixel = self.distinct.first_pixel
-        return replace(
-            self,
-            transfer=self.transfer.index_select(-1, first_pixel),
-            albedo=self.albedo.index_select(-1, first_pixel),
-            coverage=self.coverage.index_select(0, first_pixel),
-            pixels=self.pixels.index_select(0, first_pixel),
-            distinct=None,
-        )
+            return values
+        return values.index_select(-1, self.distinct.distinct)
 
     @cached_property
     def _background_cache(self) -> dict[str, Any]:
@@ -573,22 +572,7 @@ class TransferOperator:
         The product with the K used coefficients has exact zeros in all other
         places. The shape is (coefficients, K).
         """
-        return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
-
-
-class DistinctPixels(NamedTuple):
-    """Groups of the P covered pixels of an operator whose pixels are equal.
-
-    Equal pixels have the same transfer, albedo and coverage. There are U groups.
-
-    Attributes:
-        first_pixel: Index of the first covered pixel of each group, ascending,
-            shape (U,).
-        pixel_to_group: Index of the group of each covered pixel, shape (P,).
-    """
-
-    first_pixel: Int[Tensor, " U"]
-    pixel_to_group: Int[Tensor, " P"]
+        return torch.eye(self.basis.size).to(self.distinct_transfer)[:, self.nonzero]
 
 
 class _PreparedBackground(NamedTuple):
@@ -596,9 +580,8 @@ class _PreparedBackground(NamedTuple):
 
     Attributes:
         images: Background images, shape (..., 3, size²).
-        term: Linear values to add to the radiance of U pixels, shape
-            (..., 3, U). U is the number of groups of equal pixels, or P without
-            such groups.
+        term: Linear values to add to the radiance of the D distinct pixels,
+            shape (..., 3, D).
     """
 
     images: Tensor
@@ -621,9 +604,11 @@ class _Radiance(torch.autograd.Function):
             Radiance times coverage, shape (..., 3, P).
         """
         ctx.operator = operator
-        if operator._compact is None:
-            return operator._radiance(lights)
-        return operator._copy_to_equal_pixels(operator._compact._radiance(lights))
+        radiance = operator._radiance(lights)
+        if operator.distinct is None:
+            return radiance
+        all_radiance = radiance.new_empty(*radiance.shape[:-1], len(operator.pixels))
+        return operator.distinct.write(radiance, all_radiance)
 
     @staticmethod
     @once_differentiable
@@ -871,6 +856,10 @@ class _OperatorBuilder:
         """
         surface = Surface(self.mesh, fragments, self.settings, given_gloss=self.gloss)
         channels = self._channels(surface)
+        albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
+        distinct = None
+        if self._is_uniform_on_faces(surface, channels):
+            distinct = find_distinct_pixels(fragments, albedo)
         # Rows of the matrix as dense tensors, and as lists of nonzero entries.
         dense = []
         sparse = []
@@ -881,14 +870,12 @@ class _OperatorBuilder:
             else:
                 dense.append(self._local_rows(part, entries, surface))
         if self.basis.environment is not None:
-            dense.append(self._environment_rows(self.basis.environment, surface, channels))
+            dense.append(
+                self._environment_rows(self.basis.environment, surface, channels, distinct)
+            )
         all_rows = self._concatenate(dense, channels.number, len(fragments.pixels))
-        albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
-        distinct = None
-        if self._is_uniform_on_faces(surface, channels):
-            distinct = _distinct_pixels(fragments, albedo)
         return TransferOperator(
-            transfer=all_rows.transfer,
+            distinct_transfer=all_rows.transfer,
             albedo=albedo,
             coverage=fragments.coverage.to(self.dtype),
             pixels=fragments.pixels,
@@ -974,7 +961,11 @@ class _OperatorBuilder:
         return surface_albedo(self.mesh, fragments, self.settings.encoding) * self.albedo_scale
 
     def _environment_rows(
-        self, part: EnvironmentPart, surface: Surface, channels: _Channels
+        self,
+        part: EnvironmentPart,
+        surface: Surface,
+        channels: _Channels,
+        distinct: DistinctPixels | None,
     ) -> _DenseRows:
         """Compute the rows of the coefficients of environment light, with shadows and bounces.
 
@@ -982,15 +973,16 @@ class _OperatorBuilder:
             part: Environment light of the basis.
             surface: Points, normals and gloss at the samples of the view.
             channels: Channels and albedo of the transfer.
+            distinct: Distinct pixels, or None.
 
         Returns:
-            Rows of the matrix.
+            Rows of the matrix, for the distinct pixels if `distinct` is given.
         """
         harmonics_basis = part.basis
         all_coefficients = torch.arange(harmonics_basis.size)
         if surface.gloss is None:
             weights = None if channels.is_shared else channels.sample_albedo
-            transfer = _box_filter(surface, weights, harmonics_basis, self.dtype)
+            transfer = _box_filter(surface, weights, harmonics_basis, self.dtype, distinct)
             coefficients = harmonics_basis.nonzero
         else:
             albedo = channels.sample_albedo
@@ -1105,7 +1097,11 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 
 def _box_filter(
-    surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype
+    surface: Surface,
+    albedo: Tensor | None,
+    basis: Harmonics,
+    dtype: torch.dtype,
+    distinct: DistinctPixels | None = None,
 ) -> Tensor:
     """Compute the transfer of a matte surface under an open sky.
 
@@ -1120,9 +1116,12 @@ def _box_filter(
             in a single channel.
         basis: SH basis, in which K functions change the irradiance.
         dtype: Data type of the result.
+        distinct: Distinct pixels, for flat normals and an albedo of 1. None
+            computes all pixels.
 
     Returns:
-        Radiance per unit of each of the K coefficients, shape (C, K, P).
+        Radiance per unit of each of the K coefficients, shape (C, K, P), or
+        (C, K, D) for D distinct pixels.
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
@@ -1131,7 +1130,7 @@ def _box_filter(
         # A_l Y_lm(n) of each seen face, shape (G, K).
         face_values = basis.irradiance(surface.face_planes)
         if albedo is None and _are_pixels_mostly_filled(fragments):
-            return _copy_from_faces(fragments, face_values, dtype)
+            return _copy_from_faces(fragments, face_values, dtype, distinct)
         # Each entry of a pixel's sum is a run of samples that show one face.
         entry_to_pixel, entry_to_face, weights = _run_weights(fragments, albedo)
     else:
@@ -1162,7 +1161,12 @@ def _are_pixels_mostly_filled(fragments: Fragments) -> bool:
     return 2 * int(is_filled.sum()) > len(fragments.pixels)
 
 
-def _copy_from_faces(fragments: Fragments, face_values: Tensor, dtype: torch.dtype) -> Tensor:
+def _copy_from_faces(
+    fragments: Fragments,
+    face_values: Tensor,
+    dtype: torch.dtype,
+    distinct: DistinctPixels | None,
+) -> Tensor:
     """Compute `_box_filter` for flat normals and an albedo of 1.
 
     A pixel that a single face fills has the transfer of this face, which is
@@ -1173,25 +1177,29 @@ def _copy_from_faces(fragments: Fragments, face_values: Tensor, dtype: torch.dty
         face_values: Transfer of each seen face, A_l Y_lm(n) for K functions,
             shape (G, K).
         dtype: Data type of the result.
+        distinct: The D distinct pixels. None computes all pixels.
 
     Returns:
-        Transfer, shape (1, K, P).
+        Transfer, shape (1, K, P) or (1, K, D).
     """
     run_to_pixel, run_to_face, sample_count = fragments.runs
     runs_per_pixel = torch.bincount(run_to_pixel, minlength=len(fragments.pixels))
     first_run = _row_starts(runs_per_pixel)[:-1]
+    if distinct is not None:
+        runs_per_pixel = runs_per_pixel.index_select(0, distinct.distinct)
+        first_run = first_run.index_select(0, distinct.distinct)
     # A value that is copied from one face may be -0.0, but a sum that starts at 0.0 is never
     # -0.0. Adding 0.0 turns -0.0 into 0.0, so that copies and sums have the same bits.
     values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
-    # First give each pixel the values of the face in its first run, shape (K, P).
+    # First give each pixel the values of the face in its first run, shape (K, pixels).
     transfer = values_by_function.index_select(1, run_to_face.index_select(0, first_run))
     # Then replace the pixels with several runs, or with uncovered samples.
     is_partial_run = sample_count < fragments.samples**2
-    partial_runs = _indices(is_partial_run)
+    partial_runs = indices_of_true(is_partial_run)
     partial_to_face = run_to_face.index_select(0, partial_runs)
     partial_sample_count = sample_count.index_select(0, partial_runs)
     partial_weights = partial_sample_count.double() / fragments.samples**2
-    partial_pixels = _indices(is_partial_run.index_select(0, first_run))
+    partial_pixels = indices_of_true(is_partial_run.index_select(0, first_run))
     entry_starts = _row_starts(runs_per_pixel.index_select(0, partial_pixels))
     for first in range(0, len(partial_pixels), BLOCK):
         block_starts = entry_starts[first : first + BLOCK + 1]
@@ -1202,63 +1210,6 @@ def _copy_from_faces(fragments: Fragments, face_values: Tensor, dtype: torch.dty
         block_pixels = partial_pixels[first : first + BLOCK].expand(len(transfer), -1)
         transfer.scatter_(1, block_pixels, sums.to(dtype).T.contiguous())
     return transfer[None]
-
-
-def _distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | None:
-    """Group the pixels that are filled by the same face and therefore are equal.
-
-    All samples of a face must have the same transfer.
-
-    Args:
-        fragments: Covered samples of a view, in P pixels.
-        albedo: Albedo of each pixel, shape (3, P).
-
-    Returns:
-        Groups of equal pixels. None if the groups would save too little time, or
-        if two pixels of a group differ in albedo.
-    """
-    pixel_count = len(fragments.pixels)
-    if pixel_count < FEWEST_SAVED_PIXELS:
-        return None
-    # Runs of samples of one face that fill a pixel.
-    filling_runs = _indices(fragments.runs.sample_count == fragments.samples**2)
-    filled_pixel = fragments.runs.run_to_pixel.index_select(0, filling_runs)
-    filling_face = fragments.runs.run_to_seen_face.index_select(0, filling_runs)
-    # First of the pixels that each face fills.
-    face_to_first_pixel = filling_face.new_full((len(fragments.faces),), pixel_count)
-    face_to_first_pixel.scatter_reduce_(0, filling_face, filled_pixel, "amin")
-    # First pixel of the group of each pixel. Other pixels are groups of their own.
-    all_pixels = torch.arange(pixel_count)
-    pixel_to_first_pixel = all_pixels.index_copy(
-        0, filled_pixel, face_to_first_pixel.index_select(0, filling_face)
-    )
-    is_first = pixel_to_first_pixel == all_pixels
-    first_pixel = _indices(is_first)
-    saved_count = pixel_count - len(first_pixel)
-    if saved_count < FEWEST_SAVED_PIXELS or 2 * saved_count < pixel_count:
-        return None
-    if not torch.equal(albedo, albedo.index_select(1, pixel_to_first_pixel)):
-        return None
-    # Number of the group that begins with each first pixel.
-    group_of_first_pixel = is_first.cumsum(0) - 1
-    return DistinctPixels(
-        first_pixel=first_pixel,
-        pixel_to_group=group_of_first_pixel.index_select(0, pixel_to_first_pixel),
-    )
-
-
-def _indices(mask: Tensor) -> Tensor:
-    """Return the indices of the entries of a mask that are true.
-
-    NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
-
-    Args:
-        mask: Mask, shape (N,).
-
-    Returns:
-        Ascending indices, int64.
-    """
-    return torch.from_numpy(np.flatnonzero(mask.numpy()))
 
 
 def _row_starts(counts: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from renderer.light.harmonics import nonzero_coefficients
 from renderer.light.projector import Projector
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.shading.gloss import Gloss
-from renderer.transport import lamp_paths
+from renderer.transport import distinct_pixels, lamp_paths
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.rasterizers import choose
 
@@ -134,10 +134,18 @@ def test_most_pixels_of_large_faces_are_multiplied_once():
     columns = operator.transfer[0].T
     distinct_columns = len(columns.unique(dim=0))
     mixed_count = int((operator.coverage < 1).sum())
-    assert distinct_columns <= len(operator.distinct.first_pixel) < len(operator.pixels) / 4
-    assert mixed_count < len(operator.distinct.first_pixel)
-    repeated = columns[operator.distinct.first_pixel][operator.distinct.pixel_to_group]
-    assert torch.equal(repeated, columns)
+    multiplied_count = operator.distinct_transfer.shape[-1]
+    assert distinct_columns <= multiplied_count < len(operator.pixels) / 4
+    assert mixed_count < multiplied_count
+
+
+def test_equal_pixels_change_no_transfer(monkeypatch):
+    operator = LAYOUTS["equal pixels"].operator()
+    monkeypatch.setattr(distinct_pixels, "FEWEST_COPIES", 10**9)
+    expected = LAYOUTS["equal pixels"].operator()
+    assert expected.distinct is None
+    assert torch.equal(operator.transfer, expected.transfer)
+    assert torch.equal(operator.by_channel, expected.by_channel)
 
 
 def test_pixels_of_one_face_with_several_colors_are_not_equal():
