@@ -9,7 +9,6 @@ from PIL import Image
 
 from renderer.io.images import read_square
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX
-from train.evaluation.scores.metrics import AreaUnderCurve
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.tables import Estimate, Table
 from train.report import comparison as compare
@@ -132,6 +131,7 @@ class Compared(NamedTuple):
         subjects: The same two networks in sentences.
         place: Where the images are from, to begin a sentence.
         change: What the second network differs by, such as "hardening".
+        trained_objects: Classes whose images show the objects of the training.
     """
 
     label: str
@@ -141,6 +141,7 @@ class Compared(NamedTuple):
     subjects: tuple[str, str]
     place: str
     change: str = "hardening"
+    trained_objects: Sequence[str] = ()
 
     def difference(self, name: str) -> compare.Difference | None:
         """Subtract a metric of the original network from that of the hardened network."""
@@ -220,24 +221,28 @@ def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> Fir
         numbers=numbers,
         rows=rows,
         names=compared.names,
-        images=describe_images(compared.label, compared.after[0].pools[compare.ALL].metrics.auc),
+        images=_describe_images(compared),
     )
 
 
-def describe_images(label: str, auc: AreaUnderCurve) -> str:
-    """Say how many images were scored, of how many objects.
+def _describe_images(compared: Compared) -> str:
+    """Say how many images were scored, of how many objects, and which objects were trained on.
 
     Args:
-        label: Classes under study in words.
-        auc: The area under the curve, with the numbers of images and objects.
+        compared: Evaluations of both networks on the same images.
 
     Returns:
-        A sentence.
+        One sentence, or two.
     """
-    return (
-        f"Scored on {auc.positives:,} images of {label} ({auc.positive_objects:,} objects) and "
-        f"{auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
+    auc = compared.after[0].pools[compare.ALL].metrics.auc
+    sentence = (
+        f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
+        f"objects) and {auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
     )
+    if compared.trained_objects:
+        trained = " and ".join(compared.trained_objects)
+        sentence += f" The images of {trained} show the objects of the training in new light."
+    return sentence
 
 
 def _direction(change: compare.Difference) -> int:

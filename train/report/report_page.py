@@ -18,6 +18,7 @@ from augment.progress import progress_message
 from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
+from train.evaluation.laboratory.kept_aside import can_be_generated
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Table, as_text, format_fraction, format_interval, fraction
@@ -33,7 +34,7 @@ from train.report.first_screen import (
     place_of,
 )
 from train.report.plots import Picture
-from train.report.summary import Methods, RunSummary, Scored
+from train.report.summary import Methods, RunSummary, Scored, ScoredRun
 from train.runs.epoch_metrics import attack_success
 from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import RENDERS
@@ -468,8 +469,28 @@ def _compare_on(group: Scored) -> FirstScreen | None:
         subjects=subjects,
         change="hardening" if initial else f"“{method}”",
         place=place_of(images, scored.name),
+        trained_objects=_classes_with_trained_objects(scored, images),
     )
     return compare_networks(compared, rows)
+
+
+def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> list[str]:
+    """List the classes whose images show the objects of the training.
+
+    A run renders its own test images. A class without generated solids has no
+    other objects than those of the training.
+
+    Args:
+        scored: A run with its scores.
+        images: Folder of the images that were scored. None if it is unknown.
+
+    Returns:
+        Names of the classes in words.
+    """
+    if images != scored.run.folder / KEPT_ASIDE:
+        return []
+    labels = scored.scores.labels
+    return [in_words(label) for label in labels if not can_be_generated(label)]
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:

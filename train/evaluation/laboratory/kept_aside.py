@@ -69,6 +69,21 @@ def kept_aside_settings(
     )
 
 
+def can_be_generated(label: str) -> bool:
+    """Return whether a class has generated solids.
+
+    Args:
+        label: Name of the class, such as "orange" or "golf ball".
+    """
+    name = _solid_name(label)
+    return name in SOLIDS or name in HARD_NEGATIVES
+
+
+def _solid_name(label: str) -> str:
+    """Return the name that the solid of a class would have, such as "golf_ball"."""
+    return simplified(label).replace(" ", "_")
+
+
 def _positives(settings: ExperimentSettings, label: str) -> list[Any]:
     """Choose the objects of a positive class for the test renders.
 
@@ -81,9 +96,8 @@ def _positives(settings: ExperimentSettings, label: str) -> list[Any]:
         the name of the class. Otherwise settings of the meshes of this class
         that the training uses.
     """
-    name = simplified(label).replace(" ", "_")
-    if name in SOLIDS or name in HARD_NEGATIVES:
-        return _generated(name, label, POSITIVE_COUNT)
+    if can_be_generated(label):
+        return _generated(_solid_name(label), label, POSITIVE_COUNT)
     return [asdict(item) for item in settings.objects.values() if item.label == label]
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from train.__main__ import main as train_command
 from train.command_settings import TRAINED_PATTERNS
-from train.evaluation.laboratory.kept_aside import kept_aside_settings
+from train.evaluation.laboratory.kept_aside import can_be_generated, kept_aside_settings
 from train.settings import ExperimentSettings
 
 
@@ -32,8 +32,11 @@ def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path
     assert "other_orange" not in labels
 
 
-def test_a_class_that_cannot_be_generated_has_its_meshes_of_training(tmp_path):
+@pytest.mark.parametrize("label", ["mug", "golf ball", "cup", "sweet pepper"])
+def test_a_class_has_its_meshes_of_training_only_if_it_cannot_be_generated(label, tmp_path):
     words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
-    own = train_command.read([*words, "label=mug", "scene.meshes=[mug.glb]"])
-    aside = kept_aside_settings(own, ["mug"], 32, tmp_path)
-    assert [item["mesh"] for item in aside.meshes if item["label"] == "mug"] == ["mug.glb"]
+    own = train_command.read([*words, f"label={label}", f"scene.meshes=[{{mesh: own.glb, label: {label}}}]"])
+    aside = kept_aside_settings(own, [label], 32, tmp_path)
+    meshes = [item["mesh"] for item in aside.meshes if item["label"] == label]
+    assert (meshes == ["own.glb"]) != can_be_generated(label)
+    assert can_be_generated(label) == (label in ("cup", "sweet pepper"))
