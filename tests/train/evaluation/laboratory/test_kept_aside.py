@@ -35,7 +35,8 @@ def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path
 @pytest.mark.parametrize("label", ["mug", "golf ball", "cup", "sweet pepper"])
 def test_a_class_has_its_meshes_of_training_only_if_it_cannot_be_generated(label, tmp_path):
     words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
-    own = train_command.read([*words, f"label={label}", f"scene.meshes=[{{mesh: own.glb, label: {label}}}]"])
+    mesh = f"scene.meshes=[{{mesh: own.glb, label: {label}}}]"
+    own = train_command.read([*words, f"label={label}", mesh])
     aside = kept_aside_settings(own, [label], 32, tmp_path)
     meshes = [item["mesh"] for item in aside.meshes if item["label"] == label]
     assert (meshes == ["own.glb"]) != can_be_generated(label)
