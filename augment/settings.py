@@ -375,6 +375,9 @@ class CameraEffectSettings(Settings):
     pattern_fraction: float = setting(
         0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1
     )
+    slides: str | None = setting(
+        None, "Folder of photographs, which half of the patterns show. null: none."
+    )
     pattern_fill: list[float] = setting(
         list(NONE),
         "Smallest and largest factor of the lighting of the scene beneath the pattern.",

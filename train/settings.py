@@ -87,6 +87,7 @@ INPUTS = (
         "classes",
         "augment.folder",
         "augment.vary.environments",
+        "augment.vary.camera.slides",
         "train.init_from",
     ),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),

@@ -18,8 +18,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.photographs.slides import draw_slides, interpolate_smoothly, luminance
+from augment.photographs.slides import draw_slides, interpolate_smoothly
 from augment.random_streams import generator
+from augment.scene.patterns import luminance
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed

@@ -13,8 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.scene.patterns import draw_patterns, pixel_centers, random_colors
-from renderer.image import LUMINANCE, decode, to_unit
+from augment.scene.patterns import (
+    MAX_ZOOM,
+    draw_patterns,
+    pixel_centers,
+    random_colors,
+    show_photographs,
+)
+from renderer.image import decode, to_unit
 
 # Smallest and largest number of cells of a slide that `draw_cells` draws.
 MIN_CELLS = 3
@@ -24,29 +30,12 @@ MIN_NODES = 2
 MAX_NODES = 6
 # Standard deviation of these values. A sigmoid then maps them to light in [0, 1].
 FIELD_CONTRAST = 2.0
-# `draw_projected` shows a photograph at a scale from 1 / MAX_ZOOM to MAX_ZOOM.
-MAX_ZOOM = 2.0
-# Largest factor by which `draw_projected` multiplies the saturation of a photograph.
-MAX_SATURATION = 3.0
 # Relative frequencies with which `draw_slides` draws two-color patterns, cells, smooth fields
 # and photographs.
 SHARES = (0.4, 0.15, 0.15, 0.3)
 # Coordinate of unused centers of cells in `draw_cells`. They are so far away that no pixel is
 # in their cells.
 FAR = 100.0
-
-
-def luminance(linear: Tensor) -> Tensor:
-    """Compute the luminance of linear RGB.
-
-    Args:
-        linear: Linear RGB, shape (N, 3, H, W).
-
-    Returns:
-        Luminance, shape (N, 1, H, W).
-    """
-    weights = linear.new_tensor(LUMINANCE)[:, None, None]
-    return (linear * weights).sum(1, keepdim=True)
 
 
 def draw_slides(
@@ -179,8 +168,4 @@ def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Gene
 
     chosen = photographs[rows.to(photographs.device)].cpu()
     linear = decode(to_unit(chosen), "srgb")
-    turned = F.grid_sample(linear, grid, padding_mode="reflection", align_corners=False)
-    # The saturation is changed by moving each color away from or towards its gray value.
-    gray = luminance(turned)
-    factor = MAX_SATURATION * saturation[:, None, None, None]
-    return (gray + factor * (turned - gray)).clamp(0, 1)
+    return show_photographs(linear, grid, saturation)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from augment.scene.patterns import draw_patterns
+from augment.scene.image_files import draw_image_files
+from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.settings import CameraEffectSettings
 from renderer.image import clamp, decode, encode
 from renderer.settings import ImageSettings
@@ -16,6 +17,8 @@ BLUR_RADIUS = 3
 # Smallest standard deviation of the Gaussian in `_blur`, in pixels. A blur of this width leaves
 # images as they are. It replaces 0, by which `_blur` cannot divide.
 MIN_BLUR = 1e-3
+# Probability that a pattern shows a photograph if the settings name a folder of photographs.
+PHOTOGRAPH_PROBABILITY = 0.5
 
 
 def draw_camera_effects(
@@ -55,6 +58,8 @@ def draw_camera_effects(
     # The pattern multiplies the linear light, shape (count, 3, size, size). `fill` is the
     # fraction of the light that does not come from the projector.
     patterns = draw_patterns(count, image.size, draws, points)
+    if settings.slides is not None:
+        patterns = _with_photographs(patterns, settings.slides, draws, points)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
     # Mask of the examples without a pattern, shape (count, 1, 1, 1).
@@ -71,6 +76,33 @@ def draw_camera_effects(
         noises=noises.to(device),
         encoding=image.encoding,
     )
+
+
+def _with_photographs(
+    patterns: Tensor, folder: str, draws: torch.Generator, points: Tensor | None
+) -> Tensor:
+    """Replace some patterns by photographs.
+
+    Args:
+        patterns: Linear light in [0, 1], shape (count, 3, size, size).
+        folder: Folder of the photographs.
+        draws: Generator of the random numbers.
+        points: See `draw_camera_effects`.
+
+    Returns:
+        The patterns, of the same shape.
+    """
+    count, _, size, _ = patterns.shape
+    is_replaced = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY
+    replaced_count = int(is_replaced.sum())
+    if not replaced_count:
+        return patterns
+    images = draw_image_files(folder, "slides", replaced_count, size, draws)
+    shown_points = pixel_centers(size) if points is None else points[:, is_replaced]
+    photographs = draw_photograph_patterns(decode(images, "srgb"), shown_points, draws)
+    result = patterns.clone()
+    result[is_replaced] = photographs
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,15 +11,20 @@ import math
 from collections.abc import Callable
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from renderer.image import decode
+from renderer.image import LUMINANCE, decode
 
 # The radius of a disc in a cell of width 1. The discs cover half of the area.
 DISC_RADIUS = 0.4
 # The smallest and the largest period of a pattern.
 MIN_PERIOD = 0.25
 MAX_PERIOD = 1.0
+# A pattern shows a photograph at a scale from 1 / MAX_ZOOM to MAX_ZOOM.
+MAX_ZOOM = 2.0
+# The largest factor by which the saturation of such a photograph is multiplied.
+MAX_SATURATION = 3.0
 
 
 def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tensor:
@@ -212,3 +217,58 @@ def draw_patterns(
     brightness = colors[:, 4:, None, None]
     second = random_colors(colors[:, 2:4]) * brightness
     return two_colors(weight, first, second)
+
+
+def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.Generator) -> Tensor:
+    """Draw patterns that show photographs: turned, scaled and saturated at random.
+
+    Args:
+        photographs: Linear light in [0, 1], shape (N, 3, H, W).
+        points: Point of the pattern that each pixel shows, shape
+            (2, N, size, size), or (2, 1, size, size) if it is the same for all.
+        draws: Source of random numbers.
+
+    Returns:
+        Linear light in [0, 1], shape (N, 3, size, size).
+    """
+    # Numbers in [0, 1], shape (N, 1, 1) each.
+    turn, zoom, saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
+    angle = 2 * math.pi * turn
+    scale = MAX_ZOOM ** (2 * zoom - 1)
+    rotated = turned(points * scale, angle.cos(), angle.sin())
+    return show_photographs(photographs, rotated.permute(1, 2, 3, 0), saturation[:, 0, 0])
+
+
+def show_photographs(photographs: Tensor, grid: Tensor, saturation: Tensor) -> Tensor:
+    """Sample photographs at points, and change their saturation.
+
+    Beyond the border, a photograph is mirrored.
+
+    Args:
+        photographs: Linear light in [0, 1], shape (N, 3, H, W).
+        grid: Point of the photograph that each pixel shows, in [-1, 1], shape
+            (N, size, size, 2).
+        saturation: Factor of the saturation as a fraction of `MAX_SATURATION`,
+            shape (N,).
+
+    Returns:
+        Linear light in [0, 1], shape (N, 3, size, size).
+    """
+    shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
+    # The saturation is changed by moving each color away from or towards its gray value.
+    gray = luminance(shown)
+    factor = MAX_SATURATION * saturation[:, None, None, None]
+    return (gray + factor * (shown - gray)).clamp(0, 1)
+
+
+def luminance(linear: Tensor) -> Tensor:
+    """Compute the luminance of linear RGB.
+
+    Args:
+        linear: Linear RGB, shape (N, 3, H, W).
+
+    Returns:
+        Luminance, shape (N, 1, H, W).
+    """
+    weights = linear.new_tensor(LUMINANCE)[:, None, None]
+    return (linear * weights).sum(1, keepdim=True)

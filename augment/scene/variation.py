@@ -14,6 +14,7 @@ from torch import Tensor
 from augment.progress import progress
 from augment.scene.camera_effects import draw_camera_effects
 from augment.scene.conditions import Example
+from augment.scene.image_files import draw_image_files
 from augment.scene.objects import SceneObject, add_specular_layer, resample_instance, rotated
 from augment.scene.patterns import pixel_centers, random_colors
 from augment.scene.scene import Scene
@@ -22,7 +23,6 @@ from augment.settings import CameraEffectSettings, SpecularLayerSettings, Variat
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
-from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
@@ -114,7 +114,7 @@ def _vary_geometry(
     if settings.backgrounds is not None:
         folder = Path(settings.backgrounds)
         size = scene.settings.size
-        changed["backgrounds"] = _draw_background_files(folder, len(scene), size, draws)
+        changed["backgrounds"] = draw_image_files(folder, "backgrounds", len(scene), size, draws)
         examples = _number_backgrounds(examples)
     if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
         # One object is drawn for each pair of an object and its cameras in the given scene.
@@ -232,31 +232,6 @@ def _to_perspective(camera: Camera, fov: float) -> Camera:
         return replace(camera, distance=distance)
     fields_of_camera = {item.name: getattr(camera, item.name) for item in fields(Camera)}
     return PerspectiveCamera(**fields_of_camera, distance=distance)
-
-
-def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Read randomly chosen background images. A file may be chosen several times.
-
-    Args:
-        folder: Folder of the image files. Its sub-folders are searched, too.
-        count: Number of images.
-        size: Pixels per side to which each image is scaled.
-        draws: Generator of the random numbers.
-
-    Returns:
-        Image values, shape (count, 3, size, size).
-
-    Raises:
-        InputError: If the folder has no images.
-    """
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    if not files:
-        raise InputError(
-            f"backgrounds={folder} holds no image: give a folder of .jpg or .png files"
-        )
-    chosen = torch.randint(len(files), (count,), generator=draws).tolist()
-    images = [read_image(files[index], size) for index in progress(chosen, "reading backgrounds")]
-    return torch.stack(images)
 
 
 def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:

@@ -12,10 +12,10 @@ from augment.photographs.projected_light import (
     draw_shading,
     relight_photographs,
 )
-from augment.photographs.slides import LUMINANCE, draw_cells, draw_slides
+from augment.photographs.slides import draw_cells, draw_slides
 from augment.random_streams import generator
 from renderer.errors import InputError
-from renderer.image import encode
+from renderer.image import LUMINANCE, encode
 
 SIZE = 12
 
