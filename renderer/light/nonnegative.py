@@ -47,6 +47,7 @@ Dips are found on a grid and refined by Newton's method on the sphere.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,8 @@ _MAX_ROUNDS = 50
 # `project_nonnegative` solves its program at most this many times. Dips that are left
 # are filled by mixing in a windowed light.
 _MAX_SOLUTIONS = 4
+# `project_nonnegative` keeps the results for this many channels.
+_MAX_KEPT_CHANNELS = 256
 # A solution x counts as lying on the sphere |x - c| = r if |x - c| differs from r by
 # at most this fraction of r.
 _RADIUS_TOLERANCE = 1e-7
@@ -150,10 +153,26 @@ def project_nonnegative(lights: Tensor) -> Tensor:
     # One row of K coefficients for each channel of each light, shape (lights · 3, K).
     rows = lights.detach().mT.flatten(0, -2).clone()
     for channel in np.unique(dip_to_channel):
-        projected = torch.from_numpy(_project_with_mean(channels[channel])).to(rows)
+        projected = _project_once(channels[channel].tobytes())
         has_channel = torch.from_numpy(row_to_channel.reshape(-1) == channel)
-        rows[has_channel] = projected
+        rows[has_channel] = projected.to(rows)
     return rows.view(lights.mT.shape).mT
+
+
+@lru_cache(maxsize=_MAX_KEPT_CHANNELS)
+def _project_once(channel: bytes) -> Tensor:
+    """Call `_project_with_mean`, and keep the result for later calls.
+
+    Several attacks often start in the same light. At degree 39, a projection takes
+    half a minute.
+
+    Args:
+        channel: Bytes of the K SH coefficients of one channel, float64.
+
+    Returns:
+        SH coefficients, float64, shape (K,).
+    """
+    return torch.from_numpy(_project_with_mean(np.frombuffer(channel).copy()))
 
 
 def _project_with_mean(light: Array) -> Array:
