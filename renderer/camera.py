@@ -24,25 +24,25 @@ from renderer.errors import (
 from renderer.settings import MAX_VIEWS
 from renderer.validation import as_array, require_whole
 
-# Names for the directions of the axes of other programs' cameras, see
-# `PinholeCamera.from_matrix`.
+# Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward.
+# OpenGL has y up and z backward.
 CONVENTIONS = ("opencv", "opengl")
-# Default of `Camera.clip_range` in world units. It shows all of a normalized mesh, whose
-# vertices are at most √3 from the origin.
+# Default of a camera's `clip_range` in world units. A camera then shows all of a normalized
+# mesh, whose vertices are at most √3 from the origin.
 CLIP_RANGE = 2.0
 # Largest polar angle, roll and first azimuth of an orbit in degrees: two turns.
 MAX_TURN = 720.0
-# Limits of the field of view in degrees, for `orbit_cameras` and projectors.
+# Limits of the field of view in degrees, for the cameras of an orbit and for projectors.
 MIN_FOV = 0.05
 MAX_FOV = 172.0
-# Smallest depth of the near plane of a perspective camera, as a fraction of the distance
-# of the camera from the origin. A mesh with a smaller depth raises an error.
-NEAREST = 0.01
-# Smallest depth of a point in front of a pinhole camera, as a fraction of the depth of
-# the farthest point. A mesh with a smaller depth raises an error.
+# Smallest depth that a perspective camera can show, divided by the distance between camera
+# and origin. A mesh with a smaller depth raises an error.
+MIN_NEAR_RATIO = 0.01
+# Smallest depth that a pinhole camera can show, divided by the depth of the farthest point of
+# the mesh. A mesh with a smaller depth raises an error.
 MIN_DEPTH_RATIO = 1e-3
-# Largest difference between R Rᵀ and the identity for a rotation matrix R, and largest
-# skew of intrinsics, divided by the focal length.
+# Tolerance for matrices of cameras: largest difference between R Rᵀ and the identity for a
+# rotation matrix R, and largest skew of intrinsics as a fraction of the focal length.
 MATRIX_TOLERANCE = 1e-4
 
 
@@ -60,9 +60,9 @@ class Camera(ABC):
         azimuth: Azimuth in degrees.
         width: Width of the image at the origin in world units. A normalized
             mesh spans at most [-1, 1] along each axis.
-        right: Position of the origin in the image, to the right of the center
-            in world units.
-        up: Position of the origin in the image, above the center in world
+        right: Distance by which the origin appears to the right of the image
+            center, in world units.
+        up: Distance by which the origin appears above the image center, in world
             units.
         clip_range: Largest difference between the depth of a visible surface and
             the depth of the origin, in world units.
@@ -82,14 +82,14 @@ class Camera(ABC):
     clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
-    # Principal point and aspect ratio of the pixels. Only a `PinholeCamera` has other
-    # values.
+    # Principal point relative to the image center, and aspect ratio of the pixels. Only a
+    # `PinholeCamera` has other values.
     principal_right: ClassVar[float] = 0.0
     principal_up: ClassVar[float] = 0.0
     pixel_aspect: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
-        """Convert and check the fields."""
+        """Convert each field to a number or to a tensor of shape (), and check its range."""
         for name, value in vars(self).items():
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
@@ -102,7 +102,7 @@ class Camera(ABC):
     @property
     def near(self) -> float:
         """Depth of the near plane, the smallest visible depth, in world units."""
-        return max(self.distance - self.clip_range, NEAREST * self.distance)
+        return max(self.distance - self.clip_range, MIN_NEAR_RATIO * self.distance)
 
     @property
     def far(self) -> float:
@@ -110,14 +110,14 @@ class Camera(ABC):
         return self.distance + self.clip_range
 
     def with_clip_range(self, radius: float) -> Self:
-        """Return a camera whose clipping range contains a ball around the origin.
+        """Return a camera that shows all depths of a ball around the origin.
 
         Args:
             radius: Radius of the ball in world units.
 
         Returns:
-            This camera if its clipping range is large enough. Otherwise a copy
-            with a larger clipping range.
+            This camera if its `clip_range` is large enough. Otherwise a copy with a
+            larger `clip_range`.
         """
         if radius <= self.clip_range:
             return self
@@ -136,11 +136,11 @@ class Camera(ABC):
         return replace(self, **numbers) if numbers else self
 
     def moved(self, polar: Tensor, azimuth: Tensor, log_distance: Tensor) -> Self:
-        """Return a camera that is turned about the origin and moved away from it.
+        """Return a camera that is turned about the origin and moved toward or away from it.
 
         The field of view stays the same, so the width of the image at the
-        origin grows with the distance. An orthographic camera only changes its
-        width.
+        origin grows with the distance. An orthographic camera has no distance, and
+        only its width changes.
 
         Args:
             polar: Angle to add to the polar angle in degrees, shape ().
@@ -160,21 +160,24 @@ class Camera(ABC):
         return replace(self, **moved)
 
     def normalized(self, center: np.ndarray, scale: float) -> Self:
-        """Return a camera that sees a moved and scaled mesh as this camera sees the mesh.
+        """Return a camera whose image stays the same if the mesh is moved and scaled.
+
+        Each point p of the mesh is moved to (p - center) · scale.
 
         Args:
-            center: Point of the scene that is moved to the origin, in world
-                units, shape (3,).
-            scale: Factor of the scene.
+            center: Point of the mesh that is moved to the origin, in world units,
+                shape (3,).
+            scale: Factor by which the mesh is scaled.
 
         Returns:
-            Camera whose image of (p - center) · scale is this camera's image of
-            p. It is turned about the new origin.
+            Camera that shows the moved and scaled mesh as this camera shows the
+            mesh. Attacks on the pose turn it about the origin.
 
         Raises:
             InputError: If the center lies behind a perspective camera.
         """
-        right, up, back = self.axes() @ self._from_center(center)
+        # The center in the axes of the camera.
+        right, up, back = self.axes() @ self._from_pivot(center)
         changed: dict[str, Any] = {
             "right": scale * (self.right + right),
             "up": scale * (self.up + up),
@@ -208,7 +211,7 @@ class Camera(ABC):
         cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
-        # This sum is the sine of the polar angle.
+        # This sum is sin_polar, except for rounding errors.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
         up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
@@ -227,11 +230,16 @@ class Camera(ABC):
         columns = np.column_stack([axes.T, position @ axes])
         return np.vstack([columns, [0, 0, 0, 1]])
 
-    def _from_center(self, points: np.ndarray) -> np.ndarray:
-        """Subtract the point about which attacks turn the camera. Here, it is the origin.
+    def _from_pivot(self, points: np.ndarray) -> np.ndarray:
+        """Subtract the point about which attacks turn the camera from other points.
+
+        This point is the origin, except for a `PinholeCamera`.
 
         Args:
             points: Points in world axes, shape (..., 3).
+
+        Returns:
+            Vectors from the point to the other points, same shape.
         """
         return points
 
@@ -239,25 +247,25 @@ class Camera(ABC):
         """Return the position of the camera in homogeneous world coordinates.
 
         Returns:
-            For a perspective camera, the position and 1. For an orthographic
-            camera, which is infinitely far away, the unit vector to the camera
-            and 0. Float64, shape (4,).
+            Position (x, y, z, 1) of a perspective camera. An orthographic camera is
+            infinitely far away, so its position is (x, y, z, 0) with the unit vector
+            (x, y, z) toward the camera. Float64, shape (4,).
         """
+        # This is the position of an orthographic camera. `PerspectiveCamera` overrides it.
         return np.append(self.axes()[2], 0.0)
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points to normalized device coordinates.
 
-        Depth is -1 at the near plane and 1 at the far plane. A plane in world
-        coordinates is a plane in normalized device coordinates, too.
+        The image goes from -1 to 1 in x and y. The depth is -1 at the near plane and
+        1 at the far plane. Planes in the world stay planes.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            x to the right, y up and depth, shape (V, 3). The image is [-1, 1]
-            in x and y.
+            Coordinates (x, y, depth), with x to the right and y up, shape (V, 3).
 
         Raises:
             InputError: If a perspective camera lies in or behind the points.
@@ -276,28 +284,29 @@ class Camera(ABC):
             A tuple of
 
             - (x w, y w, w) for the image position (x, y), shape (V, 3). The
-              number w is 1 for an orthographic camera, and the depth over
+              number w is 1 for an orthographic camera, and the depth divided by
               `distance` for a perspective camera;
             - the nearness of each point, shape (V,). It is larger for nearer
-              points, and linear in the image on a plane.
+              points. On a plane, it is a linear function of the image position.
         """
-        right, up, back = self._coordinates(points)
+        right, up, back = self._camera_coordinates(points)
         w, nearness = self._w_and_nearness(back)
         scale = 2 / self.width
         x = (right + self.right) * scale
         y = (up + self.up) * scale
         return torch.stack([x, y, w]).T, nearness
 
-    def _coordinates(self, points: Tensor) -> Tensor:
+    def _camera_coordinates(self, points: Tensor) -> Tensor:
         """Convert points from world axes to the axes right, up and back of the camera.
 
-        Unlike `axes`, the result is differentiable with respect to the angles.
+        The result is differentiable with respect to the points, and with respect
+        to angles of the camera that are tensors.
 
         Args:
             points: V points in world axes, shape (V, 3).
 
         Returns:
-            Coordinates right, up and back from the origin, shape (3, V).
+            Coordinates right, up and back, measured from the origin, shape (3, V).
         """
         polar = _as_tensor(_in_radians(self.polar), points)
         azimuth = _as_tensor(_in_radians(self.azimuth), points)
@@ -314,25 +323,27 @@ class Camera(ABC):
 
     @abstractmethod
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute w and the nearness of points, see `homogeneous`.
+        """Compute the homogeneous coordinate w and the nearness of points.
 
         Args:
             back: Coordinate of V points along the axis from the origin to the
                 camera, in world units, shape (V,).
 
         Returns:
-            The number w and the nearness of each point, shape (V,) each.
+            A tuple of
+            - the number w by which image coordinates are divided, shape (V,);
+            - the nearness, which is larger for nearer points, shape (V,).
         """
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
-        """Compute the depths of points, by which a perspective camera divides.
+        """Compute the depths of points, which a perspective projection divides by.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            Distance from the camera along the viewing direction, in world
-            units, shape (V,). None for an orthographic camera.
+            Distance of each point from the camera along the viewing direction, in
+            world units, shape (V,). None for an orthographic camera.
 
         Raises:
             InputError: If a point lies behind a perspective camera or very near
@@ -356,31 +367,36 @@ class OrthographicCamera(Camera):
 
     @property
     def distance(self) -> float:  # type: ignore[override]
-        """Distance that files store. Images do not depend on it."""
+        """Distance that files of cameras store. Images do not depend on it."""
         return 2 * self.clip_range
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points to normalized device coordinates, see `Camera.project`.
+        """Project points to normalized device coordinates, without perspective.
+
+        The image goes from -1 to 1 in x and y. The depth is -1 at the near plane and
+        1 at the far plane.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            x to the right, y up and depth, shape (V, 3).
+            Coordinates (x, y, depth), with x to the right and y up, shape (V, 3).
         """
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.clip_range])
+        shift = np.array([self.right, self.up, 0.0])
         coordinates = (self.axes() * scale[:, None]) @ points.T
-        coordinates += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
+        coordinates += (shift * scale)[:, None]
         return coordinates.T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w = 1, and the coordinate toward the camera as nearness.
+        """Compute the homogeneous coordinate w, which is 1, and the nearness of points.
 
         Args:
-            back: Coordinate of points along the axis to the camera, shape (V,).
+            back: Coordinate of V points along the axis from the origin to the
+                camera, shape (V,).
 
         Returns:
-            w and nearness of `Camera.homogeneous`, shape (V,) each.
+            The number w of each point, and `back` as the nearness, shape (V,) each.
         """
         return torch.ones_like(back), back
 
@@ -395,21 +411,22 @@ class PerspectiveCamera(Camera):
     >>> import numpy as np
     >>> import norm_balls as nb
     >>> camera = nb.PerspectiveCamera(polar=90.0, azimuth=0.0, width=2.0, distance=4.0)
-    >>> point = np.array([[2.0, 0.5, 0.0]])  # It has half the distance of the origin.
-    >>> camera.project(point)[0, 0].round(6).item()
+    >>> # The camera is at (4, 0, 0). The image is 1 unit wide at the depth of this point.
+    >>> point = np.array([[2.0, 0.5, 0.0]])
+    >>> camera.project(point)[0, 0].round(6).item()  # 1 is the right side of the image.
     1.0
     """
 
-    # A perspective camera stores its distance. An orthographic camera derives it.
+    # Only a perspective camera has its distance as a field.
     distance: float = field(kw_only=True)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
-        """Convert and check the fields."""
+        """Convert each field to a number or to a tensor of shape (), and check its range."""
         super().__post_init__()
         require_range("distance", self.distance, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
 
     def eye(self) -> np.ndarray:
-        """Return the position of the camera and 1, float64, shape (4,)."""
+        """Return the position of the camera as (x, y, z, 1), float64, shape (4,)."""
         return self.pose()[:, 3]
 
     @property
@@ -418,50 +435,60 @@ class PerspectiveCamera(Camera):
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points to normalized device coordinates, see `Camera.project`.
+        """Project points to normalized device coordinates, with perspective.
+
+        The image goes from -1 to 1 in x and y. The depth is -1 at the near plane and
+        1 at the far plane.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            x to the right, y up and depth, shape (V, 3).
+            Coordinates (x, y, depth), with x to the right and y up, shape (V, 3).
+
+        Raises:
+            InputError: If the camera lies in or behind the points.
         """
         depths = self.depths(points)
         right, up, back = self.axes() @ points.T
         scale = 2 / self.width * (self.distance / depths)
         x = (right + self.right) * scale
         y = (up + self.up) * scale
-        # Coordinate of the near plane along the axis from the origin to the
-        # camera.
+        # Coordinate of the near plane along the axis from the origin to the camera.
         near_back = self.distance - self.near
         depth_scale = 2 * self.far / (self.far - self.near)
         normalized_depth = depth_scale * ((near_back - back) / depths) - 1
         return np.stack([x, y, normalized_depth]).T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w, which is the depth divided by the distance, and 1 / w as nearness.
+        """Compute the homogeneous coordinate w and the nearness of points.
 
         Args:
-            back: Coordinate of points along the axis to the camera, shape (V,).
+            back: Coordinate of V points along the axis from the origin to the
+                camera, shape (V,).
 
         Returns:
-            w and nearness of `Camera.homogeneous`, shape (V,) each.
+            w, which is the depth divided by the distance of the camera, and the
+            nearness 1 / w, shape (V,) each.
         """
         w = 1 - back / self.distance
         return w, 1 / w
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Compute the depths of points, and check them, see `Camera.depths`.
+        """Compute the depths of points, which must lie in front of the camera.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            Distance from the camera along the viewing direction, in world
-            units, shape (V,).
+            Distance of each point from the camera along the viewing direction, in
+            world units, shape (V,).
+
+        Raises:
+            InputError: If a point lies behind the camera or very near to it.
         """
         depths = self.distance - points @ self.axes()[2]
-        if not (depths >= NEAREST * self.distance).all():
+        if not (depths >= MIN_NEAR_RATIO * self.distance).all():
             raise InputError(
                 f"the mesh reaches the camera at distance {self.distance:g} from the origin, or "
                 "extends beyond it: increase the distance (by a smaller fov or a larger width), or "
@@ -476,24 +503,25 @@ class PinholeCamera(PerspectiveCamera):
 
     `from_matrix` creates it from a view matrix and intrinsics, and
     `nb.load_cameras` from the files of COLMAP and nerfstudio. It shows
-    everything in front of it. Where `Camera` has the origin, this camera has its
-    center: polar angle, azimuth, distance, right, up and width are relative to
-    the center. Attacks on the pose turn the camera about this point.
+    everything in front of it. The fields polar, azimuth, distance, right, up and
+    width are relative to the point (center_x, center_y, center_z) instead of the
+    origin. Attacks on the pose turn the camera about this point.
 
     Attributes:
         clip_range: Depth that files of cameras store. Images do not depend on
             it.
         roll: Turn about the viewing direction from the right to the top of the
             image, in degrees.
-        center_x: Coordinate x of the center in world units.
-        center_y: Coordinate y of the center in world units.
-        center_z: Coordinate z of the center in world units.
-        principal_right: Position of the principal point, to the right of the
-            image's center in halves of the image's width.
-        principal_up: Position of the principal point, above the image's center
-            in halves of the image's height.
-        pixel_aspect: Focal length in vertical pixels over the focal length in
-            horizontal pixels.
+        center_x: x of the point about which attacks turn the camera, in world
+            units.
+        center_y: y of this point.
+        center_z: z of this point.
+        principal_right: Distance of the principal point to the right of the image
+            center, in halves of the image width.
+        principal_up: Distance of the principal point above the image center, in
+            halves of the image height.
+        pixel_aspect: Vertical focal length divided by the horizontal one, both in
+            pixels.
 
     >>> import numpy as np
     >>> import norm_balls as nb
@@ -514,7 +542,7 @@ class PinholeCamera(PerspectiveCamera):
     pixel_aspect: float = field(default=1.0, kw_only=True)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
-        """Convert and check the fields."""
+        """Convert each field to a number or to a tensor of shape (), and check its range."""
         super().__post_init__()
         require_range("roll", self.roll, -MAX_TURN, MAX_TURN)
         require_range("pixel_aspect", self.pixel_aspect, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
@@ -531,29 +559,28 @@ class PinholeCamera(PerspectiveCamera):
     ) -> Self:
         """Create a camera from a view matrix and intrinsics.
 
-        The convention says how the axes of the camera lie: "opencv" (COLMAP) has
-        x to the right, y down and z forward. "opengl" (nerfstudio, Blender) has
-        x to the right, y up and z backward. The intrinsics are the same in both:
-        in pixels, from the upper left corner of the image to the right and down.
-        The center of the first pixel is therefore at (0.5, 0.5), as in COLMAP
-        and nerfstudio. Calibrations of OpenCV have it at (0, 0): add 0.5 to
-        their cx and cy.
+        In both conventions, the principal point (cx, cy) is in pixels from the
+        upper left corner of the image to the right and down. The center of the
+        first pixel is at (0.5, 0.5), as in COLMAP and nerfstudio. In calibrations of
+        OpenCV, it is at (0, 0): add 0.5 to their cx and cy.
 
-        Images are square. For an image of another shape, the camera shows the
-        square in its center whose side is the shorter side of the image.
+        Images are square. If the given image size is not square, the camera shows
+        the central square of the image, whose side is the shorter side.
 
         Args:
             view: Matrix from world to camera coordinates, shape (4, 4) or
                 (3, 4).
             intrinsics: Matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels,
                 shape (3, 3).
-            size: Pixels per side of the image of the intrinsics, or its width
-                and height. Renders may have another size.
-            convention: "opencv" or "opengl".
+            size: Size of the image for which the intrinsics are valid: pixels per
+                side, or width and height. Renders may have another size.
+            convention: Axes of the camera. "opencv" (also COLMAP) has x to the
+                right, y down and z forward. "opengl" (also nerfstudio and Blender)
+                has x to the right, y up and z backward.
 
         Returns:
-            The camera. Its center lies on its axis, at the distance of the
-            world's origin.
+            Camera. Attacks on the pose turn it about the point on its optical axis
+            that is as far from it as the world's origin.
 
         Raises:
             InputError: If a matrix has another shape, is no rotation and
@@ -568,72 +595,102 @@ class PinholeCamera(PerspectiveCamera):
             64
         """
         require_choice("convention", convention, CONVENTIONS)
-        # The rows of the rotation are the axes of the camera in world axes.
         rotation, translation = _split_view(view)
         if convention == "opencv":
-            # The axes of OpenCV are right, down and forward. Ours are right, up and back.
+            # OpenCV's axes are right, down and forward. Ours are right, up and back.
             rotation = rotation * [[1], [-1], [-1]]
             translation = translation * [1, -1, -1]
         focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
         image_width, image_height = _as_image_size(size)
         side = min(image_width, image_height)
+        # The rows of the rotation matrix are the axes of the camera in world axes.
         right, up, back = rotation
         position = -translation @ rotation
         distance = float(np.linalg.norm(position)) or 1.0
-        # The center lies on the axis of the camera.
-        center = position - distance * back
+        pivot = position - distance * back
         azimuth = math.atan2(back[1], back[0])
-        # The axis to the right of a camera without roll, which is horizontal.
-        level = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        # Without roll, this horizontal vector would be the axis to the right.
+        right_without_roll = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        roll = math.atan2(-up @ right_without_roll, right @ right_without_roll)
         return cls(
             polar=math.degrees(math.atan2(math.hypot(back[0], back[1]), back[2])),
             azimuth=math.degrees(azimuth),
             width=distance * side / focal_x,
             distance=distance,
-            roll=math.degrees(math.atan2(-up @ level, right @ level)),
-            center_x=center[0],
-            center_y=center[1],
-            center_z=center[2],
+            roll=math.degrees(roll),
+            center_x=pivot[0],
+            center_y=pivot[1],
+            center_z=pivot[2],
             principal_right=(2 * principal_x - image_width) / side,
             principal_up=(image_height - 2 * principal_y) / side,
             pixel_aspect=focal_y / focal_x,
         )
 
     def normalized(self, center: np.ndarray, scale: float) -> Self:
-        """Return a camera for a moved and scaled mesh, see `Camera.normalized`."""
+        """Return a camera whose image stays the same if the mesh is moved and scaled.
+
+        Each point p of the mesh is moved to (p - center) · scale.
+
+        Args:
+            center: Point of the mesh that is moved to the origin, in world units,
+                shape (3,).
+            scale: Factor by which the mesh is scaled.
+
+        Returns:
+            Camera. Attacks on the pose turn it about the origin.
+
+        Raises:
+            InputError: If the center lies behind the camera.
+        """
         moved = super().normalized(center, scale)
         return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
 
     def axes(self) -> np.ndarray:
-        """Return the unit vectors right, up and back as rows, shape (3, 3)."""
+        """Return the axes of the camera in world coordinates.
+
+        Returns:
+            Unit vectors to the right, up and back (against the viewing direction)
+            as rows, float64, shape (3, 3).
+        """
         right, up, back = super().axes()
         cosine = math.cos(math.radians(self.roll))
         sine = math.sin(math.radians(self.roll))
         return np.array([cosine * right + sine * up, cosine * up - sine * right, back])
 
     def pose(self) -> np.ndarray:
-        """Return the matrix from camera to world coordinates, shape (4, 4)."""
+        """Return the matrix that maps camera coordinates to world coordinates, shape (4, 4)."""
         pose = super().pose()
         pose[:3, 3] += [self.center_x, self.center_y, self.center_z]
         return pose
 
-    def _from_center(self, points: np.ndarray) -> np.ndarray:
-        """Subtract the center of the camera from points in world axes, shape (..., 3)."""
+    def _from_pivot(self, points: np.ndarray) -> np.ndarray:
+        """Subtract the point about which attacks turn the camera from other points.
+
+        Args:
+            points: Points in world axes, shape (..., 3).
+
+        Returns:
+            Vectors from the point to the other points, same shape.
+        """
         return points - np.array([self.center_x, self.center_y, self.center_z])
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points to normalized device coordinates, see `Camera.project`.
+        """Project points to normalized device coordinates, with perspective.
 
-        The near plane and the far plane enclose the points.
+        The image goes from -1 to 1 in x and y. The depth goes from about -1 at the
+        nearest point to about 1 at the farthest point.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            x to the right, y up and depth, shape (V, 3).
+            Coordinates (x, y, depth), with x to the right and y up, shape (V, 3).
+
+        Raises:
+            InputError: If a point lies behind the camera or very near to it.
         """
         depths = self.depths(points)
-        right, up, _ = self.axes() @ self._from_center(points).T
+        right, up, _ = self.axes() @ self._from_pivot(points).T
         scale = 2 / self.width * (self.distance / depths)
         x = (right + self.right) * scale + self.principal_right
         y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
@@ -643,13 +700,17 @@ class PinholeCamera(PerspectiveCamera):
         return np.stack([x, y, normalized_depth]).T
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points to homogeneous image coordinates, see `Camera.homogeneous`.
+        """Project points to homogeneous image coordinates, with the principal point.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            (x w, y w, w), shape (V, 3), and the nearness, shape (V,).
+            A tuple of
+
+            - (x w, y w, w) for the image position (x, y), shape (V, 3). The
+              number w is the depth divided by `distance`;
+            - the nearness 1 / w of each point, shape (V,).
         """
         positions, nearness = super().homogeneous(points)
         x, y, w = positions.T
@@ -657,34 +718,38 @@ class PinholeCamera(PerspectiveCamera):
         y = y * self.pixel_aspect + self.principal_up * w
         return torch.stack([x, y, w]).T, nearness
 
-    def _coordinates(self, points: Tensor) -> Tensor:
-        """Convert points from world axes to the axes of the camera, from its center.
+    def _camera_coordinates(self, points: Tensor) -> Tensor:
+        """Convert points from world axes to the axes right, up and back of the camera.
 
         Args:
             points: V points in world axes, shape (V, 3).
 
         Returns:
-            Coordinates right, up and back from the center, shape (3, V).
+            Coordinates right, up and back, measured from the point about which
+            attacks turn the camera, shape (3, V).
         """
         center = [self.center_x, self.center_y, self.center_z]
-        offset = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
-        right, up, back = super()._coordinates(points - offset)
+        pivot = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
+        right, up, back = super()._camera_coordinates(points - pivot)
         roll = _as_tensor(_in_radians(self.roll), points)
         cosine = roll.cos()
         sine = roll.sin()
         return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Compute the depths of points, and check them, see `Camera.depths`.
+        """Compute the depths of points, which must lie in front of the camera.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
 
         Returns:
-            Distance from the camera along the viewing direction, in world
-            units, shape (V,).
+            Distance of each point from the camera along the viewing direction, in
+            world units, shape (V,).
+
+        Raises:
+            InputError: If a point lies behind the camera or very near to it.
         """
-        depths = self.distance - self._from_center(points) @ self.axes()[2]
+        depths = self.distance - self._from_pivot(points) @ self.axes()[2]
         if not (depths >= MIN_DEPTH_RATIO * np.abs(depths).max()).all():
             position = self.pose()[:3, 3].round(3).tolist()
             raise InputError(
@@ -695,13 +760,13 @@ class PinholeCamera(PerspectiveCamera):
 
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Check a view matrix, and split it into rotation and translation.
+    """Check a view matrix, and split it into a rotation matrix and a translation.
 
     Args:
         view: Matrix from world to camera coordinates, shape (4, 4) or (3, 4).
 
     Returns:
-        Rotation, shape (3, 3), and translation, shape (3,).
+        Rotation matrix, shape (3, 3), and translation, shape (3,).
 
     Raises:
         InputError: If the matrix has another shape, or is no rotation and
@@ -716,7 +781,8 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
     if not (error <= MATRIX_TOLERANCE and is_right_handed and is_affine):
         raise InputError(
-            "view is no rotation and translation: give the matrix from world to camera coordinates"
+            f"view={matrix.tolist()} is no rotation and translation: give the matrix from world to "
+            "camera coordinates"
         )
     return rotation, matrix[:3, 3]
 
@@ -729,7 +795,7 @@ def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
             shape (3, 3).
 
     Returns:
-        fx, fy, cx and cy.
+        Focal lengths fx and fy, and principal point cx and cy, in pixels.
 
     Raises:
         InputError: If the matrix has another form.
@@ -748,7 +814,7 @@ def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
 
 
 def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Check the size of an image, and return its width and its height.
+    """Convert the size of an image to its width and its height, and check them.
 
     Args:
         size: Number of pixels per side, or a pair of width and height.
@@ -769,14 +835,13 @@ def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
 def _as_scalar(name: str, value: Any) -> Any:
     """Convert the value of a camera's field to a number, or to a tensor of shape ().
 
-    A tensor stays a tensor, so that gradients with respect to it can be computed.
-
     Args:
         name: Name of the field, for the error.
         value: Number, or a tensor, array or list with one number.
 
     Returns:
-        Number or tensor.
+        Tensor of shape () for a tensor, so that gradients with respect to the field
+        can be computed. Otherwise a number.
 
     Raises:
         InputError: If the value is not one number.
@@ -791,12 +856,12 @@ def _as_scalar(name: str, value: Any) -> Any:
 
 
 def _as_tensor(value: float | Tensor, like: Tensor) -> Tensor:
-    """Convert the value of a camera's field to a tensor with the dtype and device of `like`."""
+    """Convert a number or a tensor to a tensor with the dtype and the device of `like`."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def _in_radians(degrees: Any) -> Any:
-    """Convert an angle from degrees to radians. A tensor stays a tensor with a graph."""
+    """Convert an angle, which is a number or a tensor, from degrees to radians."""
     if isinstance(degrees, Tensor):
         return torch.deg2rad(degrees)
     return math.radians(degrees)
@@ -809,13 +874,14 @@ def orbit_cameras(
     azimuth: float = 0.0,
     fov: float | None = None,
 ) -> list[Camera]:
-    """Create cameras at equally spaced azimuths and the same polar angle.
+    """Create cameras around the origin, at equally spaced azimuths and the same polar angle.
 
-    The paper uses the default polar angle and 10 views (appendix C).
+    The paper "Beyond Pixel Norm-Balls" uses the default polar angle and 10 views
+    (appendix C).
 
     Args:
         views: Number of cameras.
-        width: Width of the images at the origin in world units.
+        width: Width in world units that an image shows at the origin.
         polar: Polar angle in degrees, within two turns.
         azimuth: Azimuth of the first camera in degrees, within two turns.
         fov: Field of view: the angle between opposite sides of the image in
@@ -845,5 +911,6 @@ def orbit_cameras(
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
     fov = _as_scalar("fov", fov)
     require_range("fov", fov, MIN_FOV, MAX_FOV)
+    # From this distance, `width` appears at the angle `fov`.
     distance = width / 2 / math.tan(math.radians(fov) / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

@@ -11,7 +11,8 @@ the sum of the squared differences.
 Only the product of light and albedo can be seen: with twice the albedo, half the
 light is found.
 
-A light has K = 49 SH coefficients per color channel (degree 6).
+A light is environment light with 49 spherical-harmonic (SH) coefficients per
+color channel (degree 6).
 """
 
 from __future__ import annotations
@@ -44,93 +45,93 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
-# The search for a camera starts from cameras at these angles from +z in degrees,
-# with AZIMUTHS equally spaced azimuths for each angle.
-POLAR = (20, 40, 60, 80, 100)
-AZIMUTHS = 16
-# Width in world units that all these first cameras show. `_framed` changes the width
-# so that the mesh is as large as the object in the photograph.
+# Polar angles in degrees of the first cameras of a search: the angles between +z and the
+# direction to the camera.
+FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)
+# Number of first cameras at each polar angle, with equally spaced azimuths.
+FIRST_AZIMUTH_COUNT = 16
+# Width in world units that a first camera shows, before it is changed so that the mesh looks
+# as large as the object in the photograph.
 FIRST_WIDTH = 2.0
-# `fit_scene` searches for cameras in images with this many pixels per side, before
-# it refines the cameras in images of the full size.
-COARSE = 32
-# Number of cameras that the search keeps: the best first cameras from which a descent
-# starts, and the best cameras that are refined at the full size.
-KEPT = 3
-# Largest number of Gauss-Newton steps in a descent from one camera.
-STEPS = 20
-# A descent ends if a step changes the squared error, or the camera, by a smaller
-# fraction.
-LEAST_GAIN = 1e-3
-# Step sizes of the numerical derivatives of a descent, times the image size in
-# pixels. They belong to the polar angle and the azimuth in radians, the relative
-# width, and the shifts right and up in units of the width. A shift by 0.5 / size is
-# half a pixel.
-DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
-# In a descent, the camera stays at least at this angle in radians from +z and from
-# -z, because the azimuth has no effect there.
-POLE_DISTANCE = 0.02
+# Width and height in pixels of the small images in which cameras are searched. The best
+# cameras are then refined in images of the full size.
+COARSE_SIZE = 32
+# Number of first cameras with the smallest errors that the search refines, and also the
+# largest number of cameras that the search returns.
+KEPT_CAMERAS = 3
+# Largest number of steps when one camera is refined with the Gauss-Newton method.
+MAX_STEPS = 20
+# The refinement of a camera ends if a step changes the squared error, or the camera, by less
+# than this fraction.
+MIN_GAIN = 1e-3
+# Step sizes of numerical derivatives for an image of one pixel: for the polar angle and the
+# azimuth in radians, the relative width, and the shifts right and up as fractions of the
+# width. Larger images have smaller steps. The shifts are always half a pixel.
+DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
+# Smallest angle in radians between a refined camera and +z or -z. Exactly there, the azimuth
+# would have no effect.
+MIN_POLE_ANGLE = 0.02
 # Number of samples along one side of a pixel in renders.
 SAMPLES = 8
-# `_distinct` treats two cameras as the same one if all their axes differ by less
-# than this angle in degrees.
-DISTINCT = 2.0
-# A camera of the search is refined at the full size if its squared error is at most
-# this multiple of the smallest squared error.
-PLAUSIBLE = 3
-# Weight of the smoothness penalty of the light, relative to the squared brightness
-# of the object under uniform light (see `_Target.penalty`). Without a penalty, light
-# from directions that the object hardly reflects could become arbitrarily bright.
-SMOOTH = 1e-6
-# A pixel of the photograph with this linear value or more counts as clipped: the
-# scene may have been brighter than the photograph shows.
-CLIPPED = 0.995
-# The light is solved for up to this many times. Each time, the clipped pixels that
-# the last solution made brighter than 1 are left out.
+# Two cameras count as the same one if all their axes differ by less than this angle in
+# degrees.
+MIN_CAMERA_ANGLE = 2.0
+# A camera of the search in small images is refined in full size if its squared error is at
+# most this multiple of the smallest squared error.
+MAX_ERROR_RATIO = 3
+# Weight of the smoothness penalty of the light, relative to the squared brightness of the
+# object under uniform light. Without a penalty, light from directions that the object hardly
+# reflects could become arbitrarily bright.
+SMOOTHNESS_WEIGHT = 1e-6
+# A pixel of the photograph with this linear value or more counts as clipped: the scene may
+# have been brighter than the photograph can show.
+CLIPPED_VALUE = 0.995
+# The light is fitted up to this many times. Each fit ignores the clipped pixels that the last
+# fit made brighter than 1.
 CLIPPING_ROUNDS = 3
-# The radiance of the light must be at least this fraction of its mean in all
-# directions of a grid. The margin keeps the radiance positive between the
-# directions.
-LEAST_RADIANCE = 0.01
-# Largest number of iterations of SciPy's `nnls` per direction. Three are usual.
-MAX_EXCHANGES = 100
-# The first solution for a light is constrained in every FIRST_DIRECTIONS-th direction
-# of the grid. Directions with negative radiance are added afterwards.
-FIRST_DIRECTIONS = 16
-# Number of subdivisions of the icosphere whose vertices are the grid of directions:
-# SEARCH_GRID while a camera is sought, and FINAL_GRID for the returned light.
+# In all directions of a grid, the radiance of a light must be at least this fraction of its
+# mean radiance. The margin keeps the radiance positive between the directions.
+MIN_RADIANCE_RATIO = 0.01
+# Largest number of iterations of SciPy's `nnls`, per direction of the grid in which the
+# radiance of a light is constrained. Three iterations are usual.
+MAX_NNLS_ITERATIONS = 100
+# At first, the radiance of a light is only constrained in every 16th direction of the grid.
+# Directions in which it is negative are added afterwards.
+FIRST_DIRECTION_STEP = 16
+# Number of subdivisions of the icosphere whose vertices are the directions in which the
+# radiance of a light is constrained, while a camera is searched.
 SEARCH_GRID = 2
+# The same number of subdivisions for the light that is returned.
 FINAL_GRID = 5
-# A pixel counts as completely covered by the object if the object's share of the
-# pixel is larger than this. With a limit of 0.99, the other hundredth of a pixel could
-# be brighter than the object, such as a white background beside the blue channel of a
-# banana.
-WHOLE = 0.999
-# Pixels on the border of the object get the mean color of the completely covered
-# pixels that are at most this many pixels away in each direction.
+# The object covers a pixel completely if its share of the pixel is larger than this. A limit
+# of 0.99 would be too low: a white background in the other hundredth of the pixel can be
+# brighter than the object, for example in the blue channel of a banana.
+WHOLE_PIXEL = 0.999
+# A pixel on the border of the object gets the mean color of the pixels that the object covers
+# completely and that are at most this many rows and columns away.
 BORDER = 2
-# Side of the square window that is cut around an object, as a multiple of the longer
-# side of the object's bounding box.
-MARGIN = 1.6
+# Side of the square window that is cut around an object, divided by the longer side of the
+# object's bounding box.
+WINDOW_SCALE = 1.6
 # A pixel of an 8-bit mask belongs to the object if its value is larger than this.
-OPAQUE = 127
+MASK_THRESHOLD = 127
 # First guess of the angle between +z and the direction to the camera, in degrees.
-USUAL_POLAR = 60.0
-# `fit_photograph` cuts a window again if a component of the window's axes changes by
-# more than this.
-TILTED = 1e-3
-# Smallest number of pixels that the object must cover.
+GUESSED_POLAR = 60.0
+# A window of the photograph is cut and fitted again if the first fit changes a component of
+# the axes of the window by more than this.
+MAX_AXIS_CHANGE = 1e-3
+# Smallest number of pixels of an image that the object must cover.
 MIN_COVERED_PIXELS = 16
 # Number of color channels.
-COLORS = 3
+CHANNELS = 3
 
 
 class FittedPhotograph(NamedTuple):
-    """Camera, light and window that `fit_photograph` found.
+    """Camera and light of an object anywhere in a photograph, and the window that was fitted.
 
     Attributes:
         scene: Camera and light. The camera looks at the center of the mesh.
-        window: Part of the photograph that the camera shows.
+        window: Square part of the photograph that the camera shows.
     """
 
     scene: FittedScene
@@ -138,7 +139,7 @@ class FittedPhotograph(NamedTuple):
 
 
 class FittedScene(NamedTuple):
-    """Camera and light of a photograph.
+    """Camera and light with which a render resembles a photograph most.
 
     Attributes:
         camera: Camera from which the mesh looks most like the photograph.
@@ -170,8 +171,8 @@ def fit_photograph(
     """Find the camera and the light of an object anywhere in a photograph.
 
     The function cuts a square window around the object out of the photograph.
-    The window shows what a camera would see that is turned toward the object
-    (see `renderer.photograph`), and it is fitted with `fit_scene`. The upward
+    The window shows what a camera would see if it were turned toward the object
+    (see `renderer.photograph`). The window is fitted with `fit_scene`. The upward
     direction in the window depends on the height of the camera, which is only
     known after the fit. If the first window was tilted, a second window is cut
     and fitted.
@@ -183,8 +184,8 @@ def fit_photograph(
         mask: Mask with 8 bits, white where the object is, shape (H, W).
         mesh: Mesh of the object, normalized and upright.
         size: Number of pixels per side of the images that are compared.
-        fov: Field of view of the window in degrees. The window is `MARGIN` times
-            as wide as the object. None for a camera without perspective.
+        fov: Field of view of the window in degrees. The window is 1.6 times as
+            wide as the object. None for a camera without perspective.
         encoding: Encoding of the photograph and of the images that will be
             rendered with the result, "linear" or "srgb".
         **options: Other arguments of `fit_scene`.
@@ -195,7 +196,7 @@ def fit_photograph(
     Raises:
         InputError: If no pixel of the mask is white.
     """
-    is_object = mask > OPAQUE
+    is_object = mask > MASK_THRESHOLD
     rows = np.flatnonzero(is_object.any(axis=1))
     columns = np.flatnonzero(is_object.any(axis=0))
     if not len(rows):
@@ -203,39 +204,57 @@ def fit_photograph(
             "the mask has no white pixels: give a mask that is white where the object is, "
             "or a box around the object"
         )
-    # Center of the bounding box in pixels, and side of the window in pixels.
+    # Center (column, row) of the object's bounding box in the photograph, in pixels.
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
-    side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
+    # Side of the window in pixels.
+    side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
     camera_image = Photograph(photograph, focal_length)
     fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
 
-    # First fit: the world's z-axis, in the axes of the photograph's camera, is guessed.
-    usual_polar = math.radians(USUAL_POLAR)
-    guessed_up = np.array([0.0, math.sin(usual_polar), math.cos(usual_polar)])
+    # The window needs the direction of the world's z-axis in the axes of the photograph's
+    # camera: right, up and back. For the first fit, this direction is guessed.
+    guessed_polar = math.radians(GUESSED_POLAR)
+    guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
     window = camera_image.window(center, side, guessed_up)
     scene = fit.fit(window, None)
-    # Second fit: the z-axis is known from the first fit. It has no component to the
-    # right, because the camera of the photograph is upright.
+    # The first fit tells the direction for the second fit.
     up = _up_direction(scene.camera, window)
+    # The camera of the photograph is upright, so the z-axis does not point to its right.
     up[0] = 0
     upright_window = camera_image.window(center, side, up)
-    if np.abs(upright_window.axes - window.axes).max() > TILTED:
+    if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
         window = upright_window
         scene = fit.fit(window, scene.camera)
-    # The returned camera and window are centered on the mesh instead of the mask.
+    return _centered_on_mesh(scene, window, camera_image)
+
+
+def _centered_on_mesh(
+    scene: FittedScene, window: Window, camera_image: Photograph
+) -> FittedPhotograph:
+    """Turn a fitted camera and its window so that the mesh center is in their center.
+
+    Args:
+        scene: Fitted camera and light. The camera may show the mesh center
+            elsewhere in its image.
+        window: Window of the photograph that the camera shows.
+        camera_image: Photograph with its focal length.
+
+    Returns:
+        Turned camera with the same light, and a window of the same size.
+    """
     camera = scene.camera
+    # Offset (right, up) of the mesh center from the window center, in pixels.
+    offset = np.array([camera.right, camera.up]) * window.side / camera.width
+    mesh_center = np.array(window.pixels(*offset))
     up = _up_direction(camera, window)
-    # Position of the mesh center in the window, in pixels from the window's center.
-    shift = np.array([camera.right, camera.up]) * side / camera.width
-    mesh_center = np.array(window.pixels(*shift))
     centered_scene = scene._replace(camera=_turned_to_mesh(camera))
-    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, side, up))
+    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, window.side, up))
 
 
 @dataclass(frozen=True)
 class _WindowFit:
-    """Fits of the camera and the light in windows of one photograph.
+    """Photograph with the settings for fitting a camera and a light to windows of it.
 
     Attributes:
         photograph: Photograph with 8 bits per channel, shape (H, W, 3).
@@ -256,14 +275,13 @@ class _WindowFit:
 
         Args:
             window: Window of the photograph.
-            start: Camera near the one that is sought. None searches for a
-                camera.
+            start: Camera that is refined. None searches for a camera.
 
         Returns:
-            Camera and light.
+            Camera and light with which a render resembles the window most.
         """
         linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
-        # The object's share of each pixel, shape (size, size).
+        # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
         return fit_scene(linear_image, coverage, self.mesh, start=start, **self.options)
 
@@ -276,7 +294,8 @@ def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
         window: Window of the photograph.
 
     Returns:
-        Unit vector (right, up, back), shape (3,).
+        Unit vector along the z-axis with the components right, up and back,
+        shape (3,).
     """
     z_axis_in_window = camera.axes()[:, 2]
     return window.axes.T @ z_axis_in_window
@@ -285,15 +304,16 @@ def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
 def _turned_to_mesh(camera: Camera) -> Camera:
     """Return a copy of a camera at the same place that looks at the center of the mesh.
 
-    The center of the mesh is the origin. If the camera has perspective and does
-    not show the origin in the image center, its viewing direction changes.
+    The center of the mesh is the origin. A perspective camera is turned if it does
+    not show the origin in the center of its image. An orthographic camera is
+    shifted.
 
     Args:
-        camera: Camera whose image center may be shifted from the origin by
-            `camera.right` and `camera.up`.
+        camera: Camera that may show the origin elsewhere in its image
+            (`camera.right` and `camera.up`).
 
     Returns:
-        Camera without a shift.
+        Camera that shows the origin in the center of its image.
     """
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
@@ -312,10 +332,15 @@ def _turned_to_mesh(camera: Camera) -> Camera:
 
 @dataclass(frozen=True)
 class _RenderOptions:
-    """Settings that are passed on to `render` and `precompute_transfer`.
+    """Arguments for `render` and `precompute_transfer` while a camera or a light is fitted.
 
-    The attributes are arguments of `fit_scene`, except for `samples`, the number
-    of samples along one side of a pixel.
+    Attributes:
+        albedo_scale: Factor for the albedo of the mesh.
+        encoding: Encoding of image values, "linear" or "srgb".
+        normals: "flat" or "smooth".
+        rasterizer: "auto", "opengl", "numba" or "numpy".
+        samples: Number of samples along one side of a pixel.
+        bounces: Number of light bounces, with shadows.
     """
 
     albedo_scale: float
@@ -345,9 +370,10 @@ def fit_scene(
     from the center of the image (`Camera.right`, `Camera.up`).
 
     Args:
-        photograph: Linear values in [0, 1], shape (3, size, size). Values of
-            `CLIPPED` or more count as clipped.
-        mask: The object's share of each pixel in [0, 1], shape (size, size).
+        photograph: Linear values in [0, 1], shape (3, size, size). Values of 0.995
+            or more count as clipped: the scene may have been brighter.
+        mask: Share of each pixel that the object covers, in [0, 1],
+            shape (size, size).
         mesh: Mesh of the object, normalized and upright.
         fov: Angle between opposite sides of the image in degrees. None for a
             camera without perspective.
@@ -360,7 +386,7 @@ def fit_scene(
             light is fitted. With 0, the light for a concave mesh is too bright
             or too dim. The search for the camera ignores shadows and bounces.
         rasterizer: "auto", "opengl", "numba" or "numpy".
-        start: Camera near the one that is sought. None searches for a camera.
+        start: Camera that is refined. None searches for a camera.
 
     Returns:
         Camera and light, the error of the pixels, and the overlap of the
@@ -385,7 +411,7 @@ def fit_scene(
         if not (values.min() >= 0 and values.max() <= 1):
             raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
     size = photograph.shape[-1]
-    if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
+    if photograph.shape != (CHANNELS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
         raise InputError(
             f"photograph and mask have the shapes {given}: "
@@ -400,19 +426,18 @@ def fit_scene(
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
     mask = mask.double()
-    # The search for first cameras uses a small copy of the photograph. The best of these
-    # cameras are refined with the photograph in its full size.
-    fine_target = _Target.from_photograph(photograph, mask, mesh, size, options)
+    target = _Target.from_photograph(photograph, mask, mesh, size, options)
     if start is None:
-        coarse_size = min(COARSE, size)
+        # A search in a small copy of the photograph is faster.
+        coarse_size = min(COARSE_SIZE, size)
         coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
-        starts = _plausible_cameras(coarse_target, mask, fov)
+        start_cameras = _plausible_cameras(coarse_target, mask, fov)
     else:
-        starts = [start]
-    refined_cameras = [fine_target.refine_camera(camera) for camera in starts]
-    _, best_camera = fine_target.rank_cameras(refined_cameras)[0]
-    # Bounces are slow to compute, so only the final light is fitted with bounces.
-    target_with_bounces = fine_target._replace(options=replace(options, bounces=bounces))
+        start_cameras = [start]
+    refined_cameras = [target.refine_camera(camera) for camera in start_cameras]
+    _, best_camera = target.rank_cameras(refined_cameras)[0]
+    # Bounces are slow to compute, so only the returned light is fitted with bounces.
+    target_with_bounces = target._replace(options=replace(options, bounces=bounces))
     return target_with_bounces.fit_final_light(best_camera)
 
 
@@ -420,32 +445,33 @@ def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list
     """Search all directions for a few cameras, one of which should be near the best camera.
 
     Args:
-        target: Small image to which renders are compared.
-        mask: The object's share of each pixel in the full image,
+        target: Small copy of the photograph, to which renders are compared.
+        mask: Share of each pixel of the photograph that the object covers,
             shape (size, size).
         fov: Field of view in degrees. None for cameras without perspective.
 
     Returns:
-        At most `KEPT` different cameras, the best one first.
+        At most `KEPT_CAMERAS` different cameras, the best one first.
     """
     mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
     first_cameras = []
-    for polar in POLAR:
-        for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, polar, fov=fov):
+    for polar in FIRST_POLAR_ANGLES:
+        for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov):
             first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
-    # From the best camera to the worst.
     ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
-    # All azimuths fit a round object equally well, so the best cameras may all have
-    # the same polar angle. A descent therefore also starts from the best camera of
-    # each polar angle. In reversed order, the best camera is written last.
-    best_of_polar = {camera.polar: camera for camera in reversed(ranked_cameras)}
-    # dict.fromkeys removes duplicates and keeps the order.
-    starts = dict.fromkeys([*ranked_cameras[:KEPT], *best_of_polar.values()])
-    refined = target.rank_cameras(target.refine_camera(camera) for camera in starts)
+    # All azimuths fit a round object equally well, so the best cameras may all have the same
+    # polar angle. The best camera of each polar angle is therefore refined, too.
+    best_of_polar: dict[float, Camera] = {}
+    for camera in ranked_cameras:
+        best_of_polar.setdefault(camera.polar, camera)
+    # dict.fromkeys removes duplicates, and keeps the order.
+    start_cameras = dict.fromkeys([*ranked_cameras[:KEPT_CAMERAS], *best_of_polar.values()])
+    refined = target.rank_cameras(target.refine_camera(camera) for camera in start_cameras)
     smallest_error, _ = refined[0]
-    plausible = [camera for error, camera in refined if error <= PLAUSIBLE * smallest_error]
-    return _distinct(plausible)[:KEPT]
+    largest_error = MAX_ERROR_RATIO * smallest_error
+    plausible_cameras = [camera for error, camera in refined if error <= largest_error]
+    return _distinct(plausible_cameras)[:KEPT_CAMERAS]
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
@@ -455,28 +481,32 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
         cameras: Cameras in order of preference.
 
     Returns:
-        The cameras whose axes differ from those of each earlier camera by at
-        least `DISTINCT` degrees.
+        The cameras of which an axis differs from that of each earlier returned
+        camera by more than `MIN_CAMERA_ANGLE` degrees.
     """
-    kept: list[Camera] = []
+    kept_cameras: list[Camera] = []
+    max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
     for camera in cameras:
-        # Cosine of the largest angle between the axes of two cameras.
-        cosines = [float((camera.axes() * other.axes()).sum(1).min()) for other in kept]
-        if max(cosines, default=-1.0) < math.cos(math.radians(DISTINCT)):
-            kept.append(camera)
-    return kept
+        is_new = True
+        for kept_camera in kept_cameras:
+            # Cosines of the angles between the axes right, up and back of both cameras.
+            cosines = (camera.axes() * kept_camera.axes()).sum(axis=1)
+            is_new = is_new and float(cosines.min()) < max_cosine
+        if is_new:
+            kept_cameras.append(camera)
+    return kept_cameras
 
 
 class _LightFit(NamedTuple):
-    """Best light for a given camera.
+    """Light with which a render from a given camera resembles the photograph most.
 
     Attributes:
-        residuals: Differences between the render and the target for all pixels
-            and channels, followed by the weighted differences of the light's
-            coefficients from the expected light, shape (N,). The sum of their
-            squares is the error.
+        residuals: Differences between the render and the photograph for all pixels
+            and channels, followed by the weighted differences between the SH
+            coefficients of the light and of the expected light, shape (N,). The
+            sum of the squared residuals is the error of the camera.
         light: SH coefficients, shape (49, 3).
-        coverage: Fraction of each pixel that the mesh covers in the render,
+        coverage: Share of each pixel that the mesh covers in the render,
             shape (size²,).
     """
 
@@ -486,16 +516,16 @@ class _LightFit(NamedTuple):
 
 
 class _Target(NamedTuple):
-    """Image of an object that renders of a mesh should resemble.
+    """Photograph of an object that renders of a mesh should resemble.
 
     Attributes:
         image: Linear values of the photograph, shape (3, size²). Pixels outside
             of the object have the value `gray`.
-        mask: The object's share of each pixel, shape (size²,).
+        mask: Share of each pixel that the object covers, shape (size²,).
         gray: Linear value outside of the object, 0 or 1.
         mesh: Mesh of the object.
         size: Number of pixels per side.
-        options: Settings with which the mesh is rendered.
+        options: Arguments with which the mesh is rendered.
     """
 
     image: Tensor
@@ -509,34 +539,35 @@ class _Target(NamedTuple):
     def from_photograph(
         photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
     ) -> _Target:
-        """Resample a photograph and its mask, and replace the background by a gray value.
+        """Resample a photograph and its mask, and replace the background by black or white.
 
         Pixels on the border of the object show a mixture of object and
         background. They get the mean color of the object's pixels around them.
 
         Args:
             photograph: Linear values, shape (3, H, H).
-            mask: The object's share of each pixel, shape (H, H).
+            mask: Share of each pixel that the object covers, shape (H, H).
             mesh: Mesh of the object.
-            size: Number of pixels per side of the target.
-            options: Settings with which the mesh is rendered.
+            size: Number of pixels per side of the resampled photograph.
+            options: Arguments with which the mesh is rendered.
 
         Returns:
-            Target with `size` pixels per side.
+            Resampled photograph with `size` pixels per side.
         """
-        # 1 in pixels that the object covers completely, shape (1, H, H).
-        is_inside = (mask > WHOLE).double()[None]
-        # Mean color of the inside pixels around each pixel: sum over their count.
-        window = 2 * BORDER + 1
-        mean_inside_color = F.avg_pool2d(photograph * is_inside, window, 1, BORDER)
-        inside_fraction = F.avg_pool2d(is_inside, window, 1, BORDER)
-        border_color = mean_inside_color / inside_fraction.clamp(min=1e-9)
+        # 1 in pixels that the object covers completely, and 0 elsewhere, shape (1, H, H).
+        is_inside = (mask > WHOLE_PIXEL).double()[None]
+        # Both means below are over a square of pixels around each pixel. Their quotient is
+        # the mean color of the inside pixels in this square.
+        side = 2 * BORDER + 1
+        mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
+        inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
+        border_color = mean_color / inside_fraction.clamp(min=1e-9)
         color = torch.where(is_inside > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
-        # Black behind a bright object, and white behind a dark object, so that the
-        # silhouette stands out.
-        is_bright = float(object_image.sum()) > 0.5 * COLORS * float(mask.sum())
+        # The background becomes black behind a bright object, and white behind a dark one,
+        # so that the silhouette stands out.
+        is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum())
         gray = 0.0 if is_bright else 1.0
         image = object_image + gray * (1 - mask)
         return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
@@ -544,23 +575,23 @@ class _Target(NamedTuple):
     def fit_light(
         self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
     ) -> _LightFit:
-        """Find the light under which a render from a camera resembles the target most.
+        """Find the light under which a render from a camera resembles the photograph most.
 
         Args:
             camera: Camera from which the mesh is rendered.
-            min_coverage: Smallest share of a pixel that the mesh and the mask
-                must both cover. Other pixels do not count.
-            grid: Number of subdivisions of the grid of directions in which the
-                radiance of the light is constrained (see `LEAST_RADIANCE`).
+            min_coverage: Smallest share of a pixel that both the mesh and the mask
+                must cover. The fit ignores other pixels.
+            grid: Number of subdivisions of the icosphere whose vertices are the
+                directions in which the radiance of the light is constrained.
 
         Returns:
             Best light, with its residuals and the rendered coverage.
         """
         operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
-        # 49 lights, each with a single coefficient of 1, shape (49, 49, 3).
+        # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
-        unit_lights = unit_lights[..., None].expand(-1, -1, COLORS)
-        # Radiance of the P covered pixels per unit of each coefficient, (3, 49, P).
+        unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
+        # Radiance of the P covered pixels under each of these lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
         no_coverage = self.mask.new_zeros(self.size**2)
@@ -568,36 +599,34 @@ class _Target(NamedTuple):
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
         is_covered = torch.minimum(coverage, self.mask)[pixels] >= min_coverage
-        is_covered = is_covered.expand(COLORS, -1)
-        is_clipped = image >= CLIPPED
+        is_covered = is_covered.expand(CHANNELS, -1)
+        is_clipped = image >= CLIPPED_VALUE
         is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
-            # Normal equations of the least squares over the used pixels: matrix
-            # (3, 49, 49) and right side (3, 49).
+            # Least squares over the used pixels of each channel. The normal equations have
+            # a matrix of shape (3, 49, 49) and a right side of shape (3, 49).
             used_transfer = transfer * is_used[:, None]
             normal_matrix = used_transfer @ transfer.mT
-            # Weights of a smoothness penalty. It keeps coefficients that the pixels do
-            # not determine close to `expected_light`.
+            object_radiance = (image - background[pixels])[..., None]
+            right_side = (used_transfer @ object_radiance)[..., 0]
             penalty = self.penalty(normal_matrix)
-            difference = (image - background[pixels])[..., None]
-            right_side = (used_transfer @ difference)[..., 0]
             light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
-            # Rendered values of the covered pixels, shape (3, P).
-            predicted = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
-            # A clipped pixel may be brighter than the photograph shows. It is left
-            # out if the render is brighter than 1.
-            is_explained = is_covered & ~(is_clipped & (predicted > 1))
-            if torch.equal(is_explained, is_used):
+            # Values of the covered pixels in a render with this light, shape (3, P).
+            rendered = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
+            # A clipped pixel may be brighter than the photograph shows. The next fit
+            # ignores it if the render is brighter than 1 there.
+            is_trusted = is_covered & ~(is_clipped & (rendered > 1))
+            if torch.equal(is_trusted, is_used):
                 break
-            is_used = is_explained
-        rendered = background.repeat(COLORS, 1).index_copy(1, pixels, predicted)
-        differences = rendered.clamp(max=1) - self.image
+            is_used = is_trusted
+        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
+        differences = rendered_image.clamp(max=1) - self.image
         penalties = penalty.sqrt() * (light - expected_light).T
         residuals = torch.cat([differences.flatten(), penalties.flatten()])
         return _LightFit(residuals, light, coverage)
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-        """Sort cameras by the squared error that is left with the best light of each camera.
+        """Sort cameras by the squared error of a render with the best light of each camera.
 
         Args:
             cameras: Cameras to compare.
@@ -605,37 +634,42 @@ class _Target(NamedTuple):
         Returns:
             Pairs of the squared error and the camera, the smallest error first.
         """
-        errors = [
-            (float(self.fit_light(camera).residuals.square().sum()), camera) for camera in cameras
-        ]
-        return sorted(errors, key=lambda pair: pair[0])
+        pairs = []
+        for camera in cameras:
+            residuals = self.fit_light(camera).residuals
+            pairs.append((float(residuals.square().sum()), camera))
+        return sorted(pairs, key=lambda pair: pair[0])
 
     def penalty(self, normal_matrix: Tensor) -> Tensor:
-        """Compute the weights of the squared SH coefficients of a light in the error.
+        """Compute the weights of the smoothness penalty of a light.
 
-        The weights of band l are proportional to 1 + (l (l + 1))², because
-        -l (l + 1) is the eigenvalue of the Laplacian on the sphere. They are also
-        proportional to the squared brightness of the object under uniform light,
-        so the fit does not depend on the scale of the albedo.
+        The penalty is the weighted sum of the squared differences between the SH
+        coefficients and expected coefficients. The weight in band l is
+        proportional to 1 + (l (l + 1))², because -l (l + 1) is the eigenvalue of
+        the Laplacian on the sphere. It is also proportional to the squared
+        brightness of the object under uniform light. The fit therefore does not
+        depend on the scale of the albedo.
 
         Args:
-            normal_matrix: For each channel, the sums over pixels of products of
-                the radiances per unit of two coefficients, shape (3, 49, 49).
+            normal_matrix: Matrix of the normal equations of each channel,
+                shape (3, 49, 49). Entry (j, k) is the sum over pixels of the
+                radiance under coefficient j times the radiance under coefficient k.
 
         Returns:
             Weight of each coefficient, shape (49,).
         """
-        # Coefficient 0 is uniform light. The small addition avoids weights of 0.
-        uniform_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
+        # Coefficient 0 is uniform light. The small summand keeps the weights above 0, even if
+        # the object is black.
+        squared_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
-        return SMOOTH * uniform_brightness * (1 + (band * (band + 1)).square())
+        return SMOOTHNESS_WEIGHT * squared_brightness * (1 + (band * (band + 1)).square())
 
     def refine_camera(self, camera: Camera) -> Camera:
-        """Minimize the error over cameras near a given camera, and return the best camera."""
+        """Find the camera near a given camera whose render resembles the photograph most."""
         return _Descent(self, camera).run()
 
     def render_linear(self, camera: Camera, light: Tensor) -> Tensor:
-        """Render the mesh, and decode the image to linear values.
+        """Render the mesh in front of the gray background, and decode the image to linear values.
 
         Args:
             camera: Camera of the image.
@@ -651,16 +685,17 @@ class _Target(NamedTuple):
     def fit_final_light(self, camera: Camera) -> FittedScene:
         """Fit the light for the final camera, and compute how well the render fits.
 
+        Only the pixels that the object covers completely count.
+
         Args:
             camera: Camera that was found.
 
         Returns:
             Camera and light, with the error and the overlap of the silhouettes.
         """
-        # Only pixels inside of the object count, and the grid of directions is fine.
-        fit = self.fit_light(camera, WHOLE, FINAL_GRID)
+        fit = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
         rendered = self.render_linear(camera, fit.light)
-        is_inside = self.mask > WHOLE
+        is_inside = self.mask > WHOLE_PIXEL
         inside_image = self.image[:, is_inside]
         error = (rendered - self.image)[:, is_inside].norm() / inside_image.norm()
         intersection = torch.minimum(fit.coverage, self.mask).sum()
@@ -670,32 +705,32 @@ class _Target(NamedTuple):
 
 
 class _Descent:
-    """Gauss-Newton method in a trust region that minimizes the error over five camera values.
+    """Refinement of a camera: Gauss-Newton method in a trust region over five parameters.
 
-    The values are the polar angle and the azimuth in radians, the width divided
-    by the width of the first camera, and the shifts right and up divided by the
-    width of the first camera. The best light is computed for each camera
+    The parameters are the polar angle and the azimuth in radians, the width
+    divided by the width of the first camera, and the shifts right and up divided
+    by the width of the first camera. For each camera, the best light is computed
     (variable projection). The error jumps slightly if a sample changes from one
     face to another. Derivatives are therefore differences over about a pixel.
 
     Args:
-        target: Image that the render should resemble.
-        camera: First camera.
+        target: Photograph that the render should resemble.
+        camera: First camera, from which the method starts.
     """
 
     def __init__(self, target: _Target, camera: Camera):
-        """Keep the target and the first camera. `run` starts the descent."""
+        """Store the photograph and the first camera, without computing anything."""
         self._target = target
         self._first_camera = camera
 
     def run(self) -> Camera:
-        """Return the camera with the smallest error that the descent finds."""
+        """Minimize the error, and return the camera with the smallest error."""
         camera = self._first_camera
         right = camera.right / camera.width
         up = camera.up / camera.width
-        # Bounds of the five values.
-        lowest = [POLE_DISTANCE, -np.inf, 0.5, -1.0, -1.0]
-        highest = [math.pi - POLE_DISTANCE, np.inf, 2.0, 1.0, 1.0]
+        # Bounds of the parameters: polar angle, azimuth, relative width, right and up.
+        lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
+        highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
         polar = math.radians(camera.polar)
         azimuth = math.radians(camera.azimuth)
         start = np.array([polar, azimuth, 1.0, right, up]).clip(lowest, highest)
@@ -705,15 +740,24 @@ class _Descent:
             self._jacobian,
             bounds=(lowest, highest),
             x_scale="jac",
-            ftol=LEAST_GAIN,
-            xtol=LEAST_GAIN,
-            max_nfev=STEPS,
+            ftol=MIN_GAIN,
+            xtol=MIN_GAIN,
+            max_nfev=MAX_STEPS,
         )
         return self._camera_of(found.x)
 
-    def _camera_of(self, values: np.ndarray) -> Camera:
-        """Convert the five values of the descent, shape (5,), to a camera."""
-        polar, azimuth, relative_width, right, up = values.tolist()
+    def _camera_of(self, parameters: np.ndarray) -> Camera:
+        """Convert the five parameters of the refinement to a camera.
+
+        Args:
+            parameters: Polar angle and azimuth in radians, width divided by the
+                width of the first camera, and shifts right and up divided by the
+                width of the first camera, shape (5,).
+
+        Returns:
+            Camera.
+        """
+        polar, azimuth, relative_width, right, up = parameters.tolist()
         width = self._first_camera.width
         moved = replace(
             self._first_camera,
@@ -723,36 +767,38 @@ class _Descent:
             right=width * right,
             up=width * up,
         )
-        # The distance changes with the width, so that the field of view stays.
+        # The distance changes with the width, so that the field of view stays the same.
         if isinstance(moved, PerspectiveCamera):
             moved = replace(moved, distance=moved.distance * relative_width)
         return moved
 
-    def _residuals(self, values: np.ndarray) -> np.ndarray:
-        """Compute the residuals of the target for a camera with its best light.
+    def _residuals(self, parameters: np.ndarray) -> np.ndarray:
+        """Compute the differences between the photograph and a render with the best light.
 
         Args:
-            values: Five values of the camera, shape (5,).
+            parameters: Five parameters of the camera, shape (5,).
 
         Returns:
-            Residuals of `_LightFit`, shape (N,).
+            Residuals of the best light, shape (N,). The sum of their squares is the
+            error to minimize.
         """
-        return self._target.fit_light(self._camera_of(values)).residuals.numpy()
+        return self._target.fit_light(self._camera_of(parameters)).residuals.numpy()
 
-    def _jacobian(self, values: np.ndarray) -> np.ndarray:
-        """Compute the derivatives of the residuals by the five values, by central differences.
+    def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
+        """Compute the derivatives of the residuals by central differences.
 
         Args:
-            values: Five values of the camera, shape (5,).
+            parameters: Five parameters of the camera, shape (5,).
 
         Returns:
-            Derivatives, shape (N, 5).
+            Derivatives of the N residuals with respect to the parameters,
+            shape (N, 5).
         """
         columns = []
-        step_sizes = np.array(DIFFERENCES) / self._target.size
-        # Each row of the diagonal matrix changes one value.
+        step_sizes = np.array(DERIVATIVE_STEPS) / self._target.size
+        # Row k of the diagonal matrix is a step that changes only parameter k.
         for step in np.diag(step_sizes):
-            difference = self._residuals(values + step) - self._residuals(values - step)
+            difference = self._residuals(parameters + step) - self._residuals(parameters - step)
             columns.append(difference / (2 * step.sum()))
         return np.stack(columns, axis=1)
 
@@ -760,105 +806,126 @@ class _Descent:
 def _fit_channels(
     normal_matrix: Tensor, right_side: Tensor, penalty: Tensor, grid: int
 ) -> tuple[Tensor, Tensor]:
-    """Solve the normal equations for the light of the brightest channel, then of all channels.
+    """Fit the light of each color channel, with the light of the brightest channel as a guide.
 
-    The object may hardly reflect a color. For example, a yellow object hardly
+    An object may hardly reflect one color. For example, a yellow object hardly
     shows from where blue light comes. The light of each channel is therefore
-    expected to be a multiple of the light of the brightest channel, and
-    differences from this expected light are penalized.
+    expected to be a multiple of the light of the brightest channel. Differences
+    between the light and this expected light are penalized.
 
     Args:
-        normal_matrix: For each channel, the sums over pixels of products of the
-            radiances per unit of two coefficients, shape (3, 49, 49).
-        right_side: For each channel, the sums over pixels of products of the
-            radiance per unit of a coefficient and the radiance of the
-            photograph, shape (3, 49).
-        penalty: Weights of the squared differences of the coefficients from the
-            expected light, shape (49,).
-        grid: Number of subdivisions of the grid of directions in which the
-            radiance is constrained.
+        normal_matrix: Matrix of the normal equations of each channel,
+            shape (3, 49, 49). Entry (j, k) is the sum over pixels of the radiance
+            under coefficient j times the radiance under coefficient k.
+        right_side: Right side of the normal equations of each channel,
+            shape (3, 49). Entry j is the sum over pixels of the radiance under
+            coefficient j times the radiance in the photograph.
+        penalty: Weight of the squared difference between each coefficient and the
+            expected coefficient, shape (49,).
+        grid: Number of subdivisions of the icosphere whose vertices are the
+            directions in which the radiance of the light is constrained.
 
     Returns:
-        The light and the expected light, shape (49, 3) each. The expected light
-        of the brightest channel is zero.
+        The light and the expected light, shape (49, 3) each. For the brightest
+        channel, the expected light is zero.
     """
     regularized = normal_matrix + torch.diag(penalty)
-    # Coefficient 0 is uniform light.
+    # Coefficient 0 is uniform light, so this is the channel of the brightest color.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
-    # For each channel, the factor for `best_light` with the smallest squared error.
+    # For each channel, the multiple of `best_light` with the smallest squared error.
     squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
     factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
     expected = best_light[:, None] * factors.clamp(min=0)
     expected[:, best] = 0
-    # The penalty pulls each channel toward its expected light.
+    # The penalty pulls the light of each channel toward its expected light.
     penalized_right_side = right_side + (penalty[:, None] * expected).T
     return _nonnegative_light(regularized, penalized_right_side, grid), expected
 
 
 def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tensor:
-    """Minimize xᵀ S x / 2 − wᵀ x over lights x without negative radiance, for each channel.
+    """Minimize xᵀ S x / 2 - wᵀ x over all lights x without negative radiance.
 
-    With S = L Lᵀ and y = Lᵀ x, this is the projection of L⁻¹ w onto the cone
-    {y: G y ≥ 0}. Here G = R L⁻ᵀ, and a row of R maps x to its radiance in one
-    direction. By Moreau's decomposition, the projection is L⁻¹ w + Gᵀ μ with the
-    non-negative μ that minimizes |L⁻¹ w + Gᵀ μ|.
+    The rows of a matrix R map a light x to its radiance in the directions of a
+    grid, so the constraint is R x ≥ 0. With the Cholesky decomposition S = L Lᵀ
+    and y = Lᵀ x, the problem is to find the point y of the cone
+    {y: R L⁻ᵀ y ≥ 0} that is nearest to L⁻¹ w. By Moreau's decomposition, this
+    point is L⁻¹ w + L⁻¹ Rᵀ m, with the vector m ≥ 0 for which its length is
+    smallest. SciPy's `nnls` (non-negative least squares) finds m.
 
     Args:
         matrices: Positive definite matrix S of each of C channels,
             shape (C, 49, 49).
         right_sides: Vector w of each channel, shape (C, 49).
-        grid: Number of subdivisions of the grid of directions.
+        grid: Number of subdivisions of the icosphere whose vertices are the
+            directions.
 
     Returns:
-        Lights x, shape (49, C).
+        Light x of each channel, shape (49, C).
     """
-    # Matrix R: a light times a row gives the radiance in one of N directions, shape (N, 49).
+    # Matrix R of the docstring, shape (N, 49) for N directions.
     radiance_rows = _radiance_rows(grid)
     lights = []
     for matrix, right_side in zip(matrices.numpy(), right_sides.numpy(), strict=True):
-        # Matrix L, vector L⁻¹ w and matrix Gᵀ of the docstring.
         lower = np.linalg.cholesky(matrix)
+        # The vector L⁻¹ w and the matrix L⁻¹ Rᵀ of the docstring.
         unconstrained = solve_triangular(lower, right_side, lower=True)
         constraints = solve_triangular(lower, radiance_rows.T, lower=True)
-        nearest = unconstrained
-        # Only few directions limit the light. The first solution is constrained in
-        # some directions. Directions in which its radiance is negative are added,
-        # until there are none. The result is the same as with all directions.
-        is_constrained = np.arange(len(radiance_rows)) % FIRST_DIRECTIONS == 0
-        is_negative = unconstrained @ constraints < 0
-        while is_negative.any():
-            iterations = MAX_EXCHANGES * len(is_constrained)
-            active_constraints = constraints[:, is_constrained]
-            multipliers, _ = nnls(active_constraints, -unconstrained, maxiter=iterations)
-            nearest = unconstrained + active_constraints @ multipliers
-            is_negative = (nearest @ constraints < 0) & ~is_constrained
-            is_constrained |= is_negative
-        # x = L⁻ᵀ y.
+        nearest = _nearest_in_cone(unconstrained, constraints)
+        # The light is x = L⁻ᵀ y.
         lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
     return torch.from_numpy(np.stack(lights, axis=1))
 
 
+def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[Any]:
+    """Find the nearest point that has no negative product with any of N vectors.
+
+    Only few of the vectors limit the result. The problem is first solved with
+    some of them. Vectors whose product with the solution is negative are added
+    until there are none. The result is the same as with all vectors.
+
+    Args:
+        point: Given point, shape (K,).
+        constraints: The N vectors as columns, shape (K, N).
+
+    Returns:
+        Point that is nearest to the given point, shape (K,).
+    """
+    constraint_count = constraints.shape[1]
+    is_used = np.arange(constraint_count) % FIRST_DIRECTION_STEP == 0
+    nearest = point
+    is_negative = point @ constraints < 0
+    while is_negative.any():
+        used_constraints = constraints[:, is_used]
+        max_iterations = MAX_NNLS_ITERATIONS * constraint_count
+        multipliers, _ = nnls(used_constraints, -point, maxiter=max_iterations)
+        nearest = point + used_constraints @ multipliers
+        is_negative = (nearest @ constraints < 0) & ~is_used
+        is_used |= is_negative
+    return nearest
+
+
 @cache
 def _radiance_rows(grid: int) -> NDArray[Any]:
-    """Compute the matrix from SH coefficients to radiance above the smallest allowed radiance.
+    """Compute the matrix that maps a light to its radiance above the smallest allowed radiance.
 
-    The smallest allowed radiance is `LEAST_RADIANCE` times the mean radiance of
-    the light.
+    The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance
+    of the light.
 
     Args:
         grid: Number of subdivisions of the icosphere whose N vertices are the
             directions.
 
     Returns:
-        Matrix from 49 coefficients to N directions, shape (N, 49).
+        Matrix that maps the 49 SH coefficients of a light to N directions,
+        shape (N, 49).
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
-    # Coefficient 0 is the mean radiance times a constant, so reducing its column
-    # subtracts a fraction of the mean.
-    rows[:, 0] *= 1 - LEAST_RADIANCE
+    # The product of column 0 and coefficient 0 is the mean radiance of the light. Reducing
+    # the column therefore subtracts the smallest allowed radiance.
+    rows[:, 0] *= 1 - MIN_RADIANCE_RATIO
     return rows
 
 
@@ -871,7 +938,7 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     Args:
         camera: Camera whose direction is kept.
         mesh: Mesh of the object.
-        mask: The object's share of each pixel, shape (size, size).
+        mask: Share of each pixel that the object covers, shape (size, size).
 
     Returns:
         Copy of the camera with another width, shift and, if it has perspective,
@@ -881,6 +948,31 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)
     mesh_high = points.max(0)
+    mask_low, mask_high = _mask_box(mask)
+    mesh_area = float(np.prod(mesh_high - mesh_low))
+    mask_area = float(np.prod(mask_high - mask_low))
+    # In the image of a camera that is wider by this factor, lengths are smaller by this
+    # factor.
+    factor = math.sqrt(mesh_area / mask_area)
+    width = camera.width * factor
+    mask_center = (mask_low + mask_high) / 2
+    shift = mask_center - (mesh_low + mesh_high) / 2 / factor
+    framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
+    if isinstance(framed, PerspectiveCamera):
+        framed = replace(framed, distance=framed.distance * factor)
+    return framed
+
+
+def _mask_box(mask: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Compute the bounding box of the pixels that an object covers by more than half.
+
+    Args:
+        mask: Share of each pixel that the object covers, shape (size, size).
+
+    Returns:
+        Lower left and upper right corner of the box in image coordinates from -1
+        to 1, with x to the right and y up, shape (2,) each.
+    """
     size = len(mask)
     rows = np.flatnonzero((mask > 0.5).any(1).numpy())
     columns = np.flatnonzero((mask > 0.5).any(0).numpy())
@@ -888,14 +980,4 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     right = 2 * (columns[-1] + 1) / size - 1
     bottom = 1 - 2 * (rows[-1] + 1) / size
     top = 1 - 2 * rows[0] / size
-    mesh_area = float(np.prod(mesh_high - mesh_low))
-    mask_area = (right - left) * (top - bottom)
-    # A camera that is wider by this factor shows the mesh smaller by this factor.
-    factor = math.sqrt(mesh_area / mask_area)
-    width = camera.width * factor
-    mask_center = np.array([left + right, bottom + top]) / 2
-    shift = mask_center - (mesh_low + mesh_high) / 2 / factor
-    framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
-    if isinstance(framed, PerspectiveCamera):
-        framed = replace(framed, distance=framed.distance * factor)
-    return framed
+    return np.array([left, bottom]), np.array([right, top])

@@ -1,6 +1,6 @@
 """Conversion of linear radiance to image values: background, clamping and encoding.
 
-Clamping is not linear. These steps therefore come after all sums of radiance.
+Clamping is not linear. The conversion therefore comes after all sums of radiance.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 # Linear value at which the sRGB curve changes from a straight line to a power function.
 SRGB_KNEE = 0.0031308
-# Encoded value at the same point of the curve.
+# Encoded value at which the sRGB curve changes from a straight line to a power function.
 SRGB_ENCODED_KNEE = 0.04045
-# Weights of linear red, green and blue in the luminance (Rec. 709, IEC 61966-2-1).
+# Weights of the linear red, green and blue in the luminance (Rec. 709, IEC 61966-2-1).
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -82,23 +82,23 @@ def composite(
             encoding is unknown.
     """
     batch_shape = radiance.shape[:-2]
-    # One background for each image, with the pixels along the last axis,
-    # shape (..., 3, size²).
-    background_pixels = background.expand(*batch_shape, *background.shape[-3:]).flatten(-2)
-    behind = background_pixels.index_select(-1, pixels)
-    covered = tonemap(radiance, coverage[None], behind, encoding)
+    backgrounds = background.expand(*batch_shape, *background.shape[-3:])
+    # The last axis is over the pixels of an image in row-major order, shape (..., 3, size²).
+    background_pixels = backgrounds.flatten(-2)
+    behind_mesh = background_pixels.index_select(-1, pixels)
+    covered = tonemap(radiance, coverage[None], behind_mesh, encoding)
     images = background_pixels.scatter(-1, pixels.expand(covered.shape), covered)
     return images.unflatten(-1, background.shape[-2:])
 
 
 def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
-    """Convert a background to images.
+    """Convert a gray value, a color or images to background images.
 
     Args:
         background: Gray value, color of shape (3,), or images of shape
             (..., 3, size, size), with values in [0, 1].
         size: Width and height of the images in pixels.
-        like: Tensor with the dtype and device of the result.
+        like: Tensor whose dtype and device the result gets.
 
     Returns:
         Images, shape (..., 3, size, size).
@@ -118,16 +118,18 @@ def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor
 
 
 def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """Compute the linear values that a background adds to the radiance in front of it.
+    """Compute the linear values that the background adds to pixels that a mesh partly covers.
 
     Args:
         coverage: Fraction of each of P pixels that shows the mesh, in [0, 1],
             shape (..., 1, P).
-        background: Image values in [0, 1], shape (..., 3 or 1, P or 1).
+        background: Image values of the background in [0, 1],
+            shape (..., 3 or 1, P or 1).
         encoding: Encoding of the background, "linear" or "srgb".
 
     Returns:
-        Linear values, shape (..., 3 or 1, P).
+        Linear background times the uncovered fraction of each pixel,
+        shape (..., 3 or 1, P).
 
     Raises:
         InputError: If a tensor has NaN, infinite or too large values, or if the
@@ -140,9 +142,9 @@ def background_term(coverage: Tensor, background: Tensor, encoding: str = "linea
 def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
     """Clamp values to [0, ceiling], with a gradient of 1 at the limits themselves.
 
-    With this gradient, an optimization can increase a light of 0 on a black
-    background. The gradient of `torch.clamp` at its limits differs between
-    versions of torch.
+    With a gradient of 0 at the limit 0, an optimization could not increase a
+    light of 0 in front of a black background. The gradient of `torch.clamp` at
+    its limits differs between versions of torch.
 
     Args:
         values: Values to clamp, shape (...).
@@ -160,19 +162,19 @@ class _Clamp(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, ceiling: Tensor | float) -> Tensor:
-        """Clamp the values.
+        """Clamp values to [0, ceiling].
 
         Args:
             ctx: Context of autograd.
             values: Values to clamp, any shape.
-            ceiling: Upper limit, a number or a tensor that broadcasts.
+            ceiling: Upper limit, a number or a tensor that broadcasts to `values`.
 
         Returns:
-            Clamped values, same shape.
+            Clamped values, same shape as `values`.
         """
         clamped = values.clamp(min=0).clamp_(max=ceiling)
-        # 1.0 for values that clamping did not change, and 0.0 for other values. With
-        # booleans, the comparison and the product would be several times slower.
+        # 1.0 for values that clamping did not change, and 0.0 for other values. A product
+        # with booleans would be several times slower than a product with numbers.
         is_unclamped = torch.eq(values, clamped, out=torch.empty_like(values))
         ctx.save_for_backward(is_unclamped)
         return clamped
@@ -180,14 +182,16 @@ class _Clamp(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient by the values, which is 0 for values that were clamped.
+        """Compute the gradient of the loss, which is 0 for values that clamping changed.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the clamped values, any shape.
+            upstream: Gradient of the loss with respect to the clamped values, any
+                shape.
 
         Returns:
-            Gradient by the values, same shape, and None for the ceiling.
+            Gradient with respect to the values, same shape, and None, because the
+            ceiling has no gradient.
         """
         (is_unclamped,) = ctx.saved_tensors
         return upstream * is_unclamped, None
@@ -210,26 +214,26 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
-    # The derivative of the power is infinite at 0. Although `torch.where` selects the
-    # line there, the gradient would be infinity times 0, which is NaN. The lower limit
-    # avoids this.
+    # The power function has an infinite derivative at 0. Without the lower limit, its gradient
+    # there would be NaN, although `torch.where` selects the straight line.
     curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 
 
 def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
-    """Convert the gradient by encoded values to the gradient by linear values.
+    """Compute the gradient with respect to linear values from that for encoded values.
 
-    The result equals that of autograd for `encode` to the bit, because the
-    operations and their order are the same.
+    The bits of the result are the same as those of autograd for `encode`, because
+    the operations and their order are the same.
 
     Args:
-        linear: Linear values in [0, 1], shape (...).
-        upstream: Gradient by the encoded values, same shape.
+        linear: Linear values in [0, 1] that `encode` took, shape (...).
+        upstream: Gradient of the loss with respect to the encoded values, same
+            shape.
         encoding: Encoding, "linear" or "srgb".
 
     Returns:
-        Gradient by the linear values, same shape.
+        Gradient of the loss with respect to the linear values, same shape.
     """
     if encoding == "linear":
         return upstream
@@ -259,7 +263,7 @@ def decode(image: Tensor, encoding: str) -> Tensor:
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Round image values to 8 bits.
+    """Convert image values in [0, 1] to 8-bit values.
 
     Args:
         image: Image values in [0, 1], shape (...).
@@ -267,12 +271,12 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
     Returns:
         Whole numbers from 0 to 255, uint8, same shape.
     """
-    # Rounding in place saves the memory of a copy.
+    # `round_` rounds in place, which saves the memory of a copy.
     return (image * 255).round_().to(torch.uint8)
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
-    """Convert 8-bit values to values in [0, 1].
+    """Convert 8-bit image values to values in [0, 1].
 
     Args:
         images: Whole numbers from 0 to 255, uint8, shape (...).

@@ -1,11 +1,10 @@
 """Cut square windows out of photographs, as if the camera had been turned toward an object.
 
-The optical axis of our cameras passes through the image center. If an object is
-elsewhere in a photograph, this module computes the image of a camera at the same
-place that is turned toward the object. The photograph and this image are related
-by a homography (Hartley and Zisserman 2004, section 8.4.2). Photographs must not
-be cropped, because the optical axis of the camera must pass through the center
-of the photograph.
+An object may be anywhere in a photograph. This module computes the square image
+that the camera would have taken if it had been turned toward the object. The
+photograph and this image are related by a homography (Hartley and Zisserman
+2004, section 8.4.2). Photographs must not be cropped, because the optical axis
+of the camera must pass through the center of the photograph.
 
 A camera has the axes right, up and back. It looks along minus back.
 """
@@ -28,17 +27,17 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 Array = NDArray[Any]
-# Smallest number of samples along one side of a pixel in `Window.cut`, if the pixels of
-# the window are larger than those of the photograph.
-LEAST_SAMPLES = 8
-# Number of pixels that `Window.cut` reads around the window, because bicubic
-# interpolation needs neighbors.
+# Smallest number of samples along one side of a pixel, if a window of a photograph is
+# resampled to pixels that are larger than those of the photograph.
+MIN_SAMPLES = 8
+# Number of additional rows and columns of pixels that are read on each side of a window. The
+# bicubic interpolation at the border of the window needs them.
 BORDER = 2
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """Photograph of an upright camera.
+    """Photograph that an upright camera took.
 
     Attributes:
         pixels: RGB values, uint8, shape (H, W, 3).
@@ -49,29 +48,33 @@ class Photograph:
     pixels: UInt8[Array, "height width 3"]
     focal_length: float | None
 
-    def window(self, center: Array, side: float, above: Array) -> Window:
-        """Compute the window that a camera sees that is turned toward a point, without roll.
+    def window(self, center: Array, side: float, z_axis: Array) -> Window:
+        """Compute a square window around a point of the photograph.
+
+        The window shows what the camera would see if it were turned toward the
+        point and stayed upright. Without perspective, the window is a square of the
+        photograph itself.
 
         Args:
             center: Column and row of the point in the photograph, in pixels,
                 shape (2,).
             side: Side of the window in pixels.
-            above: World's z-axis in the axes of the photograph's camera,
-                shape (3,).
+            z_axis: World's z-axis in the axes right, up and back of the camera that
+                took the photograph, shape (3,).
 
         Returns:
-            Window whose center shows the point.
+            Window with the point in its center.
         """
         focal_length = self.focal_length
         if focal_length is None:
-            # Without perspective, the window is shifted. Rows are counted downward.
+            # Columns grow to the right as x does, but rows grow downward.
             column, row = center
-            to_pixels = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
-            return Window(to_pixels, side, np.eye(3))
+            homography = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
+            return Window(homography, side, np.eye(3))
         height, width = self.pixels.shape[:2]
-        # Matrix from a direction (x, y, z) in the axes of the camera to homogeneous
-        # (column, row). The direction meets the image plane at
-        # (x, y) · focal_length / -z.
+        # Matrix from a direction (x, y, z) in the axes of the camera to the homogeneous
+        # position (column, row, 1) · (-z) in the photograph. The column is
+        # width / 2 - focal_length · x / z.
         to_pixels = np.array(
             [
                 [focal_length, 0, -width / 2],
@@ -79,31 +82,32 @@ class Photograph:
                 [0.0, 0.0, -1.0],
             ]
         )
-        # Direction to the point, and axes of the turned camera.
+        # Direction in which the camera sees the point.
         forward = np.linalg.solve(to_pixels, np.array([*center, 1.0]))
+        # Axes of the turned camera. Its axis to the right is horizontal.
         back = -forward / np.linalg.norm(forward)
-        right = np.cross(above, back)
+        right = np.cross(z_axis, back)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(back, right), back])
-        # A point (x, y, 1) of the window has the direction (x, y, -focal_length) in the
-        # axes of the turned camera.
+        # The turned camera sees the point (x, y, 1) of the window in the direction
+        # (x, y, -focal_length).
         to_direction = np.diag([1.0, 1.0, -focal_length])
         return Window(to_pixels @ axes.T @ to_direction, side, axes)
 
 
 @dataclass(frozen=True)
 class Window:
-    """Square image that a camera would see that is turned toward a part of a photograph.
+    """Square window of a photograph, as if the camera had been turned toward its center.
 
     Attributes:
-        homography: Matrix from a point of the window to homogeneous
-            (column, row, weight) in the photograph, shape (3, 3). The point is
-            (x, y, 1), with x to the right and y up, in pixels from the center of
-            the window.
+        homography: Matrix from a point (x, y, 1) of the window to the homogeneous
+            position (column, row, 1) · w in the photograph, with any w > 0,
+            shape (3, 3). The point is in pixels from the window center, with x to
+            the right and y up.
         side: Side of the window in pixels. The pixels have the size of those in
             the center of the photograph.
-        axes: Axes right, up and back of the turned camera as rows, in the axes
-            of the photograph's camera, shape (3, 3).
+        axes: Axes right, up and back of the turned camera as rows, in the axes of
+            the camera that took the photograph, shape (3, 3).
     """
 
     homography: Array
@@ -117,7 +121,7 @@ class Window:
         encoding: str = "linear",
         beyond: int | None = None,
     ) -> Float[Tensor, "channels size size"]:
-        """Resample the photograph in the window, with linear values.
+        """Cut the window out of the photograph, and resample it.
 
         Args:
             photograph: Photograph or mask, uint8, shape (H, W, C).
@@ -130,51 +134,55 @@ class Window:
             Linear values in [0, 1], float32, shape (C, size, size).
         """
         is_enlarged = self.side < size
-        samples = 1 if is_enlarged else max(LEAST_SAMPLES, math.ceil(self.side / size))
-        part = self._needed_part()
-        part_pixels = part.read(photograph, beyond)
-        linear = decode(torch.from_numpy(part_pixels).permute(2, 0, 1) / 255, encoding)[None]
-        # Large pixels are the mean of samples with the values of the nearest pixels, as
-        # with the box filter of the renderer. Small pixels would have visible steps, so
-        # they are interpolated.
+        samples = 1 if is_enlarged else max(MIN_SAMPLES, math.ceil(self.side / size))
+        rectangle = self._needed_rectangle()
+        pixels = rectangle.read(photograph, beyond)
+        linear = decode(torch.from_numpy(pixels).permute(2, 0, 1) / 255, encoding)[None]
+        # If pixels become larger, their values are means over many samples, as with the box
+        # filter of the renderer. If they become smaller, the nearest pixel would make
+        # visible steps, so the values are interpolated.
         mode = "bicubic" if is_enlarged else "nearest"
         resolution = size * samples
-        # Positions of samples along one side, in pixels from the window center.
+        # Positions of all samples along one side, in pixels from the window center.
         offsets = ((np.arange(resolution) + 0.5) / resolution - 0.5) * self.side
+        # Positions upward from the window center of the sample rows of each row of pixels.
+        # The first row of pixels is at the top.
+        heights = -offsets.reshape(size, samples)
         rows = []
-        # Resampling one row of pixels at a time limits the memory.
-        for sample_rows in -offsets.reshape(size, samples):
-            points = np.stack(self.pixels(*np.meshgrid(offsets, sample_rows)), axis=-1)
-            grid = torch.from_numpy(part.normalized(points)).to(linear)[None]
+        # Resampling one row of pixels at a time needs less memory.
+        for row_heights in heights:
+            x, y = np.meshgrid(offsets, row_heights)
+            points = np.stack(self.pixels(x, y), axis=-1)
+            grid = torch.from_numpy(rectangle.normalized(points)).to(linear)[None]
             at_samples = F.grid_sample(linear, grid, mode, align_corners=False)
             rows.append(F.avg_pool2d(at_samples, samples)[0])
         return torch.cat(rows, dim=1).clamp(0, 1)
 
     def pixels(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Map points in the window to the photograph.
+        """Map points of the window to positions in the photograph.
 
         Args:
-            x: Pixels to the right of the center of the window, any shape.
-            y: Pixels above the center, of the same shape.
+            x: Distances to the right of the window center in pixels, any shape.
+            y: Distances above the window center in pixels, same shape.
 
         Returns:
-            Columns and rows of the photograph.
+            Columns and rows in the photograph, same shape as `x` each.
         """
         points = np.stack([x, y, np.ones_like(x)])
         columns, rows, weights = np.tensordot(self.homography, points, 1)
         return columns / weights, rows / weights
 
-    def _needed_part(self) -> _Part:
-        """Find the rectangle of the photograph that the window shows, with a border.
+    def _needed_rectangle(self) -> _Rectangle:
+        """Find the rectangle of pixels of the photograph that the window shows, with a border.
 
-        A homography maps lines to lines. The corners of the window are therefore
-        its outermost points in the photograph.
+        A homography maps lines to lines. The outermost points of the window in the
+        photograph are therefore its corners.
         """
         half = self.side / 2
         x = np.array([-half, half, half, -half])
         y = np.array([-half, -half, half, half])
         columns, rows = self.pixels(x, y)
-        return _Part(
+        return _Rectangle(
             left=math.floor(columns.min()) - BORDER,
             top=math.floor(rows.min()) - BORDER,
             right=math.ceil(columns.max()) + BORDER,
@@ -183,14 +191,14 @@ class Window:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Rectangle of pixels, which may extend beyond the photograph.
+class _Rectangle:
+    """Rectangle of pixels of a photograph, which may extend beyond the photograph.
 
     Attributes:
-        left: First column.
-        top: First row.
-        right: Column after the last one.
-        bottom: Row after the last one.
+        left: First column of pixels.
+        top: First row of pixels.
+        right: Column after the last column.
+        bottom: Row after the last row.
     """
 
     left: int
@@ -220,14 +228,14 @@ class _Part:
         return pixels
 
     def normalized(self, points: Array) -> Array:
-        """Convert columns and rows of the photograph to coordinates of `grid_sample`.
+        """Convert positions in the photograph to coordinates for torch's `grid_sample`.
 
         Args:
-            points: Columns and rows in pixels, shape (..., 2).
+            points: Columns and rows in the photograph in pixels, shape (..., 2).
 
         Returns:
-            Coordinates (x, y), which are in [-1, 1] in the rectangle,
-            shape (..., 2).
+            Coordinates (x, y), shape (..., 2). They go from -1 to 1 in the
+            rectangle.
         """
         extent = [self.right - self.left, self.bottom - self.top]
         return 2 * (points - [self.left, self.top]) / extent - 1

@@ -15,7 +15,7 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fitting import (
     FINAL_GRID,
-    LEAST_RADIANCE,
+    MIN_RADIANCE_RATIO,
     FittedScene,
     _Descent,
     _nonnegative_light,
@@ -223,7 +223,7 @@ def test_no_other_nonnegative_light_solves_a_quadratic_program_better(program):
     directions = random_directions(2000)
     roots = basis(directions, 3) @ draw(16, 200, seed=2)
     squared_lights = torch.linalg.lstsq(basis(directions, 6), roots.square()).solution
-    squared_lights[0] *= 1 + 2 * LEAST_RADIANCE
+    squared_lights[0] *= 1 + 2 * MIN_RADIANCE_RATIO
     no_light = torch.zeros(49, 1, dtype=torch.float64)
     other_lights = torch.cat([squared_lights, no_light], dim=1)
 
