@@ -1,7 +1,7 @@
 """Images of meshes in one call.
 
-`render` returns differentiable images. `precompute_transfer` returns operators,
-which give images under many lights.
+`render` returns differentiable images. `precompute_transfer` returns transfer
+operators, which compute images under many lights without rasterizing again.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ from renderer.visibility.rasterizers import choose
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Type of an entry of the argument `lights` of `render`: lamps or a projector, alone or
-# with their coefficients, shape (size, 3).
+# Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair
+# with its coefficients.
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
-# Largest albedo that `render` accepts. It is 1, and a margin for rounding errors.
-WHITE = 1 + 1e-4
-# Description of the argument `lights` in errors.
+# Largest albedo that `render` accepts: 1 and a margin for rounding errors.
+MAX_ALBEDO = 1 + 1e-4
+# What errors ask for if the argument `lights` of `render` is wrong.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
-# Default camera of `light_sphere`. It has the direction of the first camera of
-# `orbit_cameras`.
+# Default camera for pictures of lights. It looks from the same direction as the first camera
+# of `orbit_cameras`.
 _OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)
-# Function `choose` with a cache. Choosing "opengl" tests the driver, which takes longer
-# than rendering an image.
+# Choosing the rasterizer "opengl" tests the graphics driver, which takes longer than
+# rendering an image. The choice is therefore cached.
 _choose = cache(choose)
 
 
@@ -79,55 +79,54 @@ def render(
     silhouettes: bool = False,
     rasterizer: str = "auto",
 ) -> Float[Tensor, "*views 3 size size"]:
-    """Render a mesh from V cameras, differentiable in light, vertices, albedo and gloss.
+    """Render a mesh, differentiable with respect to light, vertices, albedo and gloss.
 
-    A camera alone, outside a list, gives an image without a views dimension.
-
-    NumPy arrays and lists are taken instead of tensors. The images have the
+    Arguments can be NumPy arrays or lists instead of tensors. The images have the
     dtype and the device of the light.
 
-    Gradients by the vertices hold visibility constant. Gradients by vertices,
-    albedo and gloss also hold shadows and bounces of environment light constant.
+    Gradients with respect to the vertices do not include visibility changes,
+    unless `silhouettes` is True. Gradients with respect to vertices, albedo and
+    gloss do not include changes of shadows and bounces of environment light.
 
     Args:
-        mesh: The mesh, of N vertices and F faces.
+        mesh: Mesh with N vertices and F faces.
         cameras: One camera, or a list of V cameras.
-        light: Coefficients of environment light, shape ((degree + 1)², 3), such
-            as `nb.load_light` returns. None for no environment light.
-        size: Pixels per side of the images.
-        background: Gray value, color (3,) or images in [0, 1], see
-            `renderer.image.as_background`. One for all views, or an image for each.
-
-        lights: Local lights, such as `nb.Lamps`, alone for full
-            white power or in pairs with coefficients (size, 3). They cast shadows
-            and do not bounce.
-
-        vertices: Positions in world units instead of the mesh's, shape (N, 3).
-        albedo: Linear albedo in [0, 1] instead of the mesh's colors, shape (F, 3)
-            for a color per face or (height, width, 3) for the only texture.
-        albedo_scale: Factor of the albedo, also beyond 1.
-        gloss: Gloss instead of the mesh's.
-
-        samples: Samples per side of a pixel. None for 2, or 8 with silhouettes.
+        light: SH coefficients of environment light, such as `nb.load_light`
+            returns, shape ((degree + 1)², 3). None for no environment light.
+        size: Width and height of the images in pixels.
+        background: Background in [0, 1]: a gray value, a color of shape (3,), one
+            image of shape (3, size, size), or an image for each camera.
+        lights: Local lights, such as `nb.Lamps`. A light alone has full white
+            power. A light can also be in a pair with its coefficients,
+            shape (light.size, 3). Local lights cast shadows, but do not bounce.
+        vertices: Positions in world units, shape (N, 3). None uses the positions
+            of the mesh.
+        albedo: Linear albedo in [0, 1], shape (F, 3) for one color per face, or
+            (height, width, 3) for the only texture. None uses the colors of the
+            mesh.
+        albedo_scale: Factor for the albedo. The product may exceed 1.
+        gloss: Specular reflection. None uses the gloss of the mesh.
+        samples: Number of samples along one side of a pixel. None for 2, or for 8
+            if `silhouettes` is True.
         encoding: Encoding of the image values, "linear" or "srgb".
-        rasterizer: What finds the visible faces, "auto", "opengl", "numba" or
-            "numpy".
-
-        normals: "smooth" for interpolated normals, "flat" for a normal per face.
-        shadows: Whether the mesh casts shadows of environment light on itself.
-        bounces: Number of bounces of light between the surfaces of the mesh, which
-            include shadows.
-        silhouettes: Whether gradients by the vertices, and by fields of the
-            cameras that are tensors of one number, also see how outlines and
-            surfaces move in the image.
+        normals: "smooth" interpolates the normals of the vertices. "flat" uses one
+            normal per face.
+        shadows: True if the mesh casts shadows of environment light on itself.
+        bounces: Number of bounces of light between the surfaces of the mesh. One
+            or more includes shadows.
+        silhouettes: True includes visibility changes at moving silhouettes in
+            gradients with respect to the vertices, and with respect to fields of
+            the cameras that are tensors.
+        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba"
+            or "numpy".
 
     Returns:
-        Images in [0, 1], shape (V, 3, size, size), or (3, size, size) of one
-        camera.
+        Images in [0, 1], shape (V, 3, size, size). For one camera that is not in a
+        list, one image of shape (3, size, size).
 
     Raises:
-        InputError: If an argument holds NaN or has another type, shapes do not
-            fit, a choice is unknown, or the albedo is not in [0, 1].
+        InputError: If an argument holds NaN or has a wrong type or shape, if a
+            choice is unknown, or if the albedo is not in [0, 1].
 
     Example:
         >>> import torch
@@ -154,7 +153,7 @@ def render(
             f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}"
         )
     given_lights = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
-    # Pairs of lamps or a projector with their coefficients.
+    # Each local light becomes a pair of a basis and its coefficients.
     local_lights = [_with_coefficients(local_light) for local_light in given_lights]
     # The images have the dtype and the device of the first light.
     like = torch.zeros(0) if light is None else light
@@ -163,12 +162,12 @@ def render(
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
-    # Visible faces and blocked rays are found without gradients, so these steps take a mesh
-    # and cameras with plain numbers.
-    moved = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
+    # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with
+    # plain numbers instead of tensors.
+    moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
     fixed_cameras = [camera.fixed() for camera in all_cameras]
     views = build_fragments(
-        moved.vertices,
+        moved_mesh.vertices,
         mesh.faces,
         fixed_cameras,
         settings,
@@ -176,52 +175,56 @@ def render(
         closed=mesh.closed,
     )
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
-    # Shadows on environment light and bounces. None if neither is rendered.
-    transport = build_transport(moved, settings, albedo_scale, split.basis)
-    rays = transport.rays if transport else Rays(moved)
+    # Computes the bounces and the shadows of environment light. None without both.
+    transport = build_transport(moved_mesh, settings, albedo_scale, split.basis)
+    rays = transport.rays if transport else Rays(moved_mesh)
     images = []
-    for camera, view, behind in zip(all_cameras, views, backgrounds, strict=True):
+    for camera, view, view_background in zip(all_cameras, views, backgrounds, strict=True):
         fragments = view.to(like.device)
-        # Function of the albedo and of the environment light that computes how shadows and
-        # bounces change the radiance.
         indirect = None
         if transport:
-            surface = Surface(moved, view, settings, given_gloss=gloss)
+            surface = Surface(moved_mesh, view, settings, given_gloss=gloss)
+            # Takes the albedo and the environment light, and returns the radiance that
+            # shadows and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
-        shown = ShadedView(
+        shaded_view = ShadedView(
             mesh=mesh,
             fragments=fragments,
             settings=settings,
             vertices=vertices,
-            albedo=_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
+            albedo=_sample_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
             light=split,
             rays=rays,
             gloss=gloss,
             indirect=indirect,
         )
-        seen = shown.pixel_radiance(camera, behind.flatten(1))
-        images.append(composite(seen.radiance, seen.coverage, seen.pixels, behind, encoding))
+        seen = shaded_view.pixel_radiance(camera, view_background.flatten(1))
+        image = composite(seen.radiance, seen.coverage, seen.pixels, view_background, encoding)
+        images.append(image)
     return images[0] if isinstance(cameras, Camera) else torch.stack(images)
 
 
 @cache
 def _white_ball() -> Mesh:
-    """Create a white ball of radius 1."""
+    """Create a white ball of radius 1 around the origin."""
     return Mesh.plain(*sphere(5))
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Split an entry of the argument `lights` of `render` into basis and coefficients.
+    """Split a local light for `render` into its basis and its coefficients.
 
     Args:
-        light: Lamps or a projector, alone or in a pair with coefficients.
+        light: A `Lamps` or a `Projector` object, alone or in a pair with its
+            coefficients.
 
     Returns:
-        Basis, and its coefficients, shape (size, 3). They are white light at full
-        power if none were given.
+        A tuple of
+        - the `Lamps` or `Projector` object, which is the basis of the light;
+        - the coefficients, shape (basis.size, 3). If none were given, they are
+          white light at full power.
 
     Raises:
-        InputError: If the entry has another type, or the coefficients have a wrong
+        InputError: If the light has another type, or the coefficients have a wrong
             shape or NaN.
     """
     pair = light if isinstance(light, tuple) else (light, None)
@@ -292,26 +295,28 @@ def precompute_transfer(
 ) -> TransferOperator | TransferOperators:
     """Compute a transfer operator for each camera.
 
-    An operator gives images, and their gradients by the light, without rasterizing
-    again. `operator.image(light, background)` equals the image of `render` up to
-    rounding.
+    A transfer operator computes images under any environment light, and their
+    gradients with respect to the light, without rasterizing again. Except for
+    rounding errors, `operator.image(light, background)` is the image of `render`.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh to render.
         cameras: One camera, or a list of V cameras.
         size: Width and height of the images in pixels.
-        albedo_scale: Factor of the albedo.
-        gloss: Gloss instead of the mesh's.
-        samples: Samples per side of a pixel.
+        albedo_scale: Factor for the albedo.
+        gloss: Specular reflection. None uses the gloss of the mesh.
+        samples: Number of samples along one side of a pixel.
         encoding: Encoding of the image values, "linear" or "srgb".
-        normals: "smooth" for interpolated normals, "flat" for a normal per face.
-        shadows: Whether the mesh casts shadows of environment light on itself.
-        bounces: Number of bounces of light between the surfaces of the mesh, which
-            include shadows.
-        rasterizer: "auto", "opengl", "numba" or "numpy".
+        normals: "smooth" interpolates the normals of the vertices. "flat" uses one
+            normal per face.
+        shadows: True if the mesh casts shadows of environment light on itself.
+        bounces: Number of bounces of light between the surfaces of the mesh. One
+            or more includes shadows.
+        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba"
+            or "numpy".
 
     Returns:
-        The operator of one camera, or the sequence of operators of a list of
+        The operator for one camera, or the sequence of operators for a list of
         cameras. The method `image` of the sequence renders all views in one call.
 
     Raises:
@@ -340,22 +345,21 @@ def precompute_transfer(
 def light_sphere(
     light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS
 ) -> Tensor:
-    """Render a white diffuse ball in a light, to show the light as an image.
+    """Render a white diffuse ball under a light, to show the light as an image.
 
-    The ball has radius 1 and lies at the origin, so that the image also shows
-    how far lamps are from it. It fills the image, as seen from afar. Under even
-    light of radiance 1, the ball is white. A ball that mirrors would instead
-    show coefficients that no diffuse surface reflects.
+    The ball has radius 1, lies at the origin and fills the image. Under uniform
+    light of radiance 1, the ball is white. (A mirror ball would also show
+    coefficients that no diffuse surface reflects.)
 
     Args:
         light: Coefficients of the light, shape (basis.size, 3).
-        size: Pixels per side.
-        camera: Camera whose direction shows the ball.
-        basis: Basis of the coefficients.
+        size: Width and height of the image in pixels.
+        camera: Camera that gives the viewing direction.
+        basis: Basis of the coefficients. The default is spherical harmonics.
 
     Returns:
-        Image before a white background, sRGB-encoded, shape (3, size, size),
-        float32.
+        sRGB-encoded image in front of a white background, float32,
+        shape (3, size, size).
 
     Raises:
         InputError: If the light has values that are not finite.
@@ -370,11 +374,19 @@ def light_sphere(
     if light.ndim != 2 or light.shape[1] != 3:
         shape = tuple(light.shape)
         raise InputError(f"light has shape {shape}: give coefficients {(basis.size, 3)}")
-    sky, local = split_light(basis, light.detach().cpu().float())
+    sky, local_lights = split_light(basis, light.detach().cpu().float())
+    # Uniform light of radiance 1 has the irradiance π.
     sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
     return render(
-        _white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy"
+        _white_ball(),
+        camera,
+        sky,
+        size,
+        background=1.0,
+        lights=local_lights,
+        encoding="srgb",
+        rasterizer="numpy",
     )
 
 
@@ -390,13 +402,13 @@ def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
     Raises:
         InputError: If the sequence is empty or has an entry of another type.
     """
-    advice = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
-    listed = as_list(
-        "cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice
-    )
-    if not listed:
-        raise InputError("cameras is empty: give at least one camera")
-    return listed
+    if isinstance(cameras, Camera):
+        return [cameras]
+    expected = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
+    listed_cameras = as_list("cameras", cameras, Camera, expected)
+    if not listed_cameras:
+        raise InputError(f"cameras is empty: give {expected}")
+    return listed_cameras
 
 
 def _require_scale(albedo_scale: float) -> None:
@@ -445,7 +457,7 @@ def _as_albedo(albedo: object) -> Tensor:
     """
     values = as_tensor("albedo", albedo)
     require_bounded(albedo=values)
-    if values.numel() and not (values.min() >= 0 and values.max() <= WHITE):
+    if values.numel() and not (values.min() >= 0 and values.max() <= MAX_ALBEDO):
         extremes = f"{values.min().item():g} to {values.max().item():g}"
         raise InputError(
             f"albedo has values from {extremes}: give values from 0 to 1, and set albedo_scale "
@@ -454,19 +466,19 @@ def _as_albedo(albedo: object) -> Tensor:
     return values
 
 
-def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
-    """Compute the linear albedo at the S covered samples of a view.
+def _sample_albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
+    """Compute the linear albedo at the samples of an image that show a mesh.
 
     Args:
-        mesh: Mesh that the view shows, with F faces.
-        view: Covered samples of the view.
-        albedo: Albedo to use instead of the colors of the mesh, shape (F, 3) for
-            one color per face, or (H, W, 3) for the only texture of the mesh.
-            None uses the colors of the mesh.
+        mesh: Mesh with F faces.
+        view: The S samples of the image that show the mesh.
+        albedo: Linear albedo to use instead of the colors of the mesh,
+            shape (F, 3) for one color per face, or (H, W, 3) for the only texture
+            of the mesh. None uses the colors of the mesh.
         encoding: Encoding of the colors of the mesh, "linear" or "srgb".
 
     Returns:
-        Linear albedo, shape (S, 3).
+        Linear albedo at the samples, shape (S, 3).
 
     Raises:
         InputError: If the albedo has a wrong shape.

@@ -1,8 +1,12 @@
-"""Radiance of one view of a shape, from all kinds of light."""
+"""Radiance of one view of a shape, from all kinds of light.
+
+A view is the image that one camera takes. Each pixel has several samples. A
+sample is covered if it shows the shape.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import NamedTuple
@@ -25,13 +29,14 @@ from renderer.visibility.silhouettes import moving_outlines
 
 
 class PixelRadiance(NamedTuple):
-    """Radiance of N pixels of a view.
+    """Radiance of N pixels of an image.
 
-    These are the covered pixels and, if gradients of moving outlines are needed,
-    uncovered pixels into which outlines may move.
+    These are the pixels that the shape covers. If gradients include the movement
+    of silhouettes, there are also uncovered pixels into which silhouettes may
+    move.
 
     Attributes:
-        pixels: Row-major indices of the pixels, shape (N,).
+        pixels: Row-major indices of the pixels in the image, shape (N,).
         coverage: Fraction of each pixel that the shape covers, shape (N,).
         radiance: Linear radiance times the coverage, shape (3, N).
     """
@@ -43,39 +48,40 @@ class PixelRadiance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ShadedView:
-    """One view of a shape with its lights.
+    """A shape with its lights, as one camera sees it.
 
     The shape has the faces of a mesh, and either the vertices of the mesh or
-    moved vertices. The radiance is the sum of three parts: shaded environment
+    moved vertices. The radiance is a sum of three summands: shaded environment
     light, the change of this light by shadows and bounces, and local light from
     lamps and projectors.
 
-    Shapes use these letters: the mesh has V vertices and F faces. The view has S
-    covered samples in P pixels.
+    Arrays use these letters: the mesh has V vertices and F faces. S samples in P
+    pixels of the image are covered: they show the shape.
 
     Attributes:
         mesh: Mesh of the shape.
-        fragments: Covered samples of the view.
+        fragments: Covered samples of the image.
         settings: Settings of the image.
         vertices: Vertex positions of the shape in world axes, shape (V, 3).
         albedo: Linear albedo at the samples, shape (S, 3).
         light: Environment light and local lights with their coefficients.
-        rays: Rays among the faces of the shape. They are needed if there are
+        rays: Ray tracer for the faces of the shape. It is needed if there are
             local lights and `lamp_view` is None.
-        is_moved: True if `vertices` are not those of the mesh. Gradients by the
-            vertices then include the movement of outlines, if
-            `settings.silhouettes` is true.
-        gloss: Gloss of the shape. None uses the gloss of the mesh.
+        is_moved: True if `vertices` are not those of the mesh. If
+            `settings.silhouettes` is also True, gradients with respect to the
+            vertices include the movement of silhouettes.
+        gloss: Gloss (specular reflection) of the shape. None uses the gloss of the
+            mesh.
         vertex_normals: Unit normals of the vertices, shape (V, 3). None computes
             the normals if they are needed.
-        lamp_view: View in local light of an earlier render, which is reused. None
-            creates a new one.
+        lamp_view: Local light of an earlier render of the same shape, which is
+            reused. None computes it.
         indirect: Function that takes the albedo at the samples and the SH
             coefficients of environment light, and returns the radiance that
             shadows and bounces add to the covered pixels, shape (3, P). None
             without shadows and bounces.
         lamp_positions: Positions to which the L movable lamps have moved,
-            shape (L, 3). None uses the positions of their basis.
+            shape (L, 3). None uses the positions in `light`.
     """
 
     mesh: Mesh
@@ -98,134 +104,129 @@ class ShadedView:
         Returns:
             Radiance, shape (3, P).
         """
-        # Autograd adds up gradients in the reverse of this order. Another order would
-        # change their last bits.
-        parts = [
-            *self._shade_environment(self.fragments),
-            *self._indirect_radiance(),
-            *self._shade_lamps(self.fragments),
+        # Autograd adds up gradients in the reverse of this order, so another order would
+        # change the last bits of gradients.
+        summands = [
+            self._environment_radiance(self.fragments),
+            self._indirect_radiance(),
+            *self._lamp_radiances(self.fragments),
         ]
-        return self._sum(parts, self.fragments)
+        return self._sum(summands, self.fragments)
 
     def pixel_radiance(self, camera: Camera, background: Tensor) -> PixelRadiance:
-        """Compute the radiance of the pixels of the view.
+        """Compute the radiance of the pixels that the shape covers.
 
-        If `settings.silhouettes` and `is_moved` are true, gradients include how
-        outlines and surfaces move in the image.
+        If `settings.silhouettes` and `is_moved` are True, gradients include how
+        silhouettes and surfaces move in the image.
 
         Args:
-            camera: Camera of the view. Gradients of moving outlines also reach
-                fields of the camera that are tensors.
+            camera: Camera that sees the shape. Gradients of moving silhouettes also
+                reach fields of the camera that are tensors.
             background: Image values behind the shape, shape (3, size²) or
                 (1, size²).
 
         Returns:
-            The covered pixels, followed by uncovered pixels into which outlines
-            may move.
+            The covered pixels. If gradients include silhouettes, uncovered pixels
+            into which silhouettes may move follow.
         """
         if self.settings.silhouettes and self.is_moved:
             linear_background = decode(background, self.settings.encoding).expand(3, -1)
-            return self._with_outlines(camera, linear_background)
+            return self._radiance_with_silhouettes(camera, linear_background)
         pixel_radiance = self.radiance()
         coverage = self.fragments.coverage.to(pixel_radiance)
         return PixelRadiance(self.fragments.pixels, coverage, pixel_radiance)
 
-    def _shade_environment(self, fragments: Fragments) -> Iterator[Tensor]:
+    def _environment_radiance(self, fragments: Fragments) -> Tensor | None:
         """Compute the radiance of pixels under environment light, without shadows and bounces.
 
         Args:
-            fragments: The samples of the view, grouped into P pixels of the image
-                or of a finer image.
+            fragments: The covered samples, in P pixels of the image. They may also be
+                in pixels of a finer image, with one sample each.
 
-        Yields:
-            Radiance, shape (3, P), if there is environment light. Otherwise
-            nothing.
+        Returns:
+            Radiance, shape (3, P). None without environment light.
         """
         environment = self.light.environment
         if environment is None:
-            return
+            return None
         arguments = fragments, self.vertices, environment, self.albedo, self._normals
         if self._sample_gloss is None:
-            yield radiance(*arguments)
-        else:
-            yield glossy_radiance(*arguments, self._sample_gloss)
+            return radiance(*arguments)
+        return glossy_radiance(*arguments, self._sample_gloss)
 
-    def _indirect_radiance(self) -> Iterator[Tensor]:
+    def _indirect_radiance(self) -> Tensor | None:
         """Compute the radiance that shadows and bounces add to the P covered pixels.
 
-        Yields:
-            Radiance, shape (3, P), which is negative in shadows. Nothing if there
-            are no shadows, or no environment light.
+        Returns:
+            Radiance, which is negative in shadows, shape (3, P). None without
+            environment light, or without shadows and bounces.
         """
         environment = self.light.environment
-        if environment is not None and self.indirect is not None:
-            yield self.indirect(self.albedo, environment)
+        if environment is None or self.indirect is None:
+            return None
+        return self.indirect(self.albedo, environment)
 
-    def _shade_lamps(self, fragments: Fragments) -> Iterator[Tensor]:
-        """Compute the radiance of pixels under each local light.
-
-        Args:
-            fragments: The samples of the view, grouped into P pixels of the image
-                or of a finer image.
-
-        Yields:
-            Radiance under the next local light, shape (3, P).
-        """
-        for basis, coefficients in self.light.local_lights:
-            yield self._view_of_lamps.radiance(
-                basis, self.albedo, coefficients, self.lamp_positions, fragments
-            )
-
-    def _sum(self, parts: list[Tensor], fragments: Fragments) -> Tensor:
-        """Add up radiances. Without any light, the sum is 0.
+    def _lamp_radiances(self, fragments: Fragments) -> list[Tensor]:
+        """Compute the radiance of pixels under each local light (lamps or a projector).
 
         Args:
-            parts: Radiances, shape (3, P) each.
-            fragments: Samples of the view in P pixels.
+            fragments: The covered samples, in P pixels of the image. They may also be
+                in pixels of a finer image, with one sample each.
 
         Returns:
-            Sum, shape (3, P).
+            Radiance under each local light, shape (3, P) each.
         """
-        if not parts:
-            return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
-        return reduce(torch.add, parts)
+        radiances = []
+        for basis, coefficients in self.light.local_lights:
+            lamp_radiance = self._lamp_view.radiance(
+                basis, self.albedo, coefficients, self.lamp_positions, fragments
+            )
+            radiances.append(lamp_radiance)
+        return radiances
 
-    def _with_outlines(self, camera: Camera, background: Tensor) -> PixelRadiance:
-        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
-
-        `renderer.visibility.silhouettes` needs the radiance of each sample, but
-        the radiance of shadows and bounces is only known for each pixel. It is
-        divided among the samples of the pixel in proportion to their albedo.
+    def _sum(self, summands: Sequence[Tensor | None], fragments: Fragments) -> Tensor:
+        """Add up radiances, without those that are None.
 
         Args:
-            camera: Camera of the view.
-            background: Linear background, shape (3, size²).
+            summands: Radiances, shape (3, P) each, or None.
+            fragments: The covered samples, in P pixels.
+
+        Returns:
+            Sum, shape (3, P). It is 0 if all summands are None.
+        """
+        given_summands = [summand for summand in summands if summand is not None]
+        if not given_summands:
+            return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
+        return reduce(torch.add, given_summands)
+
+    def _radiance_with_silhouettes(self, camera: Camera, background: Tensor) -> PixelRadiance:
+        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
+
+        Args:
+            camera: Camera that sees the shape.
+            background: Linear values behind the shape, shape (3, size²).
 
         Returns:
             The covered pixels, followed by uncovered pixels into which
             silhouettes may move.
         """
         fragments = self.fragments
-        sample_to_pixel = fragments.sample_to_pixel
-        # Shade each sample as a pixel of a finer image.
+        # Each sample becomes a pixel of a finer image, so that it is shaded alone.
         finer_fragments = fragments.by_sample()
-        direct = [*self._shade_environment(finer_fragments), *self._shade_lamps(finer_fragments)]
-        at_samples = self._sum(direct, finer_fragments)
+        summands = [
+            self._environment_radiance(finer_fragments),
+            *self._lamp_radiances(finer_fragments),
+        ]
+        at_samples = self._sum(summands, finer_fragments)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
-        at_pixels = zeros.index_add(1, sample_to_pixel, at_samples)
+        at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2
-        # Radiance of each sample without a graph, shape (3, S).
+        # Radiance of each sample as a constant, through which no gradients flow.
         sample_radiance = at_samples.detach()
-        for indirect in self._indirect_radiance():
+        indirect = self._indirect_radiance()
+        if indirect is not None:
             at_pixels = at_pixels + indirect
-            albedo = self.albedo.detach().T.to(sample_radiance)
-            no_albedo = sample_radiance.new_zeros(at_pixels.shape)
-            pixel_albedo = no_albedo.index_add(1, sample_to_pixel, albedo)
-            scaled = indirect.detach() * fragments.samples**2
-            # Indirect radiance of a sample per albedo, shape (3, P).
-            per_albedo = scaled / pixel_albedo.masked_fill(pixel_albedo == 0, 1)
-            indirect_at_samples = per_albedo[:, sample_to_pixel] * self.albedo.detach().T
-            sample_radiance = sample_radiance + indirect_at_samples
+            sample_radiance = sample_radiance + self._divide_among_samples(indirect.detach())
         uncovered_pixels, zeros_with_gradient = moving_outlines(
             fragments, camera, self.vertices, self._faces, sample_radiance, background
         )
@@ -235,6 +236,28 @@ class ShadedView:
             coverage=F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count)),
             radiance=F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient,
         )
+
+    def _divide_among_samples(self, pixel_radiance: Tensor) -> Tensor:
+        """Divide the radiance of each pixel among its samples, in proportion to their albedo.
+
+        The radiance of shadows and bounces is only known for whole pixels, but
+        the gradients of silhouettes need the radiance of each sample.
+
+        Args:
+            pixel_radiance: Radiance of each pixel, which is the sum over its samples
+                divided by the number of samples per pixel, shape (3, P).
+
+        Returns:
+            Radiance of each covered sample, shape (3, S).
+        """
+        sample_to_pixel = self.fragments.sample_to_pixel
+        sample_albedo = self.albedo.detach().T
+        zeros = pixel_radiance.new_zeros(pixel_radiance.shape)
+        # Sum of the albedo of the covered samples of each pixel, shape (3, P).
+        albedo_sums = zeros.index_add(1, sample_to_pixel, sample_albedo.to(zeros))
+        radiance_sums = pixel_radiance * self.fragments.samples**2
+        radiance_per_albedo = radiance_sums / albedo_sums.masked_fill(albedo_sums == 0, 1)
+        return radiance_per_albedo[:, sample_to_pixel] * sample_albedo
 
     @cached_property
     def _faces(self) -> Tensor:
@@ -256,8 +279,8 @@ class ShadedView:
         return sample_gloss(self.mesh, self.fragments, self.gloss)
 
     @cached_property
-    def _view_of_lamps(self) -> LocalLightView:
-        """View in local light: `lamp_view` if it was given, and otherwise a new one."""
+    def _lamp_view(self) -> LocalLightView:
+        """Local light on the shape: `lamp_view` if it was given, and otherwise a new object."""
         if self.lamp_view is not None:
             return self.lamp_view
         assert self.rays is not None
