@@ -20,7 +20,7 @@ from torch import Tensor
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh
 from renderer.light.basis import Harmonics, LocalBasis
-from renderer.light.harmonics import bands, degree_of, per_degree
+from renderer.light.harmonics import bands, cache_tensors, degree_of
 from renderer.settings import ImageSettings
 from renderer.transport.lamp_paths import unoccluded
 from renderer.transport.rays import NO_FACE, Rays, sphere
@@ -71,7 +71,7 @@ class _SeenPoints:
     is_on_wall: Tensor
 
 
-@per_degree
+@cache_tensors
 def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
     """Compute how harmonics represent the light above the horizon and the light below.
 
@@ -364,7 +364,7 @@ def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Te
     return is_ahead & (squared - along**2 < radius**2)
 
 
-@per_degree
+@cache_tensors
 def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     """Choose directions above a table with normal +z and in front of a wall with normal +x.
 

@@ -11,15 +11,15 @@ from torch import Tensor
 # Largest number of Newton steps in `_nearest_in_box_and_sphere`. Four are usual. With
 # too few steps, the result would lie inside of the ball instead of on its surface.
 _MAX_STEPS = 20
-# Newton's method stops if the squared distance from the center differs from the
-# squared radius by at most this multiple of the dtype's `eps`, relative to the
-# squared radius.
+# A point counts as lying on the surface of a ball if its squared distance from the center
+# differs from the squared radius r² by at most this number times r² times `eps` of the
+# dtype.
 _ROUNDING_UNITS = 8
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Norm-balls with one radius around N centers, one for each row of a batch.
+    """Norm-balls with one radius around N centers, one ball for each row of a batch.
 
     Attributes:
         center: Center of each ball, shape (N, ...).
@@ -42,7 +42,10 @@ class Ball:
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """Lowest and highest values in the balls of the norm "linf", shape (N, ...) each."""
+        """Lowest and highest value of each coordinate in the balls, if the norm is "linf".
+
+        Both tensors have the shape (N, ...).
+        """
         return self.center - self.radius, self.center + self.radius
 
 
@@ -93,16 +96,16 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     offset = values - ball.center
     squared_radius = ball.radius**2
     rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
-    # For each row, the current s, the squared distance, and its derivative by s. The
-    # shapes are (N, 1, ...), or () before the first step.
+    # The number s = 1 / (1 + λ)² of each row, in a shape that broadcasts to `values`.
     s = offset.new_zeros(())
+    # Squared distance of the point for s from the center, and its derivative by s.
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
     for _ in range(_MAX_STEPS):
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
         s = (s + step.clamp(min=0)).clamp(max=1)
-        # With s = 1, the target is v. `values` has no rounding error.
+        # The target c + √s (v - c) is v if s = 1. Taking `values` avoids rounding errors.
         target = torch.where(s < 1, ball.center + s.sqrt() * offset, values)
         nearest = target.clamp(low, high)
         # Clamped values do not change with s.
@@ -115,12 +118,13 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
 
 
 def _squared_norm(offsets: Tensor) -> Tensor:
-    """Compute the squared L2 norm of each row.
+    """Compute the squared L2 norm of each row of a batch.
 
     Args:
         offsets: N rows of values, shape (N, ...).
 
     Returns:
-        Squared norms, shape (N, 1, ...), which broadcasts to `offsets`.
+        Squared norms, with size 1 along all axes but the first one, so that they
+        broadcast to `offsets`.
     """
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

@@ -28,9 +28,9 @@ from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.harmonics import (
     basis,
     degree_of,
+    evaluate_harmonics,
     lambertian_factors,
     nonzero_coefficients,
-    select_rows,
 )
 from renderer.settings import MAX_DEGREE
 from renderer.validation import require_whole
@@ -38,12 +38,12 @@ from renderer.vectors import unit
 
 
 class EnvironmentPart(NamedTuple):
-    """Part of a basis that is environment light.
+    """Environment light as one of the lights of a basis.
 
     Attributes:
-        rows: Slice of the coefficients of the whole basis that belong to this
-            part.
-        basis: Basis of this part.
+        rows: Slice that selects the coefficients of the environment light from
+            the coefficients of all lights, shape (size, 3).
+        basis: Basis of the environment light.
     """
 
     rows: slice
@@ -51,12 +51,12 @@ class EnvironmentPart(NamedTuple):
 
 
 class LocalPart(NamedTuple):
-    """Part of a basis that is one kind of local light.
+    """Local light, such as lamps or a projector, as one of the lights of a basis.
 
     Attributes:
-        rows: Slice of the coefficients of the whole basis that belong to this
-            part.
-        basis: Basis of this part.
+        rows: Slice that selects the coefficients of the local light from the
+            coefficients of all lights, shape (size, 3).
+        basis: Basis of the local light.
     """
 
     rows: slice
@@ -72,54 +72,54 @@ class Basis(ABC):
     @property
     @abstractmethod
     def size(self) -> int:
-        """Number of functions."""
+        """Number of basis functions, which is the number of RGB coefficients."""
 
     @property
     def environment(self) -> EnvironmentPart | None:
-        """Part of this basis that is environment light, or None."""
+        """Environment light of this basis, or None if all its lights are local."""
         return None
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        """Parts of this basis that are local lights, in the order of their coefficients."""
+        """Lamps and projectors of this basis, in the order of their coefficients."""
         return []
 
     @property
     def movable_light(self) -> LocalPart | None:
-        """First part of this basis that is a movable local light, or None."""
+        """First local light of this basis whose sources can be moved, or None."""
         return next((part for part in self.local_lights if part.basis.is_movable), None)
 
     @abstractmethod
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Replace coefficients by those of a light that can exist, without negative radiance.
+        """Replace lights by similar lights that can exist, without negative radiance.
 
         Args:
-            coefficients: Coefficients, shape (..., size, 3).
+            coefficients: RGB coefficients of the lights, shape (..., size, 3).
 
         Returns:
-            Coefficients, shape (..., size, 3).
+            RGB coefficients without negative radiance, shape (..., size, 3).
         """
 
     def moved(self, positions: Tensor) -> Self:
-        """Return a copy in which movable lights are at other positions.
+        """Return a copy of this basis in which the movable light sources are moved.
 
         Args:
-            positions: Positions of the L movable lights in world axes,
+            positions: New positions of the L movable light sources in world axes,
                 shape (L, 3).
 
         Returns:
-            The copy. A basis without movable lights returns itself.
+            The copy. A basis without movable light sources returns itself.
         """
         return self
 
     def picture(self, coefficients: Tensor) -> Tensor | None:
-        """Convert coefficients to an image, if a light of this kind projects an image.
+        """Convert coefficients to the image that a projector shows.
 
         Args:
-            coefficients: Coefficients, shape (size, 3).
+            coefficients: RGB coefficients, shape (size, 3).
 
         Returns:
-            Image in [0, 1], shape (H, W, 3), or None.
+            Image in [0, 1], shape (H, W, 3). None if the light is no projector.
         """
         return None
 
@@ -165,77 +165,83 @@ class Harmonics(Basis):
 
     @property
     def environment(self) -> EnvironmentPart:
-        """These harmonics, with the rows of all coefficients."""
+        """This light itself. Its slice of the coefficients contains all coefficients."""
         return EnvironmentPart(slice(0, self.size), self)
 
     @property
     def nonzero(self) -> Tensor:
-        """Ascending indices of the K functions that change the irradiance, shape (K,).
+        """Ascending indices of the K harmonics that change the irradiance, shape (K,).
 
-        All other functions have no effect on a diffuse surface without shadows.
+        All other harmonics have no effect on a diffuse surface without shadows.
         """
         return nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Tensor) -> Tensor:
-        """Compute the irradiance of surfaces per unit of each coefficient in `nonzero`.
+        """Compute the irradiance of N surfaces from each harmonic that changes it.
 
         Args:
             normals: Unit normals of the surfaces, shape (N, 3).
 
         Returns:
-            The irradiance, shape (N, K).
+            Irradiance if the coefficient of one harmonic is 1 and all others are
+            0, shape (N, K). The K columns belong to the harmonics in `nonzero`.
 
         Raises:
             InputError: If a normal is not finite.
         """
         require_finite(normals=normals)
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
-        rows = select_rows(unit(normals.double().T), self.nonzero.tolist())
-        # Shape (K, N). Transposing at the end is faster than filling columns.
-        by_function = torch.stack(rows).to(normals.dtype) * factors[:, None]
-        return by_function.T.contiguous()
+        values = evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
+        # One row for each of K harmonics. Transposing at the end is faster than filling
+        # columns.
+        irradiance = torch.stack(values).to(normals.dtype) * factors[:, None]
+        return irradiance.T.contiguous()
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Compute the radiance from N directions per unit of each coefficient.
+        """Compute the radiance of each harmonic from N directions.
 
         Args:
             directions: Directions toward the light, shape (N, 3).
 
         Returns:
-            Radiance, shape (N, size).
+            Radiance if the coefficient of one harmonic is 1 and all others are 0,
+            shape (N, size).
         """
         return basis(directions, self.degree)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Replace coefficients by a light without negative radiance and with the same mean.
+        """Replace lights by the most similar lights without negative radiance.
 
-        Of all such lights, the result has the most similar irradiance.
+        The new light has the same mean radiance. Of all such lights, its irradiance
+        is the closest to the irradiance of the given light.
 
         Args:
-            coefficients: Coefficients, shape (..., size, 3).
+            coefficients: SH coefficients of the lights, shape (..., size, 3).
 
         Returns:
-            Coefficients, shape (..., size, 3).
+            SH coefficients of the new lights, shape (..., size, 3).
         """
-        # The module is imported here because it imports SciPy's optimizers, which takes
+        # This import stands here because it also imports SciPy's optimizers, which takes
         # long.
         from renderer.light.nonnegative import project_nonnegative
 
         return project_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest coefficients of light without negative radiance.
+        """Replace lights by the nearest lights without negative radiance.
 
-        The mean radiance may change.
+        The distance between lights is the Euclidean distance of their
+        coefficients. The mean radiance may change.
 
         Args:
-            coefficients: Coefficients, shape (..., size, 3), or (A, size, 3) if
-                `within` is given.
-            within: Ball in which the result lies. Its centers must have no
-                negative radiance.
+            coefficients: SH coefficients of the lights, shape (..., size, 3). With
+                `within`, the shape is (A, size, 3).
+            within: A norm-balls, one for each light, in which the results must
+                lie. Their centers must have no negative radiance. None for no
+                ball.
 
         Returns:
-            Coefficients of the same shape.
+            SH coefficients of the nearest lights, in the same shape.
         """
         from renderer.light.nonnegative import nearest_nonnegative
 
@@ -254,8 +260,8 @@ class LightPaths(NamedTuple):
     Attributes:
         point: Index of the surface point at the end of each path, int64,
             shape (E,).
-        function: Index of the basis function whose light each path carries,
-            int64, shape (E,).
+        function: Index of the basis function (lamp, or pixel of a projector) from
+            which each path comes, int64, shape (E,).
         source: Position of the start of each path in world axes, shape (E, 3).
         irradiance: Irradiance of the surface point per unit of the function's
             coefficient, shape (E,). It is differentiable with respect to the
@@ -291,39 +297,41 @@ class LocalBasis(Basis):
     @classmethod
     @abstractmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
-        """Create the basis and the coefficients that settings describe.
+        """Create a light, that is, a basis and its coefficients, from settings.
 
         Args:
             settings: The settings of this kind of light in `augment.settings`, with
                 angles in degrees.
 
         Returns:
-            The basis, and the coefficients (size, 3) that attacks begin with.
+            A tuple of
+            - the basis;
+            - its RGB coefficients before an attack, shape (size, 3).
 
         Raises:
             InputError: If a setting is out of range.
         """
 
     def source_positions(self) -> Tensor:
-        """Return the positions of the L sources of a movable light, shape (L, 3)."""
+        """Return the positions of the L movable light sources in world axes, shape (L, 3)."""
         raise NotImplementedError
 
     @abstractmethod
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find the paths from the sources to S surface points, as if nothing blocked them.
+        """Find the straight paths from light sources to S surface points, without shadows.
 
         Args:
             points: Surface points in world axes, shape (S, 3).
             normals: Unit normals at the points, shape (S, 3).
-            positions: Positions to which the L sources have moved, shape (L, 3).
-                None uses the positions of the basis. Only a movable basis accepts
-                positions.
+            positions: Positions to which the L light sources have moved,
+                shape (L, 3). None for `source_positions`. Only a basis with
+                `is_movable` accepts positions.
 
         Returns:
-            Paths. Their irradiance is differentiable with respect to all
-            arguments.
+            Paths, also those that an object blocks. Their irradiance is
+            differentiable with respect to all arguments.
         """
 
     @abstractmethod
@@ -346,7 +354,7 @@ class LocalBasis(Basis):
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        """This light as the only entry, with the rows of all coefficients."""
+        """List with this light only. Its slice of the coefficients contains all of them."""
         return [LocalPart(slice(0, self.size), self)]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
@@ -354,15 +362,16 @@ class LocalBasis(Basis):
         return self.nearest_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest coefficients in [0, power], also within a ball.
+        """Replace coefficients by the nearest coefficients between 0 and `power`.
 
         Args:
-            coefficients: Coefficients, shape (..., size, 3), or (A, size, 3) if
-                `within` is given.
-            within: Ball in which the result must lie, or None.
+            coefficients: RGB coefficients, shape (..., size, 3). With `within`, the
+                shape is (A, size, 3).
+            within: A norm-balls, one for each row of the coefficients, in which the
+                results must lie, too. None for no ball.
 
         Returns:
-            Coefficients of the same shape.
+            Nearest coefficients, in the same shape.
         """
         return nearest_in_box(coefficients, 0, self.power, within)
 
@@ -393,12 +402,12 @@ class SumBasis(Basis):
 
     @property
     def size(self) -> int:
-        """Number of functions of all parts together."""
+        """Number of basis functions, summed over all bases in `parts`."""
         return sum(part.size for part in self.parts)
 
     @property
     def environment(self) -> EnvironmentPart | None:
-        """Environment light of the part that has one, with its rows in the coefficients."""
+        """Environment light, with the slice of its coefficients. None if all are local."""
         for rows, part in self._rows_of_parts():
             if part.environment is not None:
                 return EnvironmentPart(rows, part.environment.basis)
@@ -406,7 +415,7 @@ class SumBasis(Basis):
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        """Lamps and projectors of all parts, with their rows in the coefficients."""
+        """Lamps and projectors of all parts, with the slices of their coefficients."""
         return [
             LocalPart(rows, light.basis)
             for rows, part in self._rows_of_parts()
@@ -414,7 +423,7 @@ class SumBasis(Basis):
         ]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Apply `project_nonnegative` to the coefficients of each part."""
+        """Replace the coefficients of each light in `parts` by ones without negative radiance."""
         projected = [
             part.project_nonnegative(coefficients[..., rows, :])
             for rows, part in self._rows_of_parts()
@@ -422,19 +431,22 @@ class SumBasis(Basis):
         return torch.cat(projected, dim=-2)
 
     def moved(self, positions: Tensor) -> Self:
-        """Return a copy in which the movable lights of all parts are at other positions.
+        """Return a copy of this basis in which the movable light sources are moved.
 
         Args:
-            positions: Positions of the L movable lights in world axes,
+            positions: New positions of the L movable light sources in world axes,
                 shape (L, 3).
         """
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
     def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
-        """List the parts with the slices of their coefficients.
+        """Iterate over the bases in `parts`, with the slices of their coefficients.
 
         Yields:
-            Slice of the coefficients, and part.
+            A tuple of
+            - the slice that selects the coefficients of one basis from all
+              coefficients, shape (size, 3);
+            - this basis.
         """
         first = 0
         for part in self.parts:
@@ -449,17 +461,18 @@ def parts_of(basis: Basis) -> list[EnvironmentPart | LocalPart]:
         basis: Basis of all lights.
 
     Returns:
-        Parts in the order of their coefficients.
+        Lights with the slices of their coefficients, in the order of the
+        coefficients.
     """
     environment = [] if basis.environment is None else [basis.environment]
     return sorted([*environment, *basis.local_lights], key=lambda part: part.rows.start)
 
 
 def harmonics_of(basis: Basis) -> Harmonics:
-    """Return the harmonics of a basis with environment light.
+    """Return the spherical harmonics of the environment light of a basis.
 
     Args:
-        basis: Basis with environment light, as each scene has one.
+        basis: Basis of all lights of a scene. Each scene has environment light.
     """
     environment = basis.environment
     assert environment is not None
@@ -472,7 +485,7 @@ class SplitLight(NamedTuple):
     Attributes:
         environment: SH coefficients of the environment light,
             shape ((degree + 1)², 3). None without environment light.
-        local_lights: Basis of each local light, with its coefficients,
+        local_lights: For each local light, its basis and its RGB coefficients,
             shape (size, 3).
     """
 
@@ -491,7 +504,7 @@ def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
 
     Args:
         basis: Basis of all lights.
-        coefficients: Coefficients of the basis, shape (size, 3).
+        coefficients: RGB coefficients of all lights, shape (size, 3).
 
     Returns:
         Coefficients of the environment light, and local lights with their
@@ -507,16 +520,17 @@ def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
 def with_local_lights(
     sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
 ) -> tuple[Basis, Tensor]:
-    """Combine environment light and local lights to one basis with coefficients.
+    """Combine environment light and local lights to one basis with its coefficients.
 
     Args:
-        sky: SH coefficients of environment light, shape ((degree + 1)², 3).
-        lights: Bases of local lights with their coefficients, shape (size, 3)
-            each.
+        sky: SH coefficients of the environment light, shape ((degree + 1)², 3).
+        lights: For each local light, its basis and its RGB coefficients,
+            shape (size, 3).
 
     Returns:
-        Basis of all lights, with the environment light first, and coefficients of
-        this basis.
+        A tuple of
+        - the basis of all lights, with the environment light first;
+        - the RGB coefficients of all lights, in the same order.
     """
     harmonics = Harmonics(degree_of(sky))
     if not lights:

@@ -33,7 +33,7 @@ SUFFIXES = (".npy", ".hdr", ".exr")
 # integrate such a map too coarsely. With 4 rows and degree 6, the coefficients of a
 # uniform map that should be 0 would have 21% of the norm of the first coefficient.
 FEWEST_ROWS = 8
-# `light_radiance` evaluates this many directions at once. Their harmonics fit into
+# Number of directions that `light_radiance` evaluates at once. Their harmonics fit into
 # the cache of the processor.
 BLOCK = 2**12
 # `read_panorama` sets negative radiance to 0 if its magnitude is at most this
@@ -42,10 +42,10 @@ NEGATIVE = 1e-4
 # Size in MB of the largest image that OpenImageIO reads. The limit is for damaged
 # files whose header claims a huge image.
 LARGEST_MAP = 4096
-# Number of bits of a channel in an .hdr file (RGBE), whose three channels share one
-# exponent.
+# Number of bits of a color channel in an .hdr file. Its format RGBE stores three channels
+# of a texel with one common exponent.
 _RGBE_BITS = 8
-# Names that the channels of an .npy array get, by the number of channels.
+# Names of the channels of an .npy array for each possible number of channels. Y is gray.
 _CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
 # Names of alpha channels, and of red, green and blue channels, in lower case.
 _ALPHA_NAMES = ("a", "alpha")
@@ -55,11 +55,10 @@ _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 def to_map(coefficients: Tensor, height: int) -> Tensor:
     """Compute the environment map of a light that is given by SH coefficients.
 
-    The radiance may be negative, because few harmonics oscillate around bright
-    places. `harmonics.project` computes the coefficients from the map again, up
-    to the error of its midpoint rule along z. At degree 6, the L2 norm of this
-    error is at most 22.2 / height² times the norm of the coefficients (3.4e-4 at
-    a height of 256).
+    The radiance may be negative, because a sum of few harmonics oscillates around
+    bright places. `harmonics.project` computes the coefficients from the map
+    again. At degree 6, the L2 norm of its error is at most 22.2 / height² times
+    the norm of the coefficients (3.4e-4 at a height of 256).
 
     Args:
         coefficients: SH coefficients, shape ((degree + 1)², 3).
@@ -74,7 +73,7 @@ def to_map(coefficients: Tensor, height: int) -> Tensor:
 
 
 def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Compute the radiance that arrives from given directions.
+    """Compute the radiance of environment light that arrives from given directions.
 
     Args:
         coefficients: SH coefficients of the light, shape ((degree + 1)², 3).
@@ -209,8 +208,8 @@ def write_map(path: str | Path, radiance: Tensor) -> None:
             _write_image(path, _to_rgbe_precision(radiance), "hdr")
         else:
             _write_image(path, radiance, "openexr")
+    # OpenImageIO raises ValueError for a file name that is not UTF-8.
     except (OSError, ValueError) as error:
-        # OpenImageIO raises ValueError for a name that is not UTF-8.
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 
 
@@ -268,10 +267,10 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 
     Raises:
         InputError: If the file cannot be read or has another format, or if the
-            image is cropped or turned.
+            image is stored cropped, mirrored or rotated.
     """
     image = _openimageio().ImageBuf(str(path))
-    # Read explicitly, because `get_pixels` ends the process if reading fails.
+    # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
     if not image.read():
         raise InputError(image.geterror())
     texels = image.get_pixels("float")
@@ -285,17 +284,16 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     is_turned = image.orientation != 1
     if is_cropped or is_turned:
         raise InputError(
-            "the image is stored cropped or turned, but the whole image with its top row first "
-            "is needed"
+            "the image is stored cropped, mirrored or rotated: save the whole image again, with "
+            "its top row first"
         )
     return texels, spec.channelnames
 
 
 def _to_rgbe_precision(radiance: Tensor) -> Tensor:
-    """Round radiance to the nearest values that the format RGBE of .hdr files can store.
+    """Round radiance to the nearest values that an .hdr file (format RGBE) can store.
 
-    OpenImageIO truncates instead of rounding, which would darken and tint the
-    light.
+    OpenImageIO would round all values down, which darkens and tints the light.
 
     Args:
         radiance: Environment map, shape (H, W, 3).
@@ -304,9 +302,9 @@ def _to_rgbe_precision(radiance: Tensor) -> Tensor:
         Rounded radiance of at least 0, shape (H, W, 3).
     """
     radiance = radiance.clamp(min=0)
-    # The exponent of the largest channel of a texel holds for its three channels.
+    # RGBE stores all three channels of a texel with the exponent of the largest channel.
     _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
-    # Difference between two neighboring values of a channel, shape (H, W, 1).
+    # Difference between neighboring values that can be stored with this exponent.
     step = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - _RGBE_BITS)
     largest_integer = 2**_RGBE_BITS - 1
     return (radiance / step).round().clamp(max=largest_integer) * step
@@ -333,13 +331,12 @@ def _color_channels(names: Sequence[str]) -> list[int]:
         layers.append(layer)
         channels.append(channel)
     layers_and_channels = list(zip(layers, channels, strict=True))
-    # OpenImageIO lists the channels of the layer without a name first, so this loop
-    # prefers this layer.
+    # OpenImageIO lists the layer without a name first. The loop therefore prefers it.
     for layer in layers:
         for color_names in _COLOR_NAMES:
-            wanted = [(layer, color_name) for color_name in color_names]
-            if set(wanted) <= set(layers_and_channels):
-                return [layers_and_channels.index(channel) for channel in wanted]
+            red_green_blue = [(layer, color_name) for color_name in color_names]
+            if set(red_green_blue) <= set(layers_and_channels):
+                return [layers_and_channels.index(channel) for channel in red_green_blue]
     gray_channels = [index for index, channel in enumerate(channels) if channel not in _ALPHA_NAMES]
     if len(gray_channels) == 1:
         return gray_channels * 3
@@ -349,7 +346,7 @@ def _color_channels(names: Sequence[str]) -> list[int]:
 
 
 def _openimageio() -> ModuleType:
-    """Import OpenImageIO, and limit its threads and its memory.
+    """Import OpenImageIO, and limit its threads and the size of the images that it reads.
 
     The import takes long, so it happens only if an image is read or written.
     """

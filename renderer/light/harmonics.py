@@ -43,21 +43,21 @@ MAX_QUADRATURE = 10**4
 MAX_TEXELS = 10**6
 # `rotate` accepts a matrix R if no entry of R Rᵀ - I is larger than this. A rotation
 # matrix whose entries are rounded to four digits fulfills this.
-ORTHONORMAL = 1e-3
+ORTHONORMALITY_TOLERANCE = 1e-3
 # Diffuse shading ignores harmonics above this degree. They change the irradiance
 # under a parallel beam of light by at most 0.015 times the irradiance of the beam.
 DIFFUSE_DEGREE = 20
-# Type of the result of a function that `per_degree` caches.
+# Type of the result of a function that `cache_tensors` decorates.
 Constant = TypeVar("Constant")
-# Indices of the axes in tensors.
+# Indices of the coordinates x, y and z in the first dimension of `gradient_matrices`.
 X_AXIS, Y_AXIS, Z_AXIS = range(3)
 
 
-def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
-    """Decorate a function of a degree and other hashable arguments, so that its results are cached.
+def cache_tensors(function: Callable[..., Constant]) -> Callable[..., Constant]:
+    """Decorate a function of hashable arguments that returns tensors, so that results are cached.
 
-    The decorated function runs outside of torch's inference mode. A cached tensor
-    that was created in inference mode could not be used in training later.
+    The function runs outside of torch's inference mode. A cached tensor that was
+    created in inference mode could not be used in training later.
 
     Args:
         function: Function to decorate.
@@ -109,9 +109,9 @@ def basis(
     """Evaluate the real spherical harmonics of all bands up to a degree.
 
     The values are computed in float64 and can be differentiated once with
-    respect to the directions. The Legendre recurrences are those of the paper's
-    appendix B.1, but the factor sin^m θ is part of the powers (x + iy)^m instead
-    of the Legendre functions P_l^m.
+    respect to the directions. The recurrences are those of Liu et al. 2019,
+    appendix B.1. In contrast to the appendix, the factor sin^m θ is part of the
+    powers (x + iy)^m and not of the Legendre functions P_l^m.
 
     Args:
         directions: Finite vectors of any length, shape (..., 3). Only their
@@ -133,8 +133,8 @@ def basis(
         raise InputError(f"directions has shape {tuple(directions.shape)}: give (..., 3)")
     require_finite(directions=directions)
     components = unit(directions.double().movedim(-1, 0))
-    rows = select_rows(components, range((degree + 1) ** 2))
-    return torch.stack(rows, dim=-1).to(directions.dtype)
+    values = evaluate_harmonics(components, range((degree + 1) ** 2))
+    return torch.stack(values, dim=-1).to(directions.dtype)
 
 
 def require_degree(degree: int) -> None:
@@ -150,8 +150,8 @@ def require_degree(degree: int) -> None:
     require_range("degree", degree, 0, MAX_DEGREE)
 
 
-def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
-    """Evaluate harmonics with given indices, without checks of the arguments.
+def evaluate_harmonics(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
+    """Evaluate the spherical harmonics with given indices, without checks of the arguments.
 
     Args:
         directions: Unit vectors, with the three components along the first axis,
@@ -159,14 +159,14 @@ def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
         indices: Indices l² + l + m of the harmonics of band l and order m.
 
     Returns:
-        Values of each harmonic, shape (...), in the order of the indices.
-        Repeated indices count once.
+        For each index, the values of its harmonic in all directions, shape (...).
+        An index that occurs again is ignored.
     """
     x, y, z = directions
-    # A dictionary keeps the order and removes repetitions.
-    wanted = dict.fromkeys(indices)
+    # A dictionary keeps the order of the indices and removes repeated indices.
+    unique_indices = dict.fromkeys(indices)
     values_by_index = {}
-    degree = math.isqrt(max(wanted, default=0))
+    degree = math.isqrt(max(unique_indices, default=0))
     # Real and imaginary part of (x + iy)^m, times √2 if m > 0.
     real_power = torch.ones_like(z)
     imaginary_power = torch.zeros_like(z)
@@ -175,9 +175,9 @@ def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
         for l, legendre in bands_and_functions:
             # Index of the harmonic of order 0 in band l.
             order_zero = l * l + l
-            if order_zero + m in wanted:
+            if order_zero + m in unique_indices:
                 values_by_index[order_zero + m] = real_power * legendre
-            if m and order_zero - m in wanted:
+            if m and order_zero - m in unique_indices:
                 values_by_index[order_zero - m] = imaginary_power * legendre
         if m == degree:
             break
@@ -187,7 +187,7 @@ def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
         next_real_power = torch.addcmul(x * real_power, y, imaginary_power, value=-1)
         imaginary_power = torch.addcmul(x * imaginary_power, y, real_power)
         real_power = next_real_power
-    return [values_by_index[index] for index in wanted]
+    return [values_by_index[index] for index in unique_indices]
 
 
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
@@ -208,28 +208,29 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
     ratios = [(2 * k + 1) / (2 * k) for k in range(1, m + 1)]
     constant = math.sqrt(math.prod(ratios) / (4 * math.pi))
     yield constant
-    # The functions of l - 2 and l - 1 give the function of l.
+    # The functions of bands l - 2 (before_previous) and l - 1 (previous) give the
+    # function of band l.
     before_previous = z.new_tensor(constant)
     previous = z * math.sqrt(2 * m + 3) * constant
     for l in range(m + 1, degree + 1):
         if l > m + 1:
             a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
             b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
-            # a (z P_(l-1) - b P_(l-2)).
+            # P_l = a (z P_(l-1) - b P_(l-2)).
             current = torch.addcmul(before_previous * (-a * b), z, previous, value=a)
             before_previous = previous
             previous = current
         yield previous
 
 
-@per_degree
+@cache_tensors
 def gradient_matrices(degree: int) -> Tensor:
-    """Compute the matrices that differentiate spherical harmonics by x, y and z.
+    """Compute the matrices of the derivatives of harmonics with respect to x, y and z.
 
     Let r be the length of (x, y, z). For a harmonic Y_k of band l, r^l Y_k is a
-    polynomial. Its derivative by the coordinate x_d is a sum over the harmonics
-    Y_j of band l - 1: ∂(r^l Y_k)/∂x_d = Σ_j M[d, j, k] r^(l-1) Y_j. These are the
-    ladder operators of solid harmonics in real form.
+    polynomial. Its derivative with respect to x, y or z is a sum over harmonics
+    Y_j of band l - 1. With the coordinates (x_0, x_1, x_2) = (x, y, z), this is
+    ∂(r^l Y_k)/∂x_d = Σ_j M[d, j, k] r^(l-1) Y_j.
 
     Args:
         degree: Highest band.
@@ -249,16 +250,20 @@ def gradient_matrices(degree: int) -> Tensor:
 def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
     """Set the columns of the harmonics Y_lm and Y_l,-m in `gradient_matrices`, in place.
 
+    The derivative of Y_lm with respect to z is a harmonic of the same order in
+    band l - 1. The derivatives with respect to x and y are sums of harmonics of
+    the orders m - 1 and m + 1 in band l - 1 (ladder operators).
+
     Args:
         matrices: Matrices, shape (3, K, K) for K harmonics.
         l: Band, at least 1.
         m: Order, at least 0.
     """
     norm = (2 * l + 1) / (2 * l - 1)
-    # Factors for harmonics of the orders m - 1 and m + 1 in band l - 1.
+    # Factors of the harmonics of the orders m - 1 (down) and m + 1 (up) in band l - 1.
     down = math.sqrt(norm * (l + m) * (l + m - 1)) / 2 * (math.sqrt(2) if m == 1 else 1)
     up = math.sqrt(norm * (l - m) * (l - m - 1)) / 2 * (math.sqrt(2) if m == 0 else 1)
-    # Row of the harmonic of order 0 in band l - 1.
+    # Row of the harmonic of order 0 in band l - 1. The row of order m is `row` + m.
     row = (l - 1) * l
     # Columns of the orders m and -m in band l, which contain cos mφ and sin mφ.
     cosine_column = l * l + l + m
@@ -281,15 +286,19 @@ def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
         matrices[Y_AXIS, row - m + 1, cosine_column] = -down
 
 
-@per_degree
+@cache_tensors
 def homogeneous_gradients(degree: int) -> Tensor:
-    """Compute the matrices that differentiate the homogeneous polynomials r^degree Y_k.
+    """Compute the matrices of the derivatives of the homogeneous polynomials r^degree Y_k.
 
     Let r be the length of (x, y, z), and Y_k a harmonic of a band l with the
-    same parity as `degree`. Then r^degree Y_k is a homogeneous polynomial, with
-    ∂(r^degree Y_k)/∂x_d = Σ_j M[d, j, k] r^(degree - 1) Y_j. By Euler's theorem,
-    the product of this gradient and (x, y, z) is `degree` times the polynomial.
-    The sum over j therefore gives the gradient and the value.
+    same parity as `degree`. Then r^degree Y_k is a homogeneous polynomial. With
+    (x_0, x_1, x_2) = (x, y, z), its derivatives are
+    ∂(r^degree Y_k)/∂x_d = Σ_j M[d, j, k] r^(degree - 1) Y_j.
+
+    The matrices follow from the product rule for r^(degree - l) (r^l Y_k). The
+    gradient of the second factor is known from `gradient_matrices`. The gradient
+    of the first factor is (degree - l) r^(degree - l - 2) (x, y, z). The products
+    x_d Y_k in it are sums of harmonics of the bands l - 1 and l + 1.
 
     Args:
         degree: Degree of the polynomials.
@@ -299,24 +308,23 @@ def homogeneous_gradients(degree: int) -> Tensor:
         shape (3, (degree + 1)², (degree + 1)²). Columns of bands of the other
         parity have no meaning.
     """
-    # Write r^degree Y_k as r^(degree - l) (r^l Y_k) and apply the product rule. The
-    # derivative of the first factor leads to x_d Y_k. This product has a part in
-    # band l - 1, ∂(r^l Y_k)/∂x_d / (2l + 1). By symmetry, its part in band l + 1 has
-    # the transposed matrix.
-    solid_gradients = gradient_matrices(degree)
+    gradients = gradient_matrices(degree)
     band_of_column = bands(degree)
-    lower_part = solid_gradients / (2 * band_of_column + 1)
-    product = lower_part + lower_part.mT
-    return solid_gradients + (degree - band_of_column) * product
+    # On the unit sphere, the sum over band l - 1 in x_d Y_k is ∂(r^l Y_k)/∂x_d / (2l + 1).
+    to_lower_band = gradients / (2 * band_of_column + 1)
+    # Multiplying by x_d is symmetric, so the sum over band l + 1 has the transposed matrix.
+    times_coordinate = to_lower_band + to_lower_band.mT
+    return gradients + (degree - band_of_column) * times_coordinate
 
 
-@per_degree
+@cache_tensors
 def monomial_coefficients(degree: int) -> Tensor:
     """Compute the matrix that expresses harmonics by monomials x^a y^b z^c, a + b + c = degree.
 
     Let r be the length of (x, y, z). For a harmonic Y_k of a band with the same
     parity as `degree`, r^degree Y_k = Σ_j M[j, k] monomial_j. The monomials are
-    in the order of `monomials`.
+    sorted from x^degree to z^degree, by falling power of x and then by falling
+    power of y.
 
     Args:
         degree: Degree of the monomials.
@@ -328,19 +336,20 @@ def monomial_coefficients(degree: int) -> Tensor:
     if degree == 0:
         return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
     # A polynomial follows from its derivatives. The coefficient of x^a y^b z^c is the
-    # coefficient of x^(a-1) y^b z^c in the derivative by x, divided by a. If a = 0,
-    # the derivative by y is used, and if a = b = 0, the derivative by z.
+    # coefficient of x^(a-1) y^b z^c in the derivative with respect to x, divided by a. If
+    # a = 0, the derivative with respect to y is used, and if a = b = 0, to z.
     lower_coefficients = monomial_coefficients(degree - 1)
     lower_gradients = homogeneous_gradients(degree)[:, : lower_coefficients.shape[1]]
     along_x, along_y, along_z = lower_coefficients @ lower_gradients
-    # The divisor of each monomial: a, or b if a = 0, or c = degree if a = b = 0.
-    divisors = torch.tensor(
-        [a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)]
-    )
-    # The last `degree` monomials of the derivative by y have no factor x, and the last
-    # monomial of the derivative by z has no factors x and y.
+    divisors = []
+    for a in range(degree, -1, -1):
+        for b in range(degree - a, -1, -1):
+            # The first power of a, b and c = degree - a - b that is not zero.
+            divisors.append(a or b or degree)
+    # First all monomials with a factor x, then those with a factor y but not x (the
+    # last `degree` rows of the derivative with respect to y), and then z^degree.
     derivatives = torch.cat([along_x, along_y[-degree:], along_z[-1:]])
-    return derivatives / divisors[:, None]
+    return derivatives / torch.tensor(divisors)[:, None]
 
 
 def monomials(vectors: Tensor, degree: int) -> Tensor:
@@ -359,19 +368,19 @@ def monomials(vectors: Tensor, degree: int) -> Tensor:
     x, y, z = vectors
     values = torch.ones_like(vectors[:1])
     for power in range(1, degree + 1):
-        # Monomials of degree `power` are monomials of the degree below times x, y or z.
+        # Each monomial of degree `power` is a monomial of degree `power` - 1 times x, y or z.
         lower_values = values
         lower_count = len(lower_values)
         values = vectors.new_empty(lower_count + power + 1, vectors.shape[1])
         torch.mul(lower_values, x, out=values[:lower_count])
-        # The last `power` monomials of the degree below have no factor x.
+        # The last `power` monomials of degree `power` - 1 have no factor x.
         without_x = lower_values[lower_count - power :]
         torch.mul(without_x, y, out=values[lower_count:-1])
         torch.mul(lower_values[-1], z, out=values[-1])
     return values
 
 
-@per_degree
+@cache_tensors
 def bands(degree: int) -> Int[Tensor, " coefficients"]:
     """Return the band l of each SH coefficient up to a degree: 0, 1, 1, 1, 2, ...
 
@@ -385,7 +394,7 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
-@per_degree
+@cache_tensors
 def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """Compute the factor A_l of each SH coefficient of a light in the irradiance.
 
@@ -409,7 +418,7 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     return torch.tensor(factors, dtype=torch.float64)[bands(degree)]
 
 
-@per_degree
+@cache_tensors
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Return the indices of the SH coefficients that change the irradiance of a diffuse surface.
 
@@ -443,40 +452,40 @@ def irradiance_error(
         Relative errors, float64, shape (...). The error is 0 if both lights are
         dark.
     """
-    # Harmonics are orthonormal, so the mean square over all normals is in proportion
-    # to the sum of the squared coefficients of the irradiance.
     size = max(lights.shape[-2], given.shape[-2])
     factors = lambertian_factors(math.isqrt(size) - 1)[:, None].to(given.device)
     approximate = _pad_bands(lights.double(), size) * factors
     exact = _pad_bands(given.double(), size) * factors
+    # Harmonics are orthonormal, so the norm of the coefficients is proportional to the
+    # root mean square of the irradiance over all normals.
     error = _norm_over_coefficients(approximate - exact)
     norm = _norm_over_coefficients(exact)
     return torch.where(error > 0, error / norm, error)
 
 
-def _pad_bands(lights: Tensor, size: int) -> Tensor:
-    """Append zeros to the coefficients of lights.
+def _pad_bands(coefficients: Tensor, size: int) -> Tensor:
+    """Append zeros to the SH coefficients of lights.
 
     Args:
-        lights: SH coefficients, shape (..., K, C).
-        size: Number of coefficients after the padding.
+        coefficients: SH coefficients of C color channels, shape (..., K, C).
+        size: Number of coefficients after the padding, at least K.
 
     Returns:
         SH coefficients, shape (..., size, C).
     """
-    return F.pad(lights, (0, 0, 0, size - lights.shape[-2]))
+    return F.pad(coefficients, (0, 0, 0, size - coefficients.shape[-2]))
 
 
-def _norm_over_coefficients(lights: Tensor) -> Tensor:
-    """Compute the L2 norm of each light over its coefficients and channels.
+def _norm_over_coefficients(coefficients: Tensor) -> Tensor:
+    """Compute the L2 norm of each light over its K SH coefficients and C color channels.
 
     Args:
-        lights: SH coefficients, shape (..., K, C).
+        coefficients: SH coefficients of the lights, shape (..., K, C).
 
     Returns:
         Norms, shape (...).
     """
-    return lights.square().sum((-2, -1)).sqrt()
+    return coefficients.square().sum((-2, -1)).sqrt()
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
@@ -501,7 +510,7 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
     z, z_weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     radius = np.sqrt(1 - z**2)[:, None]
-    # Coordinates of all pairs of a value of z and an azimuth, shape (values of z, azimuths).
+    # Coordinate x of each direction: one row per value of z, one column per azimuth.
     x = radius * np.cos(azimuth)
     y = radius * np.sin(azimuth)
     directions = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
@@ -637,7 +646,7 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
 
     def rotated_radiance(directions: Tensor) -> Tensor:
         """Compute the radiance of the rotated light from directions, shape (..., 3)."""
-        # Row vectors times R are the vectors Rᵀ ω.
+        # Each row is a direction ω. Multiplying the row by R from the right gives Rᵀ ω.
         turned_back = directions @ rotation.to(directions)
         return basis(turned_back, degree) @ coefficients.to(directions)
 
@@ -645,8 +654,8 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
 
 
 def _is_orthonormal(matrix: Tensor) -> bool:
-    """Tell whether a matrix has the shape (3, 3), and R Rᵀ is the identity up to ORTHONORMAL."""
+    """Tell whether a matrix R has the shape (3, 3) and R Rᵀ is the identity, up to rounding."""
     if matrix.shape != (3, 3):
         return False
     identity = torch.eye(3).to(matrix)
-    return torch.allclose(matrix @ matrix.mT, identity, rtol=0, atol=ORTHONORMAL)
+    return torch.allclose(matrix @ matrix.mT, identity, rtol=0, atol=ORTHONORMALITY_TOLERANCE)

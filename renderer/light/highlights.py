@@ -23,55 +23,56 @@ from renderer.light.window import best_window
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.surface.microfacets import SCHLICK, reflectance
 
-# Default of `required_degree`: a light does not need the degrees whose amplitude in a
+# By default, `required_degree` leaves out the degrees of a light whose amplitude in a
 # highlight is at most this fraction of the amplitude of degree 0.
 AMPLITUDE = 0.1
-# Factor for the width α = roughness² of a highlight. `window_without_ringing` also tests
-# a highlight that is narrower by this factor, because highlights at grazing angles are
-# narrower than those along the normal.
+# Highlights at grazing angles are narrower than highlights along the normal.
+# `window_without_ringing` therefore also tests a highlight whose width α = roughness² is
+# multiplied by this factor.
 NARROWER = 0.7
-# `highlight_window` weighs an error of the irradiance this many times as much as an error
-# of a highlight.
-IRRADIANCE = 10.0
-# Smallest amplitude that `_spectrum` returns. Windows are computed by dividing by
-# amplitudes, so these must not be 0.
-SMALLEST = 1e-4
+# When `highlight_window` minimizes errors, an error of the irradiance has this many times
+# the weight of an error of a highlight.
+IRRADIANCE_WEIGHT = 10.0
+# Smallest amplitude that `_amplitudes` returns. Other functions divide by amplitudes, so
+# these must not be 0.
+MIN_AMPLITUDE = 1e-4
 
 
 @cache
 def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
-    """Find the smallest spherical-harmonic degree that shows the highlights of a material.
+    """Find the degree of environment light that the highlights of a material need.
 
-    The highlight is the lobe of a metal for a camera that looks along the
-    normal. No higher degree has more than the given amplitude in it.
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal. It multiplies the coefficients of degree l of the light by
+    an amplitude. All degrees with a larger amplitude than `amplitude` are needed.
 
     Args:
         roughness: Roughness in [0, 1]. Values below MIN_ROUGHNESS count as MIN_ROUGHNESS.
-        amplitude: Largest amplitude of the degrees that are left out, as a
-            fraction of the amplitude of degree 0.
+        amplitude: Largest amplitude of a degree that is not needed, as a fraction
+            of the amplitude of degree 0.
 
     Returns:
         Degree, at most MAX_DEGREE.
     """
-    amplitudes = _spectrum(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
-    # The amplitudes fall with the degree. The number of degrees from 1 on that exceed the
-    # limit is therefore the last such degree.
+    amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
+    # The amplitudes fall with the degree. If n degrees from 1 on exceed the limit, these
+    # are the degrees 1 to n.
     return int(np.count_nonzero(amplitudes[1:] > amplitude))
 
 
 def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
-    """Find factors for the coefficients of a map, under which its highlights do not ring.
+    """Find factors for the SH coefficients of a map that keep dark rings out of highlights.
 
-    An environment map with few spherical harmonics oscillates around its
-    bright places. Highlights then have dark rings or negative radiance. This
-    function tries no window, then the window for the highlight of the surface,
-    and then the window for a highlight that is narrower by the factor NARROWER.
-    It returns the first one under which the narrower highlight is negative
-    nowhere.
+    The radiance of few spherical harmonics oscillates around bright places of the
+    map. Highlights then get dark rings with negative radiance. A window is a
+    factor for each coefficient that prevents this. The function tries no window,
+    then the window for a highlight of the surface, and then the window for a
+    highlight that is narrower by the factor NARROWER. It returns the first of
+    these with which the narrower highlight is negative nowhere.
 
     Args:
-        coefficients: Spherical-harmonic coefficients of the map,
-            shape (K, C) with K = (degree + 1)² and C channels.
+        coefficients: SH coefficients of the environment map, shape (K, C) with
+            K = (degree + 1)² and C color channels.
         roughness: Roughness of the smoothest surface, in [0, 1]. Values below
             MIN_ROUGHNESS count as MIN_ROUGHNESS.
 
@@ -79,9 +80,9 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
         Factor of each coefficient, float64, shape (K,). The first is 1.
     """
     degree = math.isqrt(len(coefficients)) - 1
-    # The width of a lobe is α = roughness².
+    # The square root, because the width of a highlight is α = roughness².
     narrow_roughness = max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER)
-    narrow_amplitudes = torch.from_numpy(_spectrum(narrow_roughness, degree))
+    narrow_amplitudes = torch.from_numpy(_amplitudes(narrow_roughness, degree))
     narrow_lobe = narrow_amplitudes[bands(degree)]
     window = torch.ones(len(coefficients), dtype=torch.float64)
     rows = max(FEWEST_ROWS, 2 * degree)
@@ -95,40 +96,43 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
 
 @cache
 def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
-    """Find the best factors for coefficients, under which a highlight is negative nowhere.
+    """Find factors for SH coefficients of light that keep a highlight non-negative.
 
-    The window minimizes the errors of highlights and of irradiance (see
-    `best_window`). An error of irradiance weighs IRRADIANCE times as much.
+    The factors (a window) change the highlight and the irradiance of a point
+    light as little as possible. An error of the irradiance has IRRADIANCE_WEIGHT
+    times the weight of an error of the highlight.
 
     Args:
-        degree: Degree of the lighting.
+        degree: Degree of the light.
         roughness: Roughness of the smoothest surface, in [0, 1]. Values below
             MIN_ROUGHNESS count as MIN_ROUGHNESS.
-        width: Width α of the highlight, as a fraction of the width for this
-            roughness.
+        width: Width α of the highlight, divided by the width roughness² that
+            belongs to the roughness.
 
     Returns:
         Factor of each coefficient, float64, shape ((degree + 1)²,). The first
         is 1.
     """
-    highlight = _spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
+    highlight = _amplitudes(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
     # The first harmonic of degree l has the index l².
     first_of_degree = torch.arange(degree + 1) ** 2
     irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
-    weight = np.hypot(highlight, IRRADIANCE * irradiance)
+    weight = np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance)
     harmonics_per_degree = 2 * np.arange(degree + 1) + 1
     return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
 
 
 @cache
 def highlight_error(degree: int, roughness: float) -> float:
-    """Compute the error of the highlight of a point light under `highlight_window`.
+    """Compute the error of a highlight if a point light is approximated by harmonics.
 
-    The highlight is the lobe of a metal for a camera that looks along the
-    normal. The window is the one for a narrower highlight (see NARROWER).
+    The SH coefficients of the point light are cut off at a degree and multiplied
+    by `highlight_window` for a highlight that is narrower by the factor NARROWER.
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal.
 
     Args:
-        degree: Degree of the lighting.
+        degree: Degree of the light.
         roughness: Roughness of the surface, in [0, 1]. Values below MIN_ROUGHNESS count
             as MIN_ROUGHNESS.
 
@@ -136,41 +140,44 @@ def highlight_error(degree: int, roughness: float) -> float:
         Root mean square error over all directions, as a fraction of the root
         mean square of the highlight.
     """
-    amplitudes = _spectrum(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
+    amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
     window = highlight_window(degree, roughness, NARROWER)
+    # The first harmonic of degree l has the index l².
     first_of_degree = np.arange(degree + 1) ** 2
-    kept = np.zeros_like(amplitudes)
-    kept[: degree + 1] = window[first_of_degree].numpy()
+    # Factor of each degree in the approximation. Degrees that are cut off have 0.
+    factors = np.zeros_like(amplitudes)
+    factors[: degree + 1] = window[first_of_degree].numpy()
     power = (2 * np.arange(len(amplitudes)) + 1) * amplitudes**2
-    lost_power = float(power @ (1 - kept) ** 2 / power.sum())
-    return math.sqrt(lost_power)
+    relative_squared_error = float(power @ (1 - factors) ** 2 / power.sum())
+    return math.sqrt(relative_squared_error)
 
 
-def _spectrum(roughness: float, degree: int) -> np.ndarray:
-    """Compute the amplitude of each degree l in a highlight, relative to degree 0.
+def _amplitudes(roughness: float, degree: int) -> np.ndarray:
+    """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
 
-    The highlight is the lobe with the term SCHLICK for a camera that looks
-    along the normal. It is symmetric about the normal, so its coefficient of
-    degree l is an integral with the Legendre polynomial P_l.
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal. The lobe is symmetric about the normal, so the factor of
+    degree l is the integral of the lobe times the Legendre polynomial P_l.
 
     Args:
         roughness: Roughness of the surface.
         degree: Largest degree l.
 
     Returns:
-        Amplitudes, at least SMALLEST, float64, shape (degree + 1,).
+        Factors, divided by the factor of degree 0, and at least MIN_AMPLITUDE.
+        They are float64 and have the shape (degree + 1,).
     """
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     node_count = 2**9 + 4 * degree
-    # Gauss-Legendre nodes in [-1, 1]. The lobe is 0 below the surface, so that the cosine
-    # of the angle to the normal only covers [0, 1].
+    # Gauss-Legendre nodes in [-1, 1]. They are mapped to the cosines of angles to the
+    # normal in [0, 1], because the lobe is 0 below the surface.
     nodes, weights = np.polynomial.legendre.leggauss(node_count)
     cosine = torch.from_numpy((nodes + 1) / 2)
     sine = (1 - cosine**2).sqrt()
     light = torch.stack([sine, 0 * cosine, cosine], 1)
     roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
     lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
-    # P_l at each node, shape (nodes, degree + 1).
+    # Legendre polynomials P_0 to P_degree (columns) at each node (rows).
     legendre = np.polynomial.legendre.legvander(cosine.numpy(), degree)
     amplitudes = (weights * lobe.numpy()) @ legendre
-    return np.maximum(amplitudes / amplitudes[0], SMALLEST)
+    return np.maximum(amplitudes / amplitudes[0], MIN_AMPLITUDE)

@@ -21,10 +21,11 @@ from renderer.settings import require_field_types
 from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes
 
-# A surface point casts rays to RAYS points of a disc lamp. There are SETS different
-# sets of such points. Neighboring surface points use different sets, which makes the
-# edges of soft shadows smoother.
-SETS, RAYS = 4, 8
+# A surface point casts a ray to each point of a set of points on a disc lamp.
+POINTS_PER_SET = 8
+# Number of different sets of points on a disc lamp. Neighboring surface points use
+# different sets, which makes the edges of soft shadows smoother.
+POINT_SETS = 4
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,12 @@ class Lamps(LocalBasis):
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
-        """Create lamps and their coefficients from settings, see `LocalBasis.from_settings`.
+        """Create lamps and their coefficients from settings.
 
         Args:
-            settings: `LampsSettings` of `augment.settings`. `start` is a number, a
-                list of colors, or the file of saved lamps.
+            settings: `LampsSettings` of `augment.settings`. Its field `start` gives
+                the coefficients: a number for all, an RGB color for each lamp, or
+                the path of a file of `save_light` with lamps and coefficients.
 
         Returns:
             Lamps, and their RGB coefficients, shape (L, 3) for L lamps.
@@ -105,7 +107,7 @@ class Lamps(LocalBasis):
                 "and as start a number or a list with [r, g, b] for each lamp"
             ) from error
         lamps = cls(positions, settings.power, settings.radius)
-        # The comparison is also False for NaN.
+        # NaN is out of range, too, because both comparisons with NaN are False.
         if not ((start >= 0) & (start <= settings.power)).all():
             raise InputError(
                 f"start={settings.start} is out of range: give coefficients from 0 to "
@@ -126,17 +128,17 @@ class Lamps(LocalBasis):
         return torch.tensor(self.positions)
 
     def moved(self, positions: Tensor) -> Self:
-        """Return a copy with the lamps at other positions.
+        """Return a copy of this basis with the lamps at new positions.
 
         Args:
-            positions: Positions of the L lamps in world axes, shape (L, 3).
+            positions: New positions of the L lamps in world axes, shape (L, 3).
         """
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find the paths from lamps to surface points, as if nothing blocked the light.
+        """Find the straight paths from lamps to surface points, without shadows.
 
         Args:
             points: S surface points in world axes, shape (S, 3).
@@ -145,26 +147,27 @@ class Lamps(LocalBasis):
                 None uses the positions of the basis.
 
         Returns:
-            Paths that arrive at the front of the surface. There is one path for
-            each pair of a point and a lamp, or RAYS paths if lamps are discs.
+            Paths that arrive at the front of the surface, also those that an
+            object blocks. There is one path for each pair of a surface point and
+            a lamp, or `POINTS_PER_SET` paths if the lamps are discs.
         """
         positions = points.new_tensor(self.positions) if positions is None else positions
-        # Points on the L lamps, shape (SETS, L, RAYS, 3). A lamp without extent has
-        # the shape (1, L, 1, 3).
+        # Points on the lamps, with the axes: set of points, lamp, point, coordinate. For
+        # point lamps, the first and the third axis have the size 1.
         sources = self._disc_points(positions) if self.radius else positions[None, :, None]
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
-        # First find the paths that arrive at the front of a surface, without a graph.
+        # First find the paths with light, without recording operations for gradients.
         with torch.no_grad():
-            # Vector from each of S points to each source point, shape (S, L, RAYS, 3).
+            # Vectors with the axes: surface point, lamp, point on the lamp, coordinate.
             to_lamp = sources[set_of_point] - points[:, None, None]
             irradiance = self._irradiance(to_lamp, normals[:, None, None], positions[:, None])
-            point, lamp, ray = torch.nonzero(irradiance > 0, as_tuple=True)
-        # Then compute the irradiance of these E paths again, with a graph.
-        source = sources[set_of_point[point], lamp, ray]
+            point, lamp, point_on_lamp = torch.nonzero(irradiance > 0, as_tuple=True)
+        # Then compute the irradiance of these paths again, with gradients.
+        source = sources[set_of_point[point], lamp, point_on_lamp]
         irradiance = self._irradiance(source - points[point], normals[point], positions[lamp])
-        rays_per_lamp = sources.shape[2]
+        paths_per_lamp = sources.shape[2]
         return LightPaths(
-            point=point, function=lamp, source=source, irradiance=irradiance / rays_per_lamp
+            point=point, function=lamp, source=source, irradiance=irradiance / paths_per_lamp
         )
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
@@ -172,12 +175,14 @@ class Lamps(LocalBasis):
 
         Args:
             coefficients: RGB coefficients of the L lamps, shape (L, 3).
-            albedo_scale: Factor for the intensity, instead of for the albedo.
+            albedo_scale: Factor for the albedo of the mesh. It multiplies the
+                intensity of the lamps instead, which gives the same image.
 
         Returns:
-            Entries of points or discs.
+            Entries of point or disc emitters, one for each lamp.
         """
-        # Mitsuba reflects albedo / π times the irradiance, so lamps are π times brighter.
+        # A surface reflects albedo / π times the irradiance in Mitsuba, and albedo times
+        # the irradiance in this project.
         intensities = math.pi * albedo_scale * coefficients
         describe = self._mitsuba_disc if self.radius else self._mitsuba_point
         return [
@@ -186,23 +191,27 @@ class Lamps(LocalBasis):
         ]
 
     def _disc_points(self, positions: Tensor) -> Tensor:
-        """Choose points on disc lamps, to which rays are cast.
+        """Choose points on disc lamps, to which shadow rays are cast.
 
-        The points of a set divide a disc into equal areas. They lie on Vogel's
-        spiral (1979), which is turned in each set.
+        There are several sets of points. The points of a set represent equal areas
+        of the disc. They lie on Vogel's spiral (1979), which is rotated by another
+        angle in each set.
 
         Args:
             positions: Centers of the L discs in world axes, shape (L, 3).
 
         Returns:
-            Points in world axes, shape (SETS, L, RAYS, 3).
+            Points in world axes, shape (POINT_SETS, L, POINTS_PER_SET, 3).
         """
-        # Index of the set and index of the point in the set, shape (SETS, RAYS).
-        set_index, ray = torch.meshgrid(torch.arange(SETS), torch.arange(RAYS), indexing="ij")
-        distance = self.radius * ((ray + (set_index + 0.5) / SETS) / RAYS).sqrt()
-        # π (3 - √5) is the golden angle.
-        angle = ray * math.pi * (3 - math.sqrt(5)) + set_index * 2 * math.pi / SETS
-        # Positions in the plane of a disc, shape (SETS, RAYS, 2).
+        # Both index tensors have one row for each set and one column for each point.
+        set_index, point_index = torch.meshgrid(
+            torch.arange(POINT_SETS), torch.arange(POINTS_PER_SET), indexing="ij"
+        )
+        area_fraction = (point_index + (set_index + 0.5) / POINT_SETS) / POINTS_PER_SET
+        distance = self.radius * area_fraction.sqrt()
+        golden_angle = math.pi * (3 - math.sqrt(5))
+        angle = point_index * golden_angle + set_index * 2 * math.pi / POINT_SETS
+        # Positions in the plane of a disc, with the axes: set, point, plane coordinate.
         in_plane = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2)
         in_plane = in_plane.to(positions)
         # Unit vector from the origin to each disc, which is the axis of the disc.
@@ -210,8 +219,8 @@ class Lamps(LocalBasis):
         # With the sign -1, `tangent_axes` is not singular for discs below the origin.
         sign = torch.where(z < -0.5, -1.0, 1.0).to(z)
         plane_axes = [torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)]
-        # The indices are set s, ray r, plane axis a, lamp l and coordinate j.
-        offsets = torch.einsum("sra,laj->slrj", in_plane, torch.stack(plane_axes, dim=1))
+        # Axes: set s, point p, plane coordinate a, lamp l, world coordinate w.
+        offsets = torch.einsum("spa,law->slpw", in_plane, torch.stack(plane_axes, dim=1))
         return positions[:, None] + offsets
 
     def _irradiance(self, to_lamp: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
@@ -231,8 +240,7 @@ class Lamps(LocalBasis):
         irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:
             return irradiance
-        # A disc faces the origin, so its emission has the cosine between the vector
-        # to the lamp and the position of the lamp.
+        # A disc faces the origin, so its axis is the direction of its position.
         disc_axis = F.normalize(positions, dim=-1)
         cosine_at_disc = (to_lamp * disc_axis).sum(-1) / squared_distance.sqrt()
         return irradiance * cosine_at_disc.clamp(min=0)
@@ -247,7 +255,7 @@ class Lamps(LocalBasis):
             intensity: Radiant intensity in red, green and blue.
 
         Returns:
-            Entry of a Mitsuba scene.
+            Dictionary that describes the emitter in a Mitsuba scene.
         """
         color = {"type": "rgb", "value": intensity}
         return {"type": "point", "position": list(position), "intensity": color}
@@ -259,17 +267,17 @@ class Lamps(LocalBasis):
 
         Args:
             position: Center of the disc in world axes.
-            intensity: Radiant intensity of the disc, seen from the front and from
-                afar, in red, green and blue.
+            intensity: Radiant intensity along the axis of the disc, in red, green
+                and blue.
 
         Returns:
-            Entry of a Mitsuba scene.
+            Dictionary that describes the emitter in a Mitsuba scene.
         """
         x, y, z = position
         polar = math.degrees(math.atan2(math.hypot(x, y), z))
         azimuth = math.degrees(math.atan2(y, x))
-        # A Mitsuba disk has radius 1 and emits along its +z axis. A camera at the
-        # center of the disc that looks at the origin has the pose of the disc.
+        # A Mitsuba disk emits along its +z axis, as a camera looks along it. The disc
+        # therefore has the pose of a camera at its center that looks at the origin.
         camera = PerspectiveCamera(polar, azimuth, 1.0, distance=math.hypot(x, y, z))
         area = math.pi * self.radius**2
         radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}

@@ -37,15 +37,15 @@ def save_light(
 ) -> None:
     """Write a light to a .json file.
 
-    `read_light` reads the same float32 numbers back, to the bit. The pattern of a
-    projector is also written to an 8-bit .png file with the same name. White in
-    this image is the power of the projector.
+    `read_light` reads exactly the same float32 numbers. For a projector, its
+    pattern is also written to an 8-bit .png file with the same name. White in
+    this image is the largest coefficient, the attribute `power` of the projector.
 
     Args:
         path: Path of the .json file.
-        coefficients: RGB coefficients of the light, shape (size, 3), for the
-            `size` functions of the basis.
-        basis: Basis of the light. The default is SH of degree 6.
+        coefficients: RGB coefficients of the light, shape (size, 3) with the
+            number `basis.size` of functions of the basis.
+        basis: Basis of the light. The default is spherical harmonics of degree 6.
 
     Raises:
         InputError: If the file is not a .json file or cannot be written, or the
@@ -92,17 +92,18 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     """Read a light from a .json file.
 
     Args:
-        path: Path of a file of `save_light`. A file that only has a list of rows
-            [r, g, b] holds SH coefficients.
-        kinds: Classes of bases that the file may describe.
+        path: Path of a file that `save_light` wrote. A file may also be a plain
+            list of rows [r, g, b]. These are SH coefficients.
+        kinds: Accepted kinds of light, as classes such as `Harmonics` or `Lamps`.
 
     Returns:
         A tuple of
-        - the basis;
-        - the coefficients of its `size` functions, float32, shape (size, 3).
+        - the basis of the light;
+        - its RGB coefficients, float32, shape (size, 3).
 
     Raises:
-        InputError: If the file is missing or does not describe such a light.
+        InputError: If the file is missing, or does not describe a light of an
+            accepted kind.
     """
     path = Path(path)
     require_file(path, "give the path of a .json file of coefficients")
@@ -124,7 +125,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         raise InputError(
             f"{path} does not describe a light ({error}): write the file again"
         ) from error
-    # The comparison is also False for NaN.
+    # The comparison is False for NaN, so NaN counts as too large.
     is_bounded = bool((coefficients.abs() <= MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)

@@ -58,7 +58,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.ball import Ball
-from renderer.light.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
+from renderer.light.harmonics import bands, cache_tensors, gradient_matrices, monomial_coefficients
 from renderer.light.program import shortest
 from renderer.light.window import irradiance_weights, nonnegative_window
 from renderer.vectors import tangent_axes
@@ -687,7 +687,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
 
     On the unit sphere, x² + y² + z² = 1. Each harmonic is therefore a homogeneous
     polynomial of degree `degree` or `degree` - 1 in x, y and z. For few
-    directions, this is faster than `harmonics.select_rows`.
+    directions, this is faster than `harmonics.evaluate_harmonics`.
 
     Args:
         directions: D unit vectors, shape (D, 3).
@@ -707,7 +707,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
     return monomials.T @ coefficients
 
 
-@per_degree
+@cache_tensors
 def _polynomials(degree: int) -> tuple[Array, Array]:
     """Express the spherical harmonics on the unit sphere by J monomials x^a y^b z^c.
 
@@ -735,7 +735,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
     return np.array(exponents).T, torch.cat(coefficients).numpy()
 
 
-@per_degree
+@cache_tensors
 def _derivatives(degree: int) -> Array:
     """Compute the matrix that maps SH coefficients to those of first and second derivatives.
 
@@ -768,7 +768,7 @@ class _Grid:
     neighbors: Array
 
 
-@per_degree
+@cache_tensors
 def _grid(degree: int, subdivisions: int) -> _Grid:
     """Create the grid of directions in which negative radiance is searched.
 

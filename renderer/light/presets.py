@@ -71,7 +71,7 @@ _PUBLISHED_PROBES = {
 }
 # Names of the light probes.
 PROBES = tuple(_PUBLISHED_PROBES)
-# Name of light with the same radiance from all directions.
+# Name with which `load_light` creates light with the same radiance from all directions.
 UNIFORM = "uniform"
 # `load_light` scales environment maps to the mean luminance of this probe.
 _REFERENCE_PROBE = "grace"
@@ -82,28 +82,29 @@ def load_light(
 ) -> Tensor:
     """Load environment light by name or from a file.
 
-    An environment map is scaled to the mean luminance of the grace probe, since
-    maps come in any unit. A map may have slightly negative radiance, as series
-    have that were written as a map. SH coefficients are not scaled.
+    The unit of environment maps is unknown. They are therefore scaled so that
+    their mean luminance is the one of the probe "grace". SH coefficients from a
+    file are not scaled.
 
     Args:
-        light: Name of a probe ("grace", "eucalyptus" or "st_peters"); "uniform",
-            in which a surface shows its albedo; the file of an environment map
-            (.npy, .hdr, .exr); or a file of coefficients (.json, as
-            `nb.save_light` writes it).
+        light: One of four kinds: the name of a measured light probe ("grace",
+            "eucalyptus" or "st_peters"); "uniform", the same radiance from all
+            directions, so that a surface shows its albedo; the path of an
+            environment map (.npy, .hdr or .exr); the path of SH coefficients
+            (.json, as `nb.save_light` writes it).
         degree: Degree of the result. None for the degree of a file of
             coefficients, or 6 for any other light.
         roughness: Roughness in [0, 1] of the smoothest surface that the light
-            shines on. If it is given, a map is truncated by
-            `renderer.light.highlights.window_without_ringing`, which changes maps
-            whose highlights would ring.
+            shines on. With it, the coefficients of an environment map are damped
+            where a highlight on this surface would get dark rings. None for no
+            damping.
 
     Returns:
         SH coefficients, shape ((degree + 1)², 3), float32.
 
     Raises:
-        InputError: If the name is unknown, the file does not exist or holds no
-            light, or the light has a higher degree.
+        InputError: If the name is unknown, if the file does not exist or holds no
+            light, or if the light has a higher degree than `degree`.
 
     Example:
         >>> import norm_balls as nb
@@ -132,7 +133,7 @@ def load_light(
             f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or "
             f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)",
         )
-    # A higher degree appends zeros. A lower degree may only remove zeros.
+    # Number of coefficients of the result. Only zeros may be appended or removed.
     size = len(coefficients) if degree is None else Harmonics(degree).size
     if coefficients[size:].any():
         raise InputError(
@@ -142,7 +143,9 @@ def load_light(
 
 
 def probe(name: str) -> Tensor:
-    """Return a published light probe, rotated from y up to z up.
+    """Return a published light probe, the measured light of a real place.
+
+    The published coefficients have y up and are rotated to z up.
 
     Args:
         name: Name of the probe, one of `PROBES`.
@@ -161,7 +164,7 @@ def probe(name: str) -> Tensor:
 def ambient(color: Tensor) -> Tensor:
     """Create light with the same radiance from every direction.
 
-    The irradiance of a surface is π times the radiance.
+    The irradiance of a surface in this light is π times the radiance.
 
     Args:
         color: Linear RGB radiance, shape (3,).
@@ -176,7 +179,7 @@ def ambient(color: Tensor) -> Tensor:
 
 
 def directional(direction: Tensor, color: Tensor, degree: int = DEGREE) -> Tensor:
-    """Create parallel light from one direction.
+    """Approximate parallel light from one direction by spherical harmonics.
 
     At degree 6, the error of the irradiance is at most 0.043 times the irradiance
     of a surface that faces the light.
@@ -206,9 +209,9 @@ def perturb(
         light: SH coefficients, shape (K, 3) with K = (degree + 1)².
         count: Number of lights to draw.
         amplitude: Largest change of a coefficient.
-        radius: If given, only coefficients that reach a diffuse surface are
-            changed, and their change is scaled to this L2 norm. None changes all
-            coefficients and does not scale the change.
+        radius: L2 norm to which the change of a light is scaled. With it, only
+            coefficients that change the irradiance of a diffuse surface are
+            changed. None changes all coefficients and does not scale the change.
         generator: Source of the random numbers.
 
     Returns:
@@ -217,8 +220,8 @@ def perturb(
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        # 1 for each coefficient that reaches a diffuse surface, and 0 for the others.
         diffuse_indices = nonzero_coefficients(degree_of(light))
+        # 1 for coefficients that change the irradiance of a surface, 0 for the others.
         mask = torch.zeros(len(light), 1).index_fill_(0, diffuse_indices, 1.0)
         offsets = offsets * mask
         norms = offsets.flatten(1).norm(dim=1).clamp(min=1e-12)
@@ -227,13 +230,14 @@ def perturb(
 
 
 def mean_luminance(coefficients: Tensor) -> float:
-    """Compute the mean luminance of a light over the sphere, times √(4π).
+    """Compute √(4π) times the mean luminance of a light over all directions.
 
     Args:
-        coefficients: SH coefficients, shape (K, 3). Only the first row counts.
+        coefficients: SH coefficients of linear RGB radiance, shape (K, 3). Only
+            the first row counts. It is √(4π) times the mean radiance.
 
     Returns:
-        Luminance.
+        √(4π) times the luminance.
     """
     weights = torch.tensor(LUMINANCE, dtype=torch.float64)
     return float(coefficients[0].cpu().double() @ weights)
@@ -245,7 +249,8 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     Args:
         path: File of the map.
         degree: Degree of the result.
-        roughness: Roughness of the smoothest surface, see `load_light`.
+        roughness: Roughness in [0, 1] of the smoothest surface in this light, whose
+            highlights must not get dark rings. None if this does not matter.
 
     Returns:
         SH coefficients, float32, shape ((degree + 1)², 3).

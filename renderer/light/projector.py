@@ -68,15 +68,16 @@ class Projector(LocalBasis):
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
-        """Create a projector and its pattern from settings, see `LocalBasis.from_settings`.
+        """Create a projector and its pattern from settings.
 
         Args:
-            settings: `ProjectorSettings` of `augment.settings`. `pattern` is a gray
-                value or an image file.
+            settings: `ProjectorSettings` of `augment.settings`. Its field `pattern`
+                is a gray value in [0, 1] or the path of an image.
 
         Returns:
-            Projector, and the RGB coefficients of its pixels,
-            shape (pixels², 3).
+            A tuple of
+            - the projector;
+            - the RGB coefficients of its pixels, shape (pixels², 3).
 
         Raises:
             InputError: If a setting is out of range, or if the image cannot be
@@ -119,7 +120,7 @@ class Projector(LocalBasis):
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find the path from the projector to each surface point within the pattern.
+        """Find the straight path from the projector to each surface point that it lights.
 
         Args:
             points: N surface points in world axes, shape (N, 3).
@@ -127,20 +128,20 @@ class Projector(LocalBasis):
             positions: Not used, because a projector cannot be moved.
 
         Returns:
-            One path for each point that the pattern lights, without regard to
-            shadows.
+            One path for each point that lies within the pattern and faces the
+            projector, also if an object blocks the path.
         """
-        # A camera at the projector has the axes right, up and back of the pattern.
+        # A camera in the direction of the projector has the axes of the pattern: right, up
+        # and back (away from the origin), one axis for each row.
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]
         right, up, back = ((points - source) @ axes.T).unbind(1)
         depth = -back
-        # Half the width of the pattern at depth 1.
+        # Half the width of the pattern on a screen at distance 1 from the projector.
         half_width = math.tan(math.radians(self.fov) / 2)
         column = ((1 + right / (depth * half_width)) / 2 * self.pixels).floor()
         row = ((1 - up / (depth * half_width)) / 2 * self.pixels).floor()
-        # Cosine at the surface divided by the cosine to the axis of the projector. The
-        # distance to the point is the depth divided by the second cosine.
+        # Cosine between path and normal, divided by the cosine between path and axis.
         cosine_ratio = ((source - points) * normals).sum(1) / depth
         in_rows = (row >= 0) & (row < self.pixels)
         in_columns = (column >= 0) & (column < self.pixels)
@@ -160,14 +161,15 @@ class Projector(LocalBasis):
 
         Args:
             coefficients: RGB coefficients of the pixels, shape (pixels², 3).
-            albedo_scale: Factor for the pattern, instead of for the albedo.
+            albedo_scale: Factor for the albedo of the mesh. It multiplies the
+                pattern instead, which gives the same image.
 
         Returns:
             List with one entry.
         """
-        # Mitsuba's `projector` divides by π itself, so no factor π is needed.
         texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
+        # In contrast to lamps, no factor π is needed: Mitsuba's projector has it already.
         scale = albedo_scale * self.distance**2
         return [projector(pose_of(camera), self.fov, pattern, scale)]

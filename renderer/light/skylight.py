@@ -39,9 +39,9 @@ _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(
 # Order m of each coefficient, shape (49,).
 _ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])
 # For each coefficient of degree l and order m, the index of the coefficient of order -m.
-_MIRRORED = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
-# For each coefficient, the index of its polynomial in the fit. The orders m and -m share
-# a polynomial.
+_OPPOSITE_ORDER = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
+# For each SH coefficient, the index of its polynomial in the fitted sky. The orders m and
+# -m have the same polynomial.
 _ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
 
 
@@ -51,27 +51,28 @@ def coefficients(
     turbidity: Tensor | float,
     fit: Tensor | None = None,
 ) -> Tensor:
-    """Compute the light of a daylight sky.
+    """Compute the SH coefficients of a daylight sky (Preetham et al. 1999).
 
-    The result has analytic first derivatives by the parameters. Those by the
-    angles are per degree. The error of the result is at most 7e-5 of the norm of
-    the coefficients (4e-4 in haze with the sun on the horizon, where the
-    coefficients are smallest). The error of the derivatives
-    is at most 0.1 % by zenith and azimuth and 0.5 % by turbidity, and two to
-    three times as large at the ends of the domain.
+    The coefficients are polynomials that were fitted to the sky model. Their
+    error is at most 7e-5 of their norm. It is at most 4e-4 if the sun is on the
+    horizon and the air is hazy, where the coefficients are smallest.
+
+    The result is differentiable once with respect to the three parameters. The
+    error of the derivatives is at most 0.1 % for the angles and 0.5 % for the
+    turbidity, and two to three times as large at the limits of a parameter.
 
     Args:
-        zenith: Zenith angle of the sun in degrees, in `ZENITH`. The shapes of
+        zenith: Zenith angle of the sun in degrees, from 0 to 90. The shapes of
             the three parameters broadcast to (...).
-        azimuth: Azimuth of the sun in degrees.
-        turbidity: Haziness of the air, in `TURBIDITY`.
-        fit: Polynomials to evaluate, as tests/renderer/fit_skylight.py writes
-            them. None for the fit that comes with the library.
+        azimuth: Azimuth of the sun in degrees, measured from +x toward +y.
+        turbidity: Haziness of the air, from 2 (clear) to 10 (haze).
+        fit: Coefficients of the polynomials, as tests/renderer/fit_skylight.py
+            writes them. None for the coefficients that come with the library.
 
     Returns:
-        SH coefficients of degree 6, shape (..., 49, 3), linear RGB in kcd/m²,
-        in the dtype of the turbidity. If that is a number, the dtype is that of
-        the angles, and float64 if all are numbers.
+        SH coefficients of degree 6, shape (..., 49, 3), linear RGB in kcd/m². The
+        dtype is the one of the turbidity. If the turbidity is a number, it is the
+        dtype of the angles, or float64 if these are numbers, too.
 
     Raises:
         InputError: If a parameter is outside of its range, NaN or infinite.
@@ -88,65 +89,68 @@ def coefficients(
 
 
 class _FittedSky(torch.autograd.Function):
-    """SH coefficients of the sky, with their derivatives by the three parameters.
+    """SH coefficients of the sky, differentiable with respect to the three parameters.
 
     Polynomials give the coefficients Ũ of a sky with the sun at azimuth 0. For the
     azimuth φ, the coefficients are U_lm = Ũ_lm cos(mφ) and U_l,-m = Ũ_lm sin(mφ)
-    for m ≥ 0. The paper prints the rotation by -φ, and ∂U/∂θ without the power of
-    turbidity in its second sum.
+    for m ≥ 0. (Liu et al. 2019 print the rotation by -φ instead of φ, and leave
+    out a power of the turbidity in the second sum of ∂U/∂θ.)
     """
 
     @staticmethod
     def forward(
         ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor
     ) -> Tensor:
-        """Compute the coefficients and their derivatives.
+        """Compute the SH coefficients of the sky, and save their derivatives in `ctx`.
 
         Args:
             ctx: Context of autograd.
             zenith: Zenith angle of the sun in radians, shape (...).
             azimuth: Azimuth of the sun in radians, same shape.
             turbidity: Turbidity, same shape.
-            fit: Polynomials, see `_library_fit`.
+            fit: Coefficients of the polynomials in the zenith angle (axis 0) and in
+                1 / turbidity (axis 1), see `_library_fit`.
 
         Returns:
             SH coefficients, shape (..., 49, 3).
         """
-        # Chebyshev polynomials of two variables in [-1, 1], and their derivatives.
+        # The zenith angle from 0 to π/2 is mapped to the domain [-1, 1] of the polynomials.
         zenith_values, zenith_slopes = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
+        # 1 / turbidity from 1/10 to 1/2 is mapped to the domain [-1, 1], too.
         turbidity_values, turbidity_slopes = _chebyshev(
             5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1]
         )
-        # The first axis is the value, its derivative by the zenith angle, and its
-        # derivative by the turbidity, shape (3, ..., polynomials).
+        # Factors of the sky, of its derivative with respect to the zenith angle, and of
+        # its derivative with respect to the turbidity, along the first axis.
         zenith_factors = torch.stack([zenith_values, zenith_slopes, zenith_values])
         turbidity_factors = torch.stack([turbidity_values, turbidity_values, turbidity_slopes])
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
         polynomials = fit.to(products).flatten(2).flatten(0, 1)
-        # Coefficients of the 28 harmonics with m ≥ 0, and their two derivatives, for a sun at
-        # the azimuth 0, shape (3, ..., 28, 3 colors).
+        # Coefficients with m ≥ 0 for a sun at azimuth 0, with the axes: sky and its two
+        # derivatives, shape of the parameters, 28 coefficients, 3 colors.
         at_azimuth_zero = (products.flatten(-2) @ polynomials).unflatten(-1, (-1, 3))
-        # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         orders = _ORDERS.to(azimuth)
         angles = azimuth[..., None] * orders.abs()
+        # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         rotation = torch.where(orders < 0, angles.sin(), angles.cos())[..., None]
         value, by_zenith, by_turbidity = at_azimuth_zero[..., _ROW_IN_FIT, :] * rotation
-        by_azimuth = -orders[:, None] * value[..., _MIRRORED, :]
+        by_azimuth = -orders[:, None] * value[..., _OPPOSITE_ORDER, :]
         ctx.save_for_backward(by_zenith, by_azimuth, by_turbidity)
         return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Compute the gradients by the zenith angle, the azimuth and the turbidity.
+        """Compute the gradients with respect to the three parameters of the sky.
 
         Args:
-            ctx: Context of autograd.
-            upstream: Gradient by the coefficients, shape (..., 49, 3).
+            ctx: Context of autograd, with the derivatives of the coefficients.
+            upstream: Gradient with respect to the SH coefficients,
+                shape (..., 49, 3).
 
         Returns:
-            Gradients by the three parameters, shape (...) each, and None for the
-            polynomials.
+            Gradients with respect to zenith angle, azimuth and turbidity,
+            shape (...) each, and None for the polynomials.
         """
         by_zenith, by_azimuth, by_turbidity = (
             (upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors
@@ -158,10 +162,12 @@ class _FittedSky(torch.autograd.Function):
 def _library_fit() -> Tensor:
     """Load the polynomials of the sky that come with the library.
 
+    Each SH coefficient of a sky with the sun at azimuth 0 is a sum of products of
+    two Chebyshev polynomials, one of the zenith angle and one of 1 / turbidity.
+
     Returns:
-        Coefficients of the products of Chebyshev polynomials in the zenith angle
-        (axis 0) and in 1 / turbidity (axis 1), for the 28 SH coefficients with
-        order m ≥ 0 (axis 2) and three colors (axis 3).
+        Factors of the products, with the axes: polynomial of the zenith angle,
+        polynomial of 1 / turbidity, 28 SH coefficients with order m ≥ 0, 3 colors.
     """
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 
@@ -193,8 +199,9 @@ def _as_parameters(
         if not is_number(value):
             # `as_tensor` raises InputError if the value is no tensor.
             as_tensor(name, value)
-    floating = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
-    like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
+    tensors = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
+    # Tensor that gives the dtype and the device of the results.
+    like = tensors[0] if tensors else torch.zeros((), dtype=torch.float64)
     turbidity_tensor = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
     degrees = []
     for angle in (zenith, azimuth):
@@ -203,8 +210,8 @@ def _as_parameters(
     zenith_degrees, azimuth_degrees = degrees
     require_finite(azimuth=azimuth_degrees)
     expected = "0 to 90 degrees, with the sun above the horizon"
-    _require_in_domain("zenith", zenith_degrees.to(like.dtype), ZENITH, expected)
-    _require_in_domain("turbidity", turbidity_tensor, TURBIDITY, "2 to 10")
+    _require_in_range("zenith", zenith_degrees.to(like.dtype), ZENITH, expected)
+    _require_in_range("turbidity", turbidity_tensor, TURBIDITY, "2 to 10")
     radians = [torch.deg2rad(angle).to(like.dtype) for angle in degrees]
     return [*radians, turbidity_tensor]
 
@@ -214,16 +221,14 @@ def _is_floating(value: object) -> TypeGuard[Tensor]:
     return isinstance(value, Tensor) and value.is_floating_point()
 
 
-def _require_in_domain(
-    name: str, value: Tensor, limits: tuple[float, float], description: str
-) -> None:
-    """Check that all entries of a parameter are within limits, up to rounding.
+def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], expected: str) -> None:
+    """Check that all values of a parameter of the sky are within limits, up to rounding.
 
     Args:
-        name: Name of the parameter, for the error.
+        name: Name of the parameter, for the error message.
         value: Values of the parameter, any shape.
-        limits: Smallest and largest value.
-        description: Description of the range, for the error.
+        limits: Smallest and largest permitted value.
+        expected: Description of the permitted values, for the error message.
 
     Raises:
         InputError: If an entry is outside of the limits, or NaN.
@@ -235,16 +240,16 @@ def _require_in_domain(
     if is_outside.any():
         first = value[is_outside][0].item()
         raise InputError(
-            f"{name}={first:.9g} is outside of the range of the sky model: give {description}"
+            f"{name}={first:.9g} is outside of the range of the sky model: give {expected}"
         )
 
 
 def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:
-    """Evaluate Chebyshev polynomials of a variable, and their derivatives by a parameter.
+    """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p.
 
     Args:
-        x: Variable, in [-1, 1], shape (...).
-        slope: Derivative of the variable by the parameter, shape (...) or a
+        x: Values of the variable x in [-1, 1], shape (...).
+        slope: Derivative of x with respect to the parameter p, shape (...) or a
             number.
         count: Number of polynomials.
 

@@ -29,22 +29,24 @@ import torch
 from numpy.polynomial import legendre
 from torch import Tensor
 
-from renderer.light.harmonics import bands, lambertian_factors, per_degree
+from renderer.light.harmonics import bands, cache_tensors, lambertian_factors
 
 # Largest number of rounds of the exchange method in `best_window`. Eight are usual.
 _MAX_ROUNDS = 100
-# `best_window` stops if no value of the lobe is below minus this fraction of the
-# largest value.
+# `best_window` stops if the lobe that it makes non-negative is nowhere below minus this
+# fraction of its largest value.
 _MAX_DEPTH = 1e-9
 
 
-@per_degree
+@cache_tensors
 def nonnegative_window(degree: int) -> Tensor:
-    """Compute the window that keeps lights non-negative and best keeps their irradiance.
+    """Compute factors for SH coefficients that keep lights non-negative.
 
-    The window minimizes the error of the irradiance of a point source. The root
-    mean square error is 0.17, 0.073 and 0.039 of the root mean square irradiance
-    at degrees 6, 12 and 19.
+    A physical light becomes negative in some directions if its SH coefficients
+    are cut off at a degree. Multiplied by these factors (a window), the cut light
+    is non-negative. Of all such windows, this one changes the irradiance of a
+    point source least. The root mean square error is 0.17, 0.073 and 0.039 of the
+    root mean square irradiance at degrees 6, 12 and 19.
 
     Args:
         degree: Degree of the light, from 0 to 20.
@@ -56,25 +58,24 @@ def nonnegative_window(degree: int) -> Tensor:
     # The first harmonic of band l has the index l².
     first_of_band = np.arange(degree + 1) ** 2
     irradiance_by_band = irradiance_weights(degree)[first_of_band].numpy()
-    # In band l, a point source of power 1 has the sum of squared coefficients
-    # (2l + 1) / 4π. The error of band l is therefore weighted with its square root,
-    # and the constant 4π does not matter.
+    # The squared coefficients of a point source in band l add up to (2l + 1) / 4π. The
+    # weights therefore contain √(2l + 1). The constant factor 4π does not matter.
     weights = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_by_band
     return best_window(np.ones(degree + 1), weights)
 
 
 def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
-    """Compute the window that makes a lobe non-negative and changes the lobe least.
+    """Compute the factors that make a lobe non-negative and change the lobe least.
 
     A lobe is a function of the angle θ from an axis, Σ_l (2l + 1) s_l P_l(cos θ),
     with the Legendre polynomials P_l. A window multiplies s_l by a factor w_l.
-    The window minimizes Σ_l weight_l² (w_l - 1)², and Σ_l (2l + 1) s_l w_l P_l
-    is non-negative.
+    The best window minimizes Σ_l weight_l² (w_l - 1)² under the condition that the
+    windowed lobe Σ_l (2l + 1) s_l w_l P_l(cos θ) is negative at no angle.
 
     Args:
-        spectrum: Positive factors s_l of the lobe, shape (degree + 1,). Ones are
-            the lobe of a point source.
-        weight: Weight of w_l - 1 for each l, shape (degree + 1,).
+        spectrum: Positive factors s_l of the lobe, shape (degree + 1,). If all are
+            1, the lobe is a point source.
+        weight: Weight of the change w_l - 1 for each l, shape (degree + 1,).
 
     Returns:
         Factor w_l for each coefficient of a light, float64,
@@ -84,7 +85,7 @@ def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
     degree = len(weight) - 1
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
-    # Cosines of the angles at which the windowed lobe is constrained.
+    # Cosines of the angles at which the windowed lobe must not be negative.
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
     for _ in range(_MAX_ROUNDS):
         factors = _best_factors(cosines, weight, spectrum)
@@ -98,19 +99,20 @@ def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
         if not len(negative_cosines):
             break
         cosines = np.concatenate([cosines, negative_cosines])
-    # Reducing all factors but the first one mixes the lobe with a constant. This
-    # lifts a slightly negative minimum to 0.
+    # The lobe may still be slightly negative. Reducing all factors but the first one moves
+    # the lobe toward a constant, which lifts its minimum to 0.
     factors[1:] /= max(1 - lobe_values.min(), 1)
     return torch.from_numpy(factors)[bands(degree)]
 
 
-@per_degree
+@cache_tensors
 def irradiance_weights(degree: int) -> Tensor:
     """Compute how strongly each SH coefficient changes the irradiance of a diffuse surface.
 
-    The weight of a coefficient of degree l is |A_l| / A_0, with the factors A_l
-    of `lambertian_factors`. If A_l is zero, the weight is half of the smallest
-    positive weight up to degree + 1, so that all weights are positive.
+    The weight of a coefficient of degree l is |A_l| / A_0. A_l is the factor of
+    the coefficient in the irradiance (`lambertian_factors`). If A_l is zero, the
+    weight is half of the smallest positive weight up to degree + 1, so that all
+    weights are positive.
 
     Args:
         degree: Degree of the light.
@@ -118,7 +120,7 @@ def irradiance_weights(degree: int) -> Tensor:
     Returns:
         Positive weight of each coefficient, float64, shape ((degree + 1)²,).
     """
-    # One more degree, because the smallest positive factor may belong to it.
+    # The last degree is degree + 1, because it may have the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
     weights = factors.clamp(min=smallest / 2) / factors[0]
@@ -126,11 +128,11 @@ def irradiance_weights(degree: int) -> Tensor:
 
 
 def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
-    """Compute the window of `best_window` with constraints at N angles only.
+    """Compute the factors that make a lobe non-negative at N angles and change it least.
 
-    The unknowns are weight_l (w_l - 1) for l ≥ 1. The squared length of this
-    vector is the error, so the shortest vector that fulfills the constraints is
-    the solution.
+    The lobe is Σ_l (2l + 1) s_l w_l P_l(cos θ) with the factors w_l. Its error is
+    Σ_l weight_l² (w_l - 1)². It is the squared length of the vector with the
+    entries weight_l (w_l - 1), so the shortest vector is searched.
 
     Args:
         cosines: Cosines of the angles at which the windowed lobe must not be
@@ -142,11 +144,11 @@ def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray)
         Factors w_l, the first of which is 1, shape (degree + 1,).
     """
     degree = len(weight) - 1
-    # The module imports scipy.linalg, which takes a tenth of a second.
+    # This import stands here because it also imports scipy.linalg, which takes 0.1 s.
     from renderer.light.program import shortest
 
-    # Values of (2l + 1) s_l P_l at the angles, shape (N, degree + 1).
+    # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.
     terms = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
-    # Without a window, the lobe has the values `terms.sum(1)`.
+    # The sum over a row is the value of the lobe at this angle if all factors are 1.
     weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
     return np.concatenate([[1.0], 1 + weighted_change / weight[1:]])

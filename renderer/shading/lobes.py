@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.light.harmonics import bands, per_degree, rotate, select_rows
+from renderer.light.harmonics import bands, cache_tensors, evaluate_harmonics, rotate
 from renderer.light.highlights import required_degree
 from renderer.settings import MIN_ROUGHNESS
 from renderer.surface.microfacets import DIELECTRIC, reflectance
@@ -424,7 +424,7 @@ def _degree_of_lobes(lobes: Tensor) -> int:
     return (math.isqrt(8 * len(lobes) + 1) - 3) // 2
 
 
-@per_degree
+@cache_tensors
 def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
     """Find the lobe function and the order of each of the K = (degree + 1)² harmonics.
 
@@ -522,7 +522,7 @@ def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     return torch.cat(products)
 
 
-@per_degree
+@cache_tensors
 def _exchange(degree: int) -> Tensor:
     """Compute the matrix of harmonics that exchanges the axes: x to y, y to z and z to x.
 
@@ -602,7 +602,7 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
     return (cosine_coefficients * in_cosine).sum(0).view_as(cosine)
 
 
-@per_degree
+@cache_tensors
 def coat_bands(degree: int) -> Tensor:
     """Compute the factors by which a dielectric coat reflects each degree of the lighting.
 
@@ -746,7 +746,7 @@ def _chebyshev_nodes(count: int) -> Tensor:
     return angles.cos()
 
 
-@per_degree
+@cache_tensors
 def _table(degree: int) -> Tensor:
     """Fit the lobe functions π c_lm(cos θ, r) by products of Chebyshev polynomials.
 
@@ -880,7 +880,7 @@ def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
     harmonic_indices = [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]
     light_in_sample = torch.stack([light_x, light_y, light_z])
     # The M harmonics at the Q directions of light of each camera direction, shape (M, N, Q).
-    harmonics = torch.stack(select_rows(light_in_sample, harmonic_indices))
+    harmonics = torch.stack(evaluate_harmonics(light_in_sample, harmonic_indices))
     # Sum over the Q directions of light, shape (3, M, N).
     return torch.einsum("tnq,mnq->tmn", weighted_lobe, harmonics)
 

@@ -293,7 +293,7 @@ class _HarmonicSum(torch.autograd.Function):
             normal_gradient = (slope * upstream).sum(1)
         if ctx.needs_input_grad[1]:
             # Values of the K harmonics at the normals, shape (N,) each.
-            rows = harmonics.select_rows(normals, range((ctx.degree + 1) ** 2))
+            rows = harmonics.evaluate_harmonics(normals, range((ctx.degree + 1) ** 2))
             coefficient_gradient = torch.stack(rows) @ upstream.T
         return normal_gradient, coefficient_gradient
 
@@ -466,7 +466,7 @@ class _IrradiancePolynomial:
         return value, slope
 
 
-@harmonics.per_degree
+@harmonics.cache_tensors
 def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Compute the matrices that map the SH coefficients of a light to `_IrradiancePolynomial`.
 
@@ -504,7 +504,7 @@ def _even_degree(degree: int) -> int:
     return max(min(degree, harmonics.DIFFUSE_DEGREE) - degree % 2, 2)
 
 
-@harmonics.per_degree
+@harmonics.cache_tensors
 def _slopes(degree: int) -> Tensor:
     """Compute the gradients of spherical harmonics that are extended to homogeneous polynomials.
 
@@ -543,7 +543,7 @@ def _diffuse_basis(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
     """
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
     factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
-    return nonzero, torch.stack(harmonics.select_rows(directions, nonzero)) * factors
+    return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
 
 
 def normals_in_sight(

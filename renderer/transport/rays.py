@@ -24,7 +24,7 @@ from torch import Tensor
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import face_normals
-from renderer.light.harmonics import per_degree
+from renderer.light.harmonics import cache_tensors
 from renderer.settings import ImageSettings
 from renderer.shading.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
 from renderer.shading.shading import normals_in_sight, smooth_normals
@@ -339,7 +339,7 @@ def _dot(vectors: Tensor, directions: Tensor) -> Tensor:
     return torch.einsum("bdi,di->bd", vectors, directions)
 
 
-@per_degree
+@cache_tensors
 def sphere(count: int) -> Tensor:
     """Compute directions that divide the sphere equally (spherical Fibonacci lattice).
 
@@ -357,7 +357,7 @@ def sphere(count: int) -> Tensor:
     return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
 
 
-@per_degree
+@cache_tensors
 def _shuffled(count: int) -> Tensor:
     """Return a random permutation of 0 to count - 1, which is the same in every call.
 
