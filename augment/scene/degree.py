@@ -25,7 +25,7 @@ from renderer.light.harmonics import irradiance_error
 from renderer.light.highlights import highlight_error, required_degree
 from renderer.light.presets import load_light
 from renderer.settings import MIN_ROUGHNESS
-from renderer.shading.gloss import Gloss, smoothest
+from renderer.shading.gloss import Gloss, smallest_roughness
 
 if TYPE_CHECKING:
     from augment.settings import SpecularLayerSettings
@@ -103,7 +103,7 @@ def reached_gloss(
     # `min` compares the roughness first, which is the first field of `Smoothest`.
     least = Smoothest(MATTE, "")
     for item in objects:
-        initial_roughness = smoothest(item.mesh)
+        initial_roughness = smallest_roughness(item.mesh)
         least = min(least, Smoothest(initial_roughness, item.name))
         reached_roughness = _reached_roughness(item, material, varnish)
         if reached_roughness < initial_roughness:
@@ -149,7 +149,7 @@ def _reached_roughness(
     # The strength of this gloss is 1, because attacks and variations can raise it to 1.
     gloss = Gloss(roughness, textured=not has_specular_layer)
     own_mesh = select_faces(item.mesh, slice(item.own))
-    return smoothest(gloss.on(own_mesh))
+    return smallest_roughness(gloss.on(own_mesh))
 
 
 def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:

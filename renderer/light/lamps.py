@@ -209,8 +209,8 @@ class Lamps(LocalBasis):
         )
         area_fraction = (point_index + (set_index + 0.5) / POINT_SETS) / POINTS_PER_SET
         distance = self.radius * area_fraction.sqrt()
-        golden_angle = math.pi * (3 - math.sqrt(5))
-        angle = point_index * golden_angle + set_index * 2 * math.pi / POINT_SETS
+        # Successive points of the spiral are apart by the golden angle π (3 - √5).
+        angle = point_index * math.pi * (3 - math.sqrt(5)) + set_index * 2 * math.pi / POINT_SETS
         # Positions in the plane of a disc, with the axes: set, point, plane coordinate.
         in_plane = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2)
         in_plane = in_plane.to(positions)

@@ -23,7 +23,7 @@ model is reciprocal. With ρ = 1, a dielectric reflects each beam entirely: the
 coat reflects s E(n·l), and the diffuse layer reflects 1 - s E(n·l).
 Environment light with the coefficients U_lm has the irradiance
 Σ (A_l - s B_l) U_lm Y_lm(n) below the coat, with A_l from `lambertian_factors`
-and B_l from `coat_bands`.
+and B_l from `coat_irradiance_factors`.
 
 Shapes use these letters: a view has S covered samples of a mesh with F faces. K
 is the number of SH coefficients of environment light, (degree + 1)².
@@ -46,11 +46,11 @@ from renderer.light.harmonics import bands, lambertian_factors
 from renderer.settings import MIN_ROUGHNESS
 from renderer.shading.lobes import (
     ViewFrame,
-    along,
     coat_albedo,
-    coat_bands,
+    coat_irradiance_factors,
     coat_mean,
     lobe_functions,
+    roughness_polynomials,
 )
 from renderer.surface.albedo import Texture, sample_textures
 from renderer.surface.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
@@ -61,19 +61,19 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Names of the values of `Gloss`, in the order of the columns of `Mesh.gloss`.
+# Attributes of `Gloss`, in the order of the columns of the array `Mesh.gloss`.
 _NAMES = ("roughness", "metallic", "specular_factor")
-# `smoothest` takes this percentile of the roughness of a texture as its smallest
-# roughness, so that a few smoother texels do not count.
-_SMOOTHEST_PERCENT = 1
-# SH coefficient of degree 0 of uniform light with irradiance 1. The radiance of
-# this light is 1/π.
+# `smallest_roughness` ignores this percentage of the texels of a texture, namely those
+# with the smallest roughness.
+_IGNORED_PERCENT = 1
+# The only SH coefficient of uniform light with irradiance 1. Its radiance is 1 / π, and
+# the coefficient is √(4π) times the radiance.
 _UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
 
 
 @dataclass(frozen=True, eq=False)
 class Gloss:
-    """Specular reflection of a surface.
+    """Specular reflection (gloss) of a surface, as in the material model of glTF.
 
     Roughness, metallic and specular factor are each a number in [0, 1] for the
     whole mesh, a tensor of shape (), or a tensor of shape (F,) with a number for
@@ -82,10 +82,10 @@ class Gloss:
     Attributes:
         roughness: Roughness as in glTF. Values below 0.2 are shaded as 0.2.
         metallic: Fraction of the surface that is metal.
-        specular_factor: Factor for the specular reflection of the dielectric
-            (`specularFactor` of the glTF extension KHR_materials_specular).
-        textured: True multiplies the values with the gloss textures of the
-            mesh. False ignores the gloss textures.
+        specular_factor: Factor for the specular reflection of the part that is not
+            metal (`specularFactor` of the glTF extension KHR_materials_specular).
+        textured: True multiplies roughness and metallic by the gloss textures of
+            the mesh. False ignores these textures.
 
     Example:
         >>> import norm_balls as nb
@@ -100,10 +100,10 @@ class Gloss:
     textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:
-        """Return a copy of a mesh that has this gloss.
+        """Return a copy of a mesh with this gloss instead of its own.
 
         Args:
-            mesh: Mesh with F faces. The gloss of this mesh is replaced.
+            mesh: Mesh with F faces.
 
         Raises:
             InputError: If a value of the gloss is NaN, not in [0, 1], or has a
@@ -119,13 +119,14 @@ class Gloss:
         return replace(mesh, gloss=by_face, gloss_textures=textures)
 
     def checked(self, faces: int) -> list[Tensor]:
-        """Check the values, and convert them to tensors of shape (1,) or (F,).
+        """Check roughness, metallic and specular factor, and convert them to tensors.
 
         Args:
-            faces: Number F of faces of the mesh.
+            faces: Number F of faces of the mesh that gets this gloss.
 
         Returns:
-            Roughness, metallic and specular factor.
+            Tensors of roughness, metallic and specular factor. Each has the shape
+            (1,) or (F,).
 
         Raises:
             InputError: If a value of the gloss is NaN, not in [0, 1], or has a
@@ -167,15 +168,15 @@ class SampleGloss(NamedTuple):
     specular_factor: Tensor
 
     @property
-    def metal(self) -> bool:
-        """True if a sample is metallic, or if a gradient by `metallic` is needed."""
+    def has_metal(self) -> bool:
+        """Whether a sample is partly metal, or the gradient of `metallic` is needed."""
         return self.metallic.requires_grad or bool(self.metallic.any())
 
     def at(self, samples: Tensor | slice) -> SampleGloss:
-        """Select the gloss of some of the samples.
+        """Return the gloss of some of the samples.
 
         Args:
-            samples: Indices of samples, any shape, or a slice.
+            samples: Indices of the samples, any shape, or a slice.
         """
         return SampleGloss(*(at_samples(values, samples) for values in self))
 
@@ -191,22 +192,23 @@ class SampleGloss(NamedTuple):
         """Compute the specular lobes of S samples for environment light.
 
         A lobe is the specular reflectance as a function of the direction to the
-        light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, see
-        `renderer.shading.lobes.lobe_functions`.
+        light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, the values
+        of `renderer.shading.lobes.lobe_functions`.
 
         Args:
-            cosine: Cosine n·v between normal and direction to the camera,
-                shape (S,).
+            cosine: Cosine n·v between the normal n and the direction v to the
+                camera, shape (S,).
             degree: Degree of the light.
 
         Returns:
             A tuple of
 
-            - the lobe that is multiplied by the albedo, shape (M, S), or None if
-              no sample is metallic;
-            - the lobe with the color of the light, shape (M, S).
+            - the lobe of the reflection that is multiplied by the albedo,
+              shape (M, S), or None if no sample is metallic;
+            - the lobe of the reflection with the color of the light,
+              shape (M, S).
         """
-        terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)
+        terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
         dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
         white = (1 - self.metallic) * self.specular_factor * dielectric
         if not metal_terms:
@@ -214,7 +216,9 @@ class SampleGloss(NamedTuple):
         schlick, edge = metal_terms
         return self.metallic * schlick, white + self.metallic * edge
 
-    def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor | None, Tensor]:
+    def reflect_uniform_light(
+        self, normals: Tensor, toward: Tensor
+    ) -> tuple[Tensor | None, Tensor]:
         """Compute the specular radiance of S samples under uniform light of irradiance 1.
 
         Args:
@@ -236,11 +240,12 @@ class SampleGloss(NamedTuple):
             return None, white_radiance
         return colored[0] * _UNIFORM_COEFFICIENT, white_radiance
 
-    def entering(self, cosine: Tensor) -> Tensor:
+    def coat_transmittance(self, cosine: Tensor) -> Tensor:
         """Compute the fraction of a light beam that passes the dielectric coat.
 
-        The fraction is 1 - s E(μ), with the specular factor s and the reflected
-        fraction E(μ) of `coat_albedo`. It is differentiable with respect to the
+        The coat is a transparent layer on a diffuse layer. The fraction is
+        1 - s E(μ). E(μ) is the fraction that a coat with the specular factor s = 1
+        reflects (`coat_albedo`). The result is differentiable with respect to the
         cosine and to the gloss.
 
         Args:
@@ -252,13 +257,13 @@ class SampleGloss(NamedTuple):
         """
         return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
-    def entering_bands(self, degree: int) -> Tensor:
+    def factors_below_coat(self, degree: int) -> Tensor:
         """Compute the factor of each SH coefficient in the irradiance below the dielectric coat.
 
         The irradiance is Σ_lm (A_l - s B_l) U_lm Y_lm(n), with the coefficients
         U_lm of the light, the harmonics Y_lm, the normal n and the specular
         factor s. A_l is the factor without a coat (`lambertian_factors`), and
-        B_l the factor of the light that the coat reflects (`coat_bands`). The
+        B_l the factor of the light that the coat reflects (`coat_irradiance_factors`). The
         result is differentiable with respect to the gloss.
 
         Args:
@@ -268,19 +273,23 @@ class SampleGloss(NamedTuple):
             Factor A_l - s B_l of each of the K coefficients, shape (K, S), or
             (K, 1) if all samples have the same gloss.
         """
-        # Factor B_l for each degree l, shape (degree + 1, S).
-        coat_factors = coat_bands(degree).to(self.roughness) @ along(self.roughness)
-        # Factor A_l for each coefficient, shape (K,).
+        # Factors B_l with one row for each degree l and one column for each sample.
+        coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ roughness_polynomials(
+            self.roughness
+        )
+        # Factors A_l with one entry for each SH coefficient of the light.
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 
-    def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
-        """Compute the diffuse radiance of S samples per albedo and irradiance below the coat.
+    def diffuse_factor(self, normals: Tensor, toward: Tensor) -> Tensor:
+        """Compute the factor by which metal and coat reduce the diffuse radiance at S samples.
 
-        This is (1 - m) (1 - s E(n·v)) / (1 - s E_avg), with the symbols of the
-        module docstring. Metals (m = 1) have no diffuse reflection. The coat
-        reflects a part of the diffuse light back. The result is differentiable
-        with respect to the vectors and the gloss.
+        The diffuse radiance is this factor times the albedo times the irradiance
+        below the coat. The factor is (1 - m) (1 - s E(n·v)) / (1 - s E_avg), with
+        the metallic fraction m and the specular factor s. E is the fraction of
+        light that the coat reflects (`coat_albedo`), and E_avg its mean
+        (`coat_mean`). The result is differentiable with respect to the vectors and
+        the gloss.
 
         Args:
             normals: Unit normals n, shape (S, 3).
@@ -290,19 +299,18 @@ class SampleGloss(NamedTuple):
         Returns:
             Factors, shape (S,).
         """
-        leaving = self.entering((normals * toward).sum(1))
-        return (
-            (1 - self.metallic) * leaving / (1 - self.specular_factor * coat_mean(self.roughness))
-        )
+        transmittance = self.coat_transmittance((normals * toward).sum(1))
+        mean_transmittance = 1 - self.specular_factor * coat_mean(self.roughness)
+        return (1 - self.metallic) * transmittance / mean_transmittance
 
-    def transfer(
+    def specular_transfer(
         self, normals: Tensor, toward: Tensor, degree: int
     ) -> tuple[Tensor | None, Tensor, ViewFrame]:
-        """Compute the specular radiance of S samples per unit of each of K SH coefficients.
+        """Compute the specular radiance of S samples from each spherical harmonic.
 
-        The coefficients are those of environment light in axes that face the
-        camera. The result is differentiable with respect to the vectors and the
-        gloss.
+        The environment light has K = (degree + 1)² SH coefficients in axes that
+        face the camera. The result is differentiable with respect to the vectors
+        and the gloss.
 
         Args:
             normals: Unit normals, shape (S, 3).
@@ -313,19 +321,23 @@ class SampleGloss(NamedTuple):
         Returns:
             A tuple of
 
-            - the radiance that is multiplied by the albedo, shape (K, S), or
-              None if no sample is metallic;
-            - the radiance with the color of the light, shape (K, S);
+            - the radiance of metals per unit of each coefficient, which must be
+              multiplied by the albedo, shape (K, S), or None if no sample is
+              metallic;
+            - all other specular radiance per unit of each coefficient,
+              shape (K, S);
             - the axes that face the camera. `ViewFrame.to_world` converts the
-              radiance to coefficients in world axes, and `ViewFrame.from_world`
-              converts a light to the axes.
+              first two results to world axes, and `ViewFrame.from_world` converts
+              a light to the axes that face the camera.
         """
         frame = ViewFrame.from_directions(normals, toward)
         colored_lobe, white_lobe = self.lobes(frame.cosine, degree)
         colored_transfer = None if colored_lobe is None else frame.harmonics(colored_lobe)
         return colored_transfer, frame.harmonics(white_lobe), frame
 
-    def along(self, normals: Tensor, toward: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def reflect_beams(
+        self, normals: Tensor, toward: Tensor, directions: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Compute the specular radiance per irradiance for light from single directions.
 
         The result is differentiable with respect to the vectors and the gloss.
@@ -348,14 +360,14 @@ class SampleGloss(NamedTuple):
         return self.metallic * schlick, white
 
 
-def smoothest(mesh: Mesh) -> float:
-    """Return the smallest roughness of all faces of a mesh that have gloss.
+def smallest_roughness(mesh: Mesh) -> float:
+    """Return the smallest roughness of all faces of a mesh that reflect specularly.
 
-    In each gloss texture, the 1% of the texels with the smallest roughness do
-    not count.
+    In each texture of the roughness, the 1% of the texels with the smallest
+    roughness do not count.
 
     Args:
-        mesh: Mesh whose gloss is examined.
+        mesh: Mesh whose faces are examined.
 
     Returns:
         Roughness in [0, 1]. It is 1 for a matte mesh.
@@ -364,19 +376,19 @@ def smoothest(mesh: Mesh) -> float:
         return 1.0
     # The first channel of a gloss texture is a factor for the roughness.
     roughness_factors = [
-        np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures
+        np.percentile(texture[..., 0], _IGNORED_PERCENT) / 255 for texture in mesh.gloss_textures
     ]
-    # Faces without a texture have the texture index -1, so their factor comes last.
+    # Faces without a texture have the texture index -1, which selects this last factor.
     roughness_factors.append(1.0)
     factor_of_face = np.take(roughness_factors, mesh.texture_ids if mesh.gloss_textures else -1)
     roughness_of_face = mesh.gloss[:, 0] * factor_of_face
-    # A face is matte if metallic and specular factor are both 0.
+    # Columns 1 and 2 are metallic and specular factor. If both are 0, a face is matte.
     has_gloss = mesh.gloss[:, 1:].any(1)
     return float(roughness_of_face.min(initial=1, where=has_gloss))
 
 
 def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
-    """Select the values of some samples from values that all samples may share.
+    """Select the values of some samples. A single value counts for all samples.
 
     Args:
         values: Values of all S samples, shape (S, ...), or one value that all
@@ -393,10 +405,10 @@ def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
 def sample_gloss(
     mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
 ) -> SampleGloss | None:
-    """Look up the gloss of a mesh at the covered samples of a view.
+    """Look up the specular material (gloss) at the samples of a view that show the mesh.
 
     The result is differentiable with respect to `gloss`. A warning is issued if
-    a roughness is raised to its minimum.
+    a roughness is raised to its minimum 0.2.
 
     Args:
         mesh: Mesh that the view shows, with F faces.
@@ -411,13 +423,12 @@ def sample_gloss(
         InputError: If a value of the gloss is NaN, not in [0, 1], or has a shape
             other than (), (1,) or (F,).
     """
-    # The values of a given gloss are multiplied with textures only on request.
+    # A given gloss uses the textures of the mesh only if its field `textured` is True.
     gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
     if gloss is None:
         gloss = _gloss_of_mesh(mesh)
     if gloss is None:
         return None
-    # Three tensors of shape (1,) or (F,).
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
     roughness, metallic, specular_factor = (_at_faces(column, fragments) for column in columns)
     if gloss_textures:
@@ -425,7 +436,7 @@ def sample_gloss(
         for eight_bit_texture in gloss_textures:
             factors = torch.from_numpy(eight_bit_texture).to(fragments.coverage) / 255
             textures.append(Texture.from_values(factors))
-        # The two channels of a gloss texture multiply roughness and metallic.
+        # The two channels of a texture are factors for the roughness and for metallic.
         roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
@@ -439,10 +450,11 @@ def sample_gloss(
 
 
 def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
-    """Convert the array `Mesh.gloss`, with a row for each of the F faces, to a `Gloss`.
+    """Convert the array `Mesh.gloss` to a `Gloss`.
 
     Args:
-        mesh: Mesh with F faces.
+        mesh: Mesh with F faces. `Mesh.gloss` has one row for each face, with its
+            roughness, metallic and specular factor. It is None for a matte mesh.
 
     Returns:
         Gloss with tensors of shape (F,), or (1,) if all faces have the same
@@ -457,7 +469,7 @@ def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
 
 
 def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up, at each sample, the value of the face that the sample shows.
+    """Look up the value of the face that each sample shows.
 
     Args:
         face_values: A value for each of the F faces of the mesh, shape (F,), or
@@ -489,8 +501,8 @@ def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
         (1, 3).
     """
     eye = fragments.eye.to(vertices)
-    # The fourth number is 1 for the position of a perspective camera, and 0 for the
-    # direction to an orthographic camera.
+    # `eye` is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with
+    # the direction to an orthographic camera.
     has_perspective = bool(eye[3])
     if not has_perspective:
         return eye[None, :3]

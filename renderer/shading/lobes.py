@@ -37,22 +37,21 @@ from renderer.settings import MIN_ROUGHNESS
 from renderer.surface.microfacets import DIELECTRIC, reflectance
 from renderer.vectors import unit
 
-# `_fit` sets the lobe functions of a degree to 0 if the amplitude of this degree in a
-# highlight is at most this fraction of the amplitude of degree 0.
-NEGLIGIBLE = 1e-3
+# A degree of the light is neglected if a highlight reflects it with at most this fraction
+# of the amplitude with which it reflects degree 0.
+MIN_AMPLITUDE = 1e-3
 
 # For lights up to this degree, `lobe_functions` uses one common table of this degree.
-USUAL = 6
+COMMON_DEGREE = 6
 # `_table` computes the lobe functions at this number of values of the roughness, and
 # interpolates them with the same number of Chebyshev polynomials in the roughness.
-NODES = 12
-# `_fit` uses this many more Chebyshev polynomials in the cosine than a perfect mirror would
-# need, which are 2 degree + 1.
-MARGIN = 3
-# `_fit` integrates the lobes for this many cosines at once. It limits the memory.
+ROUGHNESS_POLYNOMIALS = 12
+# A lobe function of a perfect mirror needs 2 degree + 1 Chebyshev polynomials in the
+# cosine. `_fit` uses this many more.
+EXTRA_POLYNOMIALS = 3
+# Number of cosines for which `_fit` integrates the lobes at once. It limits the memory.
 COSINES_AT_ONCE = 16
-# `_lobe_integrals` sums over half vectors with this many polar angles and azimuths. The
-# azimuths cover one side of the plane that contains the normal and the camera direction.
+# Numbers of polar angles and azimuths of the half vectors in `_half_vectors`.
 POLAR_NODE_COUNT = 32
 AZIMUTH_COUNT = 24
 
@@ -97,14 +96,13 @@ class ViewFrame(NamedTuple):
         Returns:
             Normals in sample axes, and the rotations from there to world axes.
         """
-        # The choice of view axes does not change the reflected light, so it
-        # needs no gradient.
+        # The choice of view axes does not change the reflected light. The axes are
+        # therefore computed without gradients.
         mean_toward = unit(toward.detach().mean(0))
         axis = ViewAxis.along(mean_toward)
         normals_in_view = axis.to_view(normals)
-        # A direction that all samples share is the z-axis of the view itself.
-        # If it is differentiated, its gradient must go through a tilt, because
-        # `axis` is constant.
+        # If all samples share one direction to the camera, sample axes and view axes are
+        # the same. A tilt is then only needed for the gradient of the direction.
         if len(toward) == 1 and not toward.requires_grad:
             return ViewFrame(normals=torch.stack(normals_in_view), tilt=None, axis=axis)
         toward_in_view = axis.to_view(toward)
@@ -121,13 +119,14 @@ class ViewFrame(NamedTuple):
     def harmonics(self, lobes: Tensor) -> Tensor:
         """Compute the spherical-harmonic coefficients of the lobe at each sample.
 
-        The coefficients are in intermediate axes: the view axes or, with a
-        tilt, the view axes in the order y, z, x. The coefficients in world axes
-        are `frame.to_world(frame.harmonics(lobes))`.
+        The lobe is the specular reflectance as a function of the direction to the
+        light. The coefficients are in intermediate axes: the view axes if `tilt`
+        is None, otherwise the view axes in the order y, z, x. The coefficients in
+        world axes are `frame.to_world(frame.harmonics(lobes))`.
 
         Args:
-            lobes: Values of the M lobe functions of one Fresnel term at the S
-                samples, from `lobe_functions`, shape (M, S).
+            lobes: Values of the M lobe functions at the S samples, from
+                `lobe_functions`, shape (M, S).
 
         Returns:
             Coefficients of the K = (degree + 1)² harmonics, shape (K, S).
@@ -136,23 +135,23 @@ class ViewFrame(NamedTuple):
         coefficients = self._harmonics_in_sample_axes(lobes, degree)
         if self.tilt is None:
             return coefficients
-        # The tilt is R_x(a) R_y(b), with a rotation R_x about the x-axis and so
-        # on. Harmonics are easy to rotate about z, but not about x and y. The
-        # cyclic exchange C of the axes (x to y, y to z, z to x) turns one
-        # rotation into another: C R_y(b) = R_z(b) C and C² R_x(a) = R_z(a) C².
-        # Therefore R_z(a) C R_z(b) C = C² R_x(a) R_y(b). This is the tilt,
-        # followed by two exchanges.
-        exchange = _exchange(degree)
+        # The tilt R_x(a) R_y(b) rotates about the y-axis and then about the x-axis. But
+        # harmonics are only easy to rotate about the z-axis. Let C be the cyclic
+        # permutation of the axes: x to y, y to z, z to x. Then C R_y(b) = R_z(b) C and
+        # C² R_x(a) = R_z(a) C², so R_z(a) C R_z(b) C = C² R_x(a) R_y(b). The loop computes
+        # the left side, which is the tilt and then two permutations.
+        permutation = _axis_permutation(degree)
         for angle in (self.tilt.about_y, self.tilt.about_x):
-            coefficients = _rotate_harmonics(_multiply_bands(exchange, coefficients), angle)
+            coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
         return coefficients
 
     def _harmonics_in_sample_axes(self, lobes: Tensor, degree: int) -> Tensor:
-        """Compute the SH coefficients of the lobe of each of S samples in the sample's own axes.
+        """Compute the SH coefficients of the lobe of each of S samples in its own sample axes.
 
-        The polar angle θ and the azimuth φ of the normal give the coefficients
-        c_lm sin^m θ cos mφ for the harmonics of order m ≥ 0, and
-        c_lm sin^m θ sin mφ for the harmonics of order -m < 0.
+        In sample axes, the camera is in the direction of the z-axis. Let θ be the
+        polar angle and φ the azimuth of the normal. The coefficient of the
+        harmonic of degree l and order m ≥ 0 is c_lm sin^m θ cos mφ, with the lobe
+        function c_lm. For order -m < 0, it is c_lm sin^m θ sin mφ.
 
         Args:
             lobes: Values of the lobe functions c_lm at the samples, shape (M, S).
@@ -164,55 +163,55 @@ class ViewFrame(NamedTuple):
         function_of_harmonic, order = _functions_and_orders(degree)
         function_of_harmonic = function_of_harmonic.to(lobes.device)
         order = order.to(lobes.device)
-        # The normal is (sin θ cos φ, sin θ sin φ, cos θ), so the factors are
-        # the real and imaginary parts of (x + iy)^m.
         normal_x, normal_y, _ = self.normals
+        # With x = sin θ cos φ and y = sin θ sin φ, the factors sin^m θ cos mφ and
+        # sin^m θ sin mφ are the real and the imaginary part of (x + iy)^m.
         factors = _complex_powers(normal_x, normal_y, degree).index_select(0, degree + order)
         return lobes.index_select(0, function_of_harmonic) * factors
 
     def to_world(self, coefficients: Tensor) -> Tensor:
-        """Rotate coefficients from the axes of `harmonics` to world axes.
+        """Rotate SH coefficients from the intermediate axes of `harmonics` to world axes.
 
         Args:
-            coefficients: Coefficients of one function per column, shape (K, P)
-                with K = (degree + 1)².
+            coefficients: SH coefficients, one function on the sphere per column,
+                shape (K, P) with K = (degree + 1)².
 
         Returns:
-            Coefficients of the same functions in world axes, shape (K, P).
+            SH coefficients of the same functions in world axes, shape (K, P).
         """
-        exchange = _exchange(math.isqrt(len(coefficients)) - 1)
+        permutation = _axis_permutation(math.isqrt(len(coefficients)) - 1)
         axis = self.axis.for_columns(coefficients)
-        # If there is a tilt, `harmonics` exchanges the axes twice. A third
-        # exchange restores them.
+        # With a tilt, `harmonics` permutes the axes cyclically two times. A third time
+        # restores their order.
         if self.tilt is not None:
-            coefficients = _multiply_bands(exchange, coefficients)
-        # The rotation is R_z(azimuth) R_y(polar). Its second factor is
-        # R_y(polar) = Cᵀ R_z(polar) C, with the exchange C as in `harmonics`.
-        exchanged = _rotate_harmonics(_multiply_bands(exchange, coefficients), axis.polar)
-        return _rotate_harmonics(_multiply_bands(exchange.T, exchanged), axis.azimuth)
+            coefficients = _multiply_bands(permutation, coefficients)
+        # The rotation to world axes is R_z(azimuth) R_y(polar). With the permutation C of
+        # the axes, R_y(polar) is Cᵀ R_z(polar) C.
+        permuted = _rotate_harmonics(_multiply_bands(permutation, coefficients), axis.polar)
+        return _rotate_harmonics(_multiply_bands(permutation.T, permuted), axis.azimuth)
 
     def from_world(self, coefficients: Tensor) -> Tensor:
-        """Rotate coefficients from world axes to the axes of `harmonics`.
+        """Rotate SH coefficients from world axes to the intermediate axes of `harmonics`.
 
         This is the inverse of `to_world`.
 
         Args:
-            coefficients: Coefficients of one function per column in world axes,
-                shape (K, P) with K = (degree + 1)².
+            coefficients: SH coefficients in world axes, one function on the sphere
+                per column, shape (K, P) with K = (degree + 1)².
 
         Returns:
-            Coefficients of the same functions in the axes of `harmonics`,
+            SH coefficients of the same functions in the intermediate axes,
             shape (K, P).
         """
-        exchange = _exchange(math.isqrt(len(coefficients)) - 1)
+        permutation = _axis_permutation(math.isqrt(len(coefficients)) - 1)
         axis = self.axis.for_columns(coefficients)
         without_azimuth = _rotate_harmonics(coefficients, axis.azimuth.reversed())
-        exchanged = _multiply_bands(exchange, without_azimuth)
-        without_polar = _rotate_harmonics(exchanged, axis.polar.reversed())
-        in_view = _multiply_bands(exchange.T, without_polar)
-        # `harmonics` exchanges the axes twice. Two cyclic exchanges of three axes are the
-        # inverse of one exchange, which is the transposed matrix.
-        return in_view if self.tilt is None else _multiply_bands(exchange.T, in_view)
+        permuted = _multiply_bands(permutation, without_azimuth)
+        without_polar = _rotate_harmonics(permuted, axis.polar.reversed())
+        in_view = _multiply_bands(permutation.T, without_polar)
+        # With a tilt, the intermediate axes are the view axes after two cyclic
+        # permutations. Two are the inverse of one, which is the transposed matrix.
+        return in_view if self.tilt is None else _multiply_bands(permutation.T, in_view)
 
 
 class ViewAxis(NamedTuple):
@@ -247,10 +246,11 @@ class ViewAxis(NamedTuple):
         return ViewAxis(polar, Angle(sine=azimuth.sin(), cosine=azimuth.cos()))
 
     def for_columns(self, coefficients: Tensor) -> ViewAxis:
-        """Convert both angles to the shape, dtype and device that `_rotate_harmonics` needs.
+        """Convert both angles to the shape (1,) and to the dtype and device of coefficients.
 
         Args:
-            coefficients: Coefficients that will be rotated, shape (K, S).
+            coefficients: SH coefficients that `_rotate_harmonics` will rotate by the
+                angles, shape (K, S).
         """
         return ViewAxis(
             polar=self.polar.for_columns(coefficients),
@@ -274,8 +274,9 @@ class ViewAxis(NamedTuple):
 class Tilt(NamedTuple):
     """Rotation from sample axes to view axes, one for each sample.
 
-    It is R_x(a) R_y(b): first about the y-axis by the angle b, then about the
-    x-axis by the angle a.
+    The z-axis points from the sample to the camera in sample axes, and in the
+    mean direction to the camera in view axes. The rotation R_x(a) R_y(b) first
+    rotates about the y-axis by the angle b, then about the x-axis by the angle a.
 
     Attributes:
         values: Rows sin b, cos b, sin a and cos a, shape (4, S), or (4, 1) if
@@ -296,7 +297,7 @@ class Tilt(NamedTuple):
 
     @staticmethod
     def along(directions: Components) -> Tilt:
-        """Compute the rotations that rotate the z-axis (0, 0, 1) to given directions.
+        """Compute the rotations that take the z-axis (0, 0, 1) to given directions.
 
         R_x(a) R_y(b) rotates (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The
         angle b is chosen so that cos b ≥ 0.
@@ -329,7 +330,7 @@ class Tilt(NamedTuple):
 
 
 class Angle(NamedTuple):
-    """Sine and cosine of a rotation angle. Rotations need nothing else of the angle.
+    """Rotation angle, given by its sine and its cosine.
 
     Attributes:
         sine: Sine, shape (), or (S,) for one angle per sample.
@@ -340,14 +341,14 @@ class Angle(NamedTuple):
     cosine: Tensor
 
     def reversed(self) -> Angle:
-        """Return the angle of the inverse rotation."""
+        """Return the negative angle, for the inverse rotation."""
         return Angle(sine=-self.sine, cosine=self.cosine)
 
     def for_columns(self, coefficients: Tensor) -> Angle:
-        """Convert an angle of shape () to shape (1,), with another dtype and device.
+        """Convert an angle of shape () to shape (1,), and to another dtype and device.
 
         Args:
-            coefficients: Tensor with the dtype and the device.
+            coefficients: Tensor from which the dtype and the device are taken.
         """
         return Angle(
             sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
@@ -416,7 +417,7 @@ def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tenso
 
 
 def _degree_of_lobes(lobes: Tensor) -> int:
-    """Find the degree of M = (degree + 1) (degree + 2) / 2 lobe functions.
+    """Find the degree of lobe functions from their number M = (degree + 1) (degree + 2) / 2.
 
     Args:
         lobes: Values of the lobe functions at S samples, shape (M, S).
@@ -426,15 +427,18 @@ def _degree_of_lobes(lobes: Tensor) -> int:
 
 @cache_tensors
 def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
-    """Find the lobe function and the order of each of the K = (degree + 1)² harmonics.
+    """Find the order and the index of the lobe function of each harmonic.
 
     The harmonic of degree l and order m has the index l² + l + m. The lobe
     function c_l|m| has the index l (l + 1) / 2 + |m|.
 
+    Args:
+        degree: Largest degree l of the K = (degree + 1)² harmonics.
+
     Returns:
         A tuple of
 
-        - the index of the lobe function of each harmonic, shape (K,);
+        - the index of the lobe function c_l|m| of each harmonic, shape (K,);
         - the order m of each harmonic, from -l to l, shape (K,).
     """
     l = bands(degree)
@@ -444,9 +448,10 @@ def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
 
 
 def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
-    """Compute the powers of x + iy, split into real and imaginary parts.
+    """Compute the real and imaginary parts of the powers of x + iy.
 
-    For x = s cos φ and y = s sin φ, they are s^m cos mφ and s^m sin mφ.
+    With x = s cos φ and y = s sin φ, the real part of (x + iy)^m is s^m cos mφ,
+    and the imaginary part is s^m sin mφ.
 
     Args:
         x: Real part, shape (...).
@@ -454,8 +459,8 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
         degree: Largest exponent.
 
     Returns:
-        In row degree + m, for m from -degree to degree: Im (x + iy)^|m| for
-        m < 0 and Re (x + iy)^m for m ≥ 0, shape (2 degree + 1, ...).
+        One row for each m from -degree to degree, shape (2 degree + 1, ...). The
+        row is Im (x + iy)^|m| if m < 0, and Re (x + iy)^m if m ≥ 0.
     """
     real_parts: list[Tensor] = []
     imaginary_parts: list[Tensor] = []
@@ -472,13 +477,13 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
 
 
 def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
-    """Rotate functions, given by their harmonics, about the z-axis, from x toward y.
+    """Rotate functions on the sphere about the z-axis, from x toward y.
 
-    A rotation by the angle a mixes only the coefficients u of orders m and -m:
-    u'_m = cos(ma) u_m - sin(ma) u_-m.
+    A rotation by the angle a mixes only the SH coefficients u_m and u_-m of the
+    orders m and -m in a band: u'_m = cos(ma) u_m - sin(ma) u_-m.
 
     Args:
-        coefficients: Coefficients of one function per column, shape (K, S).
+        coefficients: SH coefficients, one function per column, shape (K, S).
         angle: Angle a for each column, shape (S,), or (1,) if all columns share
             one angle.
 
@@ -488,31 +493,32 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     degree = math.isqrt(len(coefficients)) - 1
     _, order = _functions_and_orders(degree)
     order = order.to(coefficients.device)
-    # Row degree + m holds cos(ma) for m ≥ 0 and sin(|m| a) for m < 0.
-    powers = _complex_powers(angle.cosine, angle.sine, degree)
-    sines = powers[:degree]
-    # Row degree + m holds sin(ma), which is odd in m.
-    signed_sines = torch.cat([-sines, 0 * powers[:1], sines.flip(0)])
+    # Rows for m from -degree to degree: sin(|m| a) if m < 0, and cos(ma) if m ≥ 0.
+    sines_and_cosines = _complex_powers(angle.cosine, angle.sine, degree)
+    sines = sines_and_cosines[:degree]
+    # Rows with sin(ma) for m from -degree to degree.
+    signed_sines = torch.cat([-sines, 0 * sines_and_cosines[:1], sines.flip(0)])
     # In a band, the harmonic of order -m is 2 m rows before the harmonic of order m.
     opposite_harmonic = torch.arange(len(order), device=coefficients.device) - 2 * order
-    kept = coefficients * powers.index_select(0, degree + order.abs())
-    mixed_in = coefficients.index_select(0, opposite_harmonic)
-    mixed_in = mixed_in * signed_sines.index_select(0, degree + order)
-    return kept - mixed_in
+    cosine_terms = coefficients * sines_and_cosines.index_select(0, degree + order.abs())
+    opposite_coefficients = coefficients.index_select(0, opposite_harmonic)
+    sine_terms = opposite_coefficients * signed_sines.index_select(0, degree + order)
+    return cosine_terms - sine_terms
 
 
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
-    """Multiply a rotation matrix of harmonics by coefficients, one degree l at a time.
+    """Rotate functions on the sphere by multiplying their SH coefficients by a matrix.
 
-    A rotation does not mix coefficients of different degrees, so the matrix is
-    zero outside the blocks on its diagonal.
+    A rotation does not mix coefficients of different degrees. The matrix is zero
+    outside one block per degree on its diagonal, so only the blocks are
+    multiplied.
 
     Args:
-        rotation: Rotation matrix, shape (K, K).
-        coefficients: Coefficients of one function per column, shape (K, S).
+        rotation: Matrix that rotates SH coefficients, shape (K, K).
+        coefficients: SH coefficients, one function per column, shape (K, S).
 
     Returns:
-        Coefficients of the rotated functions, shape (K, S).
+        SH coefficients of the rotated functions, shape (K, S).
     """
     products: list[Tensor] = []
     for l in range(math.isqrt(len(coefficients))):
@@ -523,28 +529,38 @@ def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
 
 
 @cache_tensors
-def _exchange(degree: int) -> Tensor:
-    """Compute the matrix of harmonics that exchanges the axes: x to y, y to z and z to x.
+def _axis_permutation(degree: int) -> Tensor:
+    """Compute how SH coefficients change if the axes are permuted: x to y, y to z, z to x.
+
+    Args:
+        degree: Largest degree of the K = (degree + 1)² harmonics.
 
     Returns:
-        Orthogonal matrix, float64, shape (K, K) with K = (degree + 1)².
+        Orthogonal matrix by which the coefficients are multiplied, float64,
+        shape (K, K).
     """
     identity = torch.eye((degree + 1) ** 2, dtype=torch.float64)
-    exchange_of_axes = torch.eye(3, dtype=torch.float64).roll(1, 0)
-    return rotate(identity, exchange_of_axes)
+    permutation = torch.eye(3, dtype=torch.float64).roll(1, 0)
+    return rotate(identity, permutation)
 
 
 def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:
-    """Evaluate the lobe functions π c_lm, defined at the top of this module.
+    """Evaluate the lobe functions π c_lm, which describe the specular reflection of samples.
 
-    The result is differentiable with respect to both tensors.
+    The lobe of a sample is π times its specular reflectance times n·l, as a
+    function of the direction l to the light. The normal is n, and v is the
+    direction to the camera. In axes in which v is the z-axis and n lies in the
+    plane of x and z, the lobe has the SH coefficients π c_lm sin^m θ, with the
+    angle θ between n and v. The result is differentiable with respect to both
+    tensors.
 
     Args:
         cosine: Cosine n·v = cos θ in [0, 1] at the S samples, shape (S,).
         roughness: Roughness r in [MIN_ROUGHNESS, 1], shape (S,), or (1,) if all
             samples share one roughness.
         degree: Largest degree l of the spherical harmonics.
-        terms: T Fresnel terms among SCHLICK, EDGE and DIELECTRIC.
+        terms: T Fresnel terms of the reflectance among SCHLICK, EDGE and
+            DIELECTRIC.
 
     Returns:
         Values of the M = (degree + 1) (degree + 2) / 2 functions with
@@ -552,41 +568,38 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
     """
     term_indices = list(terms)
     has_one_roughness = len(roughness) == 1
-    # If no gradient is needed, a table for this one roughness takes less time
-    # than the table for all values of the roughness.
-    if degree > USUAL and has_one_roughness and not roughness.requires_grad:
+    # If no gradient is needed, it is faster to compute a table for this one roughness than
+    # the table for all values of the roughness.
+    if degree > COMMON_DEGREE and has_one_roughness and not roughness.requires_grad:
         table_at_roughness = _table_at(degree, float(roughness)).to(cosine)
-        # Shape (T, M, P), with P Chebyshev polynomials in the cosine.
+        # Axes: Fresnel term, lobe function, polynomial in the cosine.
         cosine_coefficients = table_at_roughness[term_indices]
         return cosine_coefficients @ _cosine_polynomials(cosine, cosine_coefficients.shape[-1])
     function_count = (degree + 1) * (degree + 2) // 2
-    table = _table(max(degree, USUAL)).to(cosine)
-    # Coefficients of the products of NODES polynomials in the roughness and P polynomials in
-    # the cosine, for T terms and M functions, shape (T, M, NODES, P).
+    table = _table(max(degree, COMMON_DEGREE)).to(cosine)
+    # Axes: Fresnel term, lobe function, polynomial in the roughness, polynomial in the
+    # cosine.
     coefficients = table[term_indices, :function_count]
-    # Values of the polynomials in the cosine, shape (P, S), and of those in the roughness,
-    # shape (NODES, S), or (NODES, 1) for one roughness.
+    # Both have one row for each polynomial and one column for each sample.
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
-    in_roughness = along(roughness)
+    in_roughness = roughness_polynomials(roughness)
     if has_one_roughness:
-        # The sum over the polynomials in the roughness leaves polynomials in the cosine,
-        # shape (T, M, P).
+        # Sum over the polynomials in the roughness (index r).
         cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
         return cosine_coefficients @ in_cosine
-    # Products of a polynomial in the roughness and one in the cosine, shape (NODES, P, S).
+    # Axes: polynomial in the roughness, polynomial in the cosine, sample.
     products = in_roughness[:, None] * in_cosine
-    # The shapes (T, M, NODES · P) and (NODES · P, S) give (T, M, S).
     return coefficients.flatten(2) @ products.flatten(0, 1)
 
 
 def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
     """Compute E(μ), the fraction of a light beam that a dielectric coat reflects.
 
-    A beam at the angle of incidence arccos μ is reflected into all directions.
-    The reflectance is the same for exchanged directions, so E(μ) is also the
-    radiance that a camera at this angle sees in the coat under uniform
-    environment lighting of radiance 1. The result is differentiable with
-    respect to both arguments.
+    The coat is a transparent layer with a rough surface. It reflects a beam at
+    the angle of incidence arccos μ into all directions. E(μ) is also the radiance
+    that a camera at this angle sees if light of radiance 1 comes from all
+    directions, because the reflectance does not change if the directions of light
+    and camera are exchanged. The result is differentiable.
 
     Args:
         cosine: Cosine μ between the normal and the direction, in [0, 1], any
@@ -598,45 +611,45 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
     """
     coefficients = _coat_coefficients().to(cosine)
     in_cosine = _cosine_polynomials(cosine.flatten(), coefficients.shape[1])
-    cosine_coefficients = coefficients.T @ along(roughness.flatten())
+    cosine_coefficients = coefficients.T @ roughness_polynomials(roughness.flatten())
     return (cosine_coefficients * in_cosine).sum(0).view_as(cosine)
 
 
 @cache_tensors
-def coat_bands(degree: int) -> Tensor:
-    """Compute the factors by which a dielectric coat reflects each degree of the lighting.
+def coat_irradiance_factors(degree: int) -> Tensor:
+    """Compute the factors of SH coefficients in the irradiance that a dielectric coat reflects.
 
-    A coat of specular_factor 1 reflects the fraction E(μ) of the light at the cosine μ
-    (see `coat_albedo`). The irradiance that it reflects in total is
-    Σ_lm B_l U_lm Y_lm(n) with the coefficients U_lm of the lighting, the
+    A coat with the specular factor 1 reflects the fraction E(μ) of light that
+    arrives at the cosine μ (see `coat_albedo`). The irradiance that it reflects is
+    Σ_lm B_l U_lm Y_lm(n), with the SH coefficients U_lm of the light, the
     harmonics Y_lm and the normal n. The factor of degree l is
     B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, with Legendre polynomials P_l.
-    If E(μ) were 1, these would be the factors π, 2π/3, π/4, ... of a Lambertian
-    surface.
+    B_l depends on the roughness and is given as a sum of polynomials.
 
     Args:
         degree: Largest degree l of the spherical harmonics.
 
     Returns:
-        Coefficients of B_l in the NODES polynomials of `along`, float64,
-        shape (degree + 1, NODES).
+        Coefficients of the factors B_l in the polynomials of
+        `roughness_polynomials`, float64, shape (degree + 1, polynomials).
     """
     nodes, weights = np.polynomial.legendre.leggauss(degree + 64)
-    # The nodes of the quadrature lie in [-1, 1], and N cosines in [0, 1].
+    # The nodes of the quadrature in [-1, 1] are mapped to cosines in [0, 1].
     cosine = (torch.from_numpy(nodes) + 1) / 2
     coefficients = _coat_coefficients()
-    # E(μ) μ in the polynomials of the roughness, at the N cosines μ, shape (NODES, N).
+    # The integrand E(μ) μ: one row for each polynomial of the roughness, one column for
+    # each cosine μ.
     reflected = coefficients @ _cosine_polynomials(cosine, coefficients.shape[1]) * cosine
-    # Legendre polynomials P_l at the N cosines, shape (N, degree + 1).
+    # Legendre polynomials: one row for each cosine, one column for each degree.
     legendre = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))
     return math.pi * (legendre.T * torch.from_numpy(weights)) @ reflected.T
 
 
 def coat_mean(roughness: Tensor) -> Tensor:
-    """Compute the fraction of uniform environment lighting that a dielectric coat reflects.
+    """Compute the fraction of uniform environment light that a dielectric coat reflects.
 
-    It is E_avg = 2 ∫ E(μ) μ dμ over 0 ≤ μ ≤ 1 (see `coat_albedo`). The result
-    is differentiable.
+    The fraction is E_avg = 2 ∫ E(μ) μ dμ over 0 ≤ μ ≤ 1, with the reflected
+    fraction E(μ) of a single beam (`coat_albedo`). The result is differentiable.
 
     Args:
         roughness: Roughness in [MIN_ROUGHNESS, 1], shape (S,).
@@ -644,22 +657,25 @@ def coat_mean(roughness: Tensor) -> Tensor:
     Returns:
         E_avg in [0, 1], shape (S,).
     """
-    reflected_irradiance = (coat_bands(0).to(roughness) @ along(roughness))[0]
+    reflected_irradiance = (
+        coat_irradiance_factors(0).to(roughness) @ roughness_polynomials(roughness)
+    )[0]
     return reflected_irradiance / math.pi
 
 
 def _coat_coefficients() -> Tensor:
-    """Return the coefficients of the function E(μ) of `coat_albedo` in Chebyshev polynomials.
+    """Return the Chebyshev coefficients of the reflected fraction E(μ) of a dielectric coat.
 
-    E(μ) is the integral of the lobe over all directions of light, which is √(4π)
-    times the SH coefficient of degree 0.
+    E(μ) is a sum of products of a Chebyshev polynomial in the roughness and one
+    in the cosine μ (see `coat_albedo`).
 
     Returns:
-        Coefficients of products of a polynomial in the roughness (axis 0) and a
-        polynomial in the cosine (axis 1), as in `_table`, float64,
-        shape (NODES, P).
+        Factors of the products, float64. Each row belongs to a polynomial in the
+        roughness, and each column to a polynomial in the cosine.
     """
-    return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
+    # E(μ) is the integral of the reflectance times n·l over all directions of light. This
+    # is √(4π) times the SH coefficient of degree 0. The table contains π times it.
+    return _table(COMMON_DEGREE)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
 
 # Chebyshev polynomials have arguments in [-1, 1]. The following four functions map
@@ -667,9 +683,10 @@ def _coat_coefficients() -> Tensor:
 
 
 def _cosine_to_argument(cosine: Tensor) -> Tensor:
-    """Map cosines from [0, 1] to arguments in [-1, 1], with finer steps at small cosines.
+    """Map cosines in [0, 1] to arguments of Chebyshev polynomials in [-1, 1].
 
-    Lobes change quickly at grazing angles, where the cosine is small.
+    Small cosines are spread over a wider range, because lobes change quickly at
+    grazing angles.
 
     Args:
         cosine: Cosines, any shape.
@@ -681,7 +698,7 @@ def _cosine_to_argument(cosine: Tensor) -> Tensor:
 
 
 def _argument_to_cosine(argument: Tensor) -> Tensor:
-    """Map arguments in [-1, 1] to cosines in [0, 1]: the inverse of `_cosine_to_argument`."""
+    """Map arguments in [-1, 1] to cosines in [0, 1], as the inverse of `_cosine_to_argument`."""
     return (argument + 1) / (3 - argument)
 
 
@@ -695,22 +712,25 @@ def _argument_to_roughness(argument: Tensor) -> Tensor:
     return (argument * (1 - MIN_ROUGHNESS) + 1 + MIN_ROUGHNESS) / 2
 
 
-def along(roughness: Tensor) -> Tensor:
-    """Evaluate the Chebyshev polynomials in which tables express functions of the roughness.
+def roughness_polynomials(roughness: Tensor) -> Tensor:
+    """Evaluate Chebyshev polynomials in the roughness.
 
-    The result is differentiable with respect to the roughness.
+    Functions of the roughness in this module are sums of these polynomials. The
+    result is differentiable with respect to the roughness.
 
     Args:
         roughness: Roughness in [MIN_ROUGHNESS, 1], shape (S,).
 
     Returns:
-        Values of the polynomials, shape (NODES, S).
+        Values of the polynomials, shape (ROUGHNESS_POLYNOMIALS, S).
     """
-    return _chebyshev(_roughness_to_argument(roughness), NODES)
+    return _chebyshev(_roughness_to_argument(roughness), ROUGHNESS_POLYNOMIALS)
 
 
 def _cosine_polynomials(cosine: Tensor, count: int) -> Tensor:
-    """Evaluate the Chebyshev polynomials in which `_table` expresses functions of the cosine.
+    """Evaluate Chebyshev polynomials in the cosine.
+
+    Functions of the cosine in this module are sums of these polynomials.
 
     Args:
         cosine: Cosine n·v in [0, 1] at S samples, shape (S,).
@@ -740,7 +760,7 @@ def _chebyshev(argument: Tensor, count: int) -> Tensor:
 
 
 def _chebyshev_nodes(count: int) -> Tensor:
-    """Compute the zeros of the Chebyshev polynomial T_count, float64, shape (count,)."""
+    """Compute the zeros of the Chebyshev polynomial of degree `count`, shape (count,)."""
     steps = torch.arange(count, dtype=torch.float64) + 0.5
     angles = math.pi * steps / count
     return angles.cos()
@@ -748,13 +768,13 @@ def _chebyshev_nodes(count: int) -> Tensor:
 
 @cache_tensors
 def _table(degree: int) -> Tensor:
-    """Fit the lobe functions π c_lm(cos θ, r) by products of Chebyshev polynomials.
+    """Approximate the lobe functions (see `lobe_functions`) by products of polynomials.
 
-    Each function is approximated by Σ_k Σ_p a_kp T_k(y) T_p(x) with Chebyshev
-    polynomials T. The argument y stands for the roughness r (see
+    Each function π c_lm(cos θ, r) is approximated by Σ_k Σ_p a_kp T_k(y) T_p(x)
+    with Chebyshev polynomials T. The argument y stands for the roughness r (see
     `_roughness_to_argument`), and x for the cosine n·v = cos θ (see
-    `_cosine_to_argument`). There are NODES polynomials in the roughness, and
-    P = 2 degree + 1 + MARGIN in the cosine.
+    `_cosine_to_argument`). There are R = ROUGHNESS_POLYNOMIALS polynomials in the
+    roughness, and P = 2 degree + 1 + EXTRA_POLYNOMIALS in the cosine.
 
     Args:
         degree: Largest degree l of the spherical harmonics.
@@ -762,23 +782,22 @@ def _table(degree: int) -> Tensor:
     Returns:
         Coefficients a_kp, float64, for each of the three Fresnel terms and of
         the M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l,
-        shape (3, M, NODES, P).
+        shape (3, M, R, P).
     """
-    roughness_arguments = _chebyshev_nodes(NODES)
+    roughness_arguments = _chebyshev_nodes(ROUGHNESS_POLYNOMIALS)
     roughnesses = _argument_to_roughness(roughness_arguments)
-    # One fit for each of NODES values of the roughness, shape (NODES, 3, M, P).
+    # Axes: roughness r, Fresnel term t, lobe function m, polynomial in the cosine c.
     fits = torch.stack([_fit(degree, float(roughness)) for roughness in roughnesses])
-    # There are as many polynomials in the roughness as values of the roughness,
-    # so the polynomials pass through all values. This matrix maps values to
-    # coefficients, shape (NODES, NODES).
-    interpolation = torch.linalg.inv(_chebyshev(roughness_arguments, NODES).T)
+    # This matrix maps the values of a function at all values of the roughness to the
+    # coefficients k of the polynomials that pass through these values.
+    interpolation = torch.linalg.inv(_chebyshev(roughness_arguments, ROUGHNESS_POLYNOMIALS).T)
     return torch.einsum("kr,rtmc->tmkc", interpolation, fits).contiguous()
 
 
 @lru_cache(maxsize=8)
 @torch.inference_mode(False)
 def _table_at(degree: int, roughness: float) -> Tensor:
-    """Return the result of `_fit` from a cache with the latest eight results.
+    """Return the result of `_fit`, from a cache if it is one of the latest eight.
 
     Args:
         degree: Largest degree of the spherical harmonics.
@@ -788,60 +807,60 @@ def _table_at(degree: int, roughness: float) -> Tensor:
 
 
 def _fit(degree: int, roughness: float) -> Tensor:
-    """Fit the lobe functions π c_lm(cos θ, r) at one roughness by Chebyshev polynomials.
+    """Approximate the lobe functions at one roughness by Chebyshev polynomials in cos θ.
 
-    There are P = 2 degree + 1 + MARGIN polynomials in the cosine. When a mirror
-    turns by θ, the reflected light turns by 2 θ. A harmonic of degree l of this
-    light therefore has degree 2 l as a function of θ.
+    For the lobe functions π c_lm(cos θ, r), see `lobe_functions`. The number of
+    polynomials is P = 2 degree + 1 + EXTRA_POLYNOMIALS. When a mirror turns by θ,
+    the reflected light turns by 2 θ. A harmonic of degree l of this light
+    therefore needs polynomials up to degree 2 l.
 
     Args:
         degree: Largest degree l of the spherical harmonics.
         roughness: Roughness r in [MIN_ROUGHNESS, 1].
 
     Returns:
-        Coefficients, float64, for each of the three Fresnel terms and of the
-        M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l,
-        shape (3, M, P). They are zero for degrees above USUAL that have no
-        noticeable amplitude at this roughness (see NEGLIGIBLE).
+        Coefficients of the polynomials, float64, for each of the three Fresnel
+        terms and of the M = (degree + 1) (degree + 2) / 2 pairs (l, m) with
+        0 ≤ m ≤ l, shape (3, M, P). They are zero for degrees above COMMON_DEGREE
+        whose amplitude at this roughness is at most MIN_AMPLITUDE.
     """
-    polynomial_count = 2 * degree + 1 + MARGIN
-    noticeable_degree = max(required_degree(roughness, NEGLIGIBLE), USUAL)
+    polynomial_count = 2 * degree + 1 + EXTRA_POLYNOMIALS
+    noticeable_degree = max(required_degree(roughness, MIN_AMPLITUDE), COMMON_DEGREE)
     fitted_degree = min(degree, noticeable_degree)
-    # The least squares below use 1.5 times as many cosines as polynomials. The
-    # number of cosines is N.
+    # A least-squares fit needs more values than polynomials: 1.5 times as many.
     cosine_arguments = _chebyshev_nodes(3 * polynomial_count // 2)
     cosines = _argument_to_cosine(cosine_arguments)
     roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
-    integrals_of_parts = []
+    blocks = []
     for some_cosines in cosines.split(COSINES_AT_ONCE):
-        integrals_of_parts.append(_lobe_integrals(some_cosines, roughness_tensor, fitted_degree))
-    # Shape (M', N, 3), with the M' pairs (l, m) up to the fitted degree.
-    integrals = torch.cat(integrals_of_parts, dim=2).permute(1, 2, 0)
-    # The integrals contain the factor sin^m θ, so the polynomials are
-    # multiplied by it too. A division by it would be a quotient of small
-    # numbers near θ = 0.
+        blocks.append(_lobe_integrals(some_cosines, roughness_tensor, fitted_degree))
+    # Values of π c_lm sin^m θ, with the axes: pair (l, m), cosine, Fresnel term.
+    integrals = torch.cat(blocks, dim=2).permute(1, 2, 0)
+    # Order m of each pair (l, m).
     orders = torch.tensor([m for l in range(fitted_degree + 1) for m in range(l + 1)])
-    # sin^m θ for each pair (l, m) and each cosine, shape (M', N, 1).
+    # Values of sin^m θ, with the axes: pair (l, m), cosine, and one of size 1.
     sine_powers = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2)
-    # The functions whose weights the least squares find: each of the P polynomials
-    # times sin^m θ, for each of the M' pairs (l, m) and each of the N cosines, shape
-    # (M', N, P).
+    # The integrals contain the factor sin^m θ. The polynomials are therefore multiplied by
+    # it, because dividing the integrals by it is inaccurate near θ = 0. Axes: pair (l, m),
+    # cosine, polynomial.
     fitted_functions = sine_powers * _chebyshev(cosine_arguments, polynomial_count).T
     fit = torch.linalg.lstsq(fitted_functions, integrals, rcond=1e-9, driver="gelsd")
-    # Coefficients up to the fitted degree, shape (3, M', P). Zeros up to `degree` follow at
-    # the end of the function, so that the result has the shape (3, M, P).
+    # Axes: Fresnel term, pair (l, m), polynomial.
     coefficients = fit.solution.permute(2, 0, 1)
+    # Append zeros for the pairs (l, m) with degrees that were not fitted.
     function_count = (degree + 1) * (degree + 2) // 2
     missing_count = function_count - len(orders)
     return torch.nn.functional.pad(coefficients, (0, 0, 0, missing_count))
 
 
 def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
-    """Integrate π times the lobe times each spherical harmonic over the directions of light.
+    """Integrate π times a specular lobe times each spherical harmonic over the sphere.
 
-    In the axes of a sample, with the normal in the plane of x and z, the
-    integral with the harmonic of degree l and order m is π c_lm sin^m θ. The
-    quadrature runs over Q half vectors for each camera direction.
+    The lobe is the reflectance times the cosine n·l, as a function of the
+    direction l to the light. In axes in which the camera direction v is the z-axis
+    and the normal n lies in the plane of x and z, the integral is π c_lm sin^m θ
+    (see `lobe_functions`). The integral is a sum over Q half vectors, which are
+    the bisectors of l and v.
 
     Args:
         cosines: Cosine n·v in (0, 1) of N camera directions, float64,
@@ -855,45 +874,47 @@ def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
         ascending order of l and then of m, shape (3, M, N).
     """
     half, solid_angles = _half_vectors(cosines, roughness)
-    # Axes of the surface: the normal is the z-axis, and the camera lies in the
-    # plane of x and z.
+    # The vectors are first computed in surface axes: the normal is the z-axis, and the
+    # camera lies in the plane of x and z.
     normal = half.new_tensor([[0.0, 0.0, 1.0]])
     sines = (1 - cosines**2).sqrt()
     zeros = 0 * sines
     toward = torch.stack([-sines, zeros, cosines], dim=1)
-    # Cosine v·h, shape (N, Q).
+    # Cosines v·h: one row for each camera direction v, one column for each half vector h.
     half_cosine = (toward[:, None] * half).sum(-1)
-    # The camera direction is mirrored at each half vector, shape (N, Q, 3).
+    # Direction to the light: the camera direction, mirrored at the half vector.
     light = 2 * half_cosine[..., None] * half - toward[:, None]
     light_cosine = light[..., 2].clamp(min=0)
-    # The solid angle of the reflected light is dl = 4 (v·h) dh (Walter et al.
-    # 2007, equation 14). Both tensors have shape (3, N, Q).
+    # Axes: Fresnel term, camera direction, half vector.
     reflected = reflectance(normal, toward[:, None], light, roughness)
+    # The solid angle of the light is dl = 4 (v·h) dh with the solid angle dh of the half
+    # vector h (Walter et al. 2007, equation 14).
     weighted_lobe = reflected * light_cosine * solid_angles * 4 * half_cosine
 
-    # Sample axes: the camera is the z-axis, and the normal lies in the plane of
-    # x and z.
+    # The directions to the light are rotated to axes in which the camera direction is the
+    # z-axis, and the normal lies in the plane of x and z.
     x_axis = torch.stack([cosines, zeros, sines], dim=1)
     light_x = (light * x_axis[:, None]).sum(2)
     light_y = light[..., 1]
     light_z = (light * toward[:, None]).sum(2)
     harmonic_indices = [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]
     light_in_sample = torch.stack([light_x, light_y, light_z])
-    # The M harmonics at the Q directions of light of each camera direction, shape (M, N, Q).
+    # Axes: harmonic m, camera direction n, direction of light q.
     harmonics = torch.stack(evaluate_harmonics(light_in_sample, harmonic_indices))
-    # Sum over the Q directions of light, shape (3, M, N).
+    # Sum over the directions of light q, for each Fresnel term t.
     return torch.einsum("tnq,mnq->tmn", weighted_lobe, harmonics)
 
 
 def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
-    """Place half vectors around a normal along z, most of them where the lobe is high.
+    """Choose half vectors for a sum over a specular lobe, most of them where the lobe is high.
 
-    The half vectors have azimuths φ and polar angles θ_h. The substitution
-    tan θ_h = α tan ψ spreads the lobe evenly over ψ. Nodes are equally spaced
-    in φ and are those of Gauss-Legendre quadrature in ψ. Half vectors at
-    large polar angles are left out, because the light that they mirror to the
-    camera would come from below the horizon. The lobe is symmetric about the
-    plane of n and v, so azimuths on one side of this plane are enough.
+    A half vector is the bisector of the directions to the light and to the camera
+    (v). The normal n is the z-axis. The half vectors have azimuths φ and polar
+    angles θ_h. The substitution tan θ_h = α tan ψ spreads the lobe evenly over ψ,
+    with α = roughness². The azimuths are equally spaced, and the values of ψ are
+    the nodes of Gauss-Legendre quadrature. Half vectors at large polar angles are
+    left out, because their light would come from below the horizon. The lobe is
+    symmetric about the plane of n and v, so azimuths on one side are enough.
 
     Args:
         cosines: Cosine n·v in (0, 1) of N camera directions, float64,
@@ -915,20 +936,22 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
     azimuth = math.pi * steps / AZIMUTH_COUNT
     alpha = roughness**2
     sines = (1 - cosines**2).sqrt()
-    # The camera leans away from the half vectors by this angle, in the plane of
-    # the normal and the azimuth φ. The mirrored light leans from the normal by
-    # this angle plus twice the polar angle. Shape (N, azimuths).
-    camera_lean = torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])
-    largest_polar = (math.pi / 2 - camera_lean) / 2
-    # The value of ψ at the largest polar angle, shape (N, 1, azimuths).
+    # Angle from the normal to the camera, projected to the plane at the azimuth φ and
+    # measured away from the half vector. One row for each camera direction, one column for
+    # each azimuth.
+    camera_angle = torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])
+    # The light is at the angle `camera_angle` + 2 θ_h from the normal, which must be at
+    # most π/2.
+    largest_polar = (math.pi / 2 - camera_angle) / 2
+    # Value of ψ for the largest polar angle, with a new axis for the nodes.
     largest_psi = (largest_polar.tan() / alpha).atan()[:, None]
-    # The nodes in [-1, 1] are moved to [0, largest ψ], shape (N, nodes, azimuths).
+    # Map the nodes from [-1, 1] to [0, largest ψ]. Axes: camera direction, node, azimuth.
     psi = largest_psi * (node + 1) / 2
     polar = (alpha * psi.tan()).atan()
     x = polar.sin() * azimuth.cos()
     y = polar.sin() * azimuth.sin()
     half = torch.stack([x, y, polar.cos()], -1).flatten(1, 2)
-    # The solid angle is sin θ_h dθ_h dφ, with the derivative dθ_h / dψ.
+    # Derivative dθ_h / dψ. The solid angle is sin θ_h (dθ_h / dψ) dψ dφ.
     polar_per_psi = alpha * (polar.cos() / psi.cos()) ** 2
     per_azimuth = (largest_psi * weight / 2 * polar_per_psi * polar.sin()).flatten(1)
     return half, per_azimuth * (2 * math.pi / AZIMUTH_COUNT)

@@ -10,15 +10,15 @@ A_l = π, 2π/3, π/4, 0, −π/24, 0, π/64, ... E is the irradiance of a diffu
 surface (Ramamoorthi and Hanrahan 2001; the paper's appendix B.2).
 
 On the sphere, the bands of even degree from 2 on are together one homogeneous
-polynomial p of degree d. By Euler's theorem, its value follows from its gradient
-(called slope here): p(n) = n · ∇p(n) / d. One product of monomials with the
-coefficients of the slope therefore gives both E and ∇E. The part of the slope
-that is tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by
-the normal (the paper's appendix D).
+polynomial p of degree d. By Euler's theorem, its value follows from its gradient:
+p(n) = n · ∇p(n) / d. One product of monomials with the coefficients of the
+gradient therefore gives both E and ∇E. The component of ∇E that is tangent to the
+sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative with respect to the normal
+(the paper's appendix D).
 
 Visibility and texture coordinates are fixed (the paper's Section 3 and appendix
-B.3). The derivative by the vertices contains how normals turn, but not how
-silhouette edges move. For derivatives by the light alone,
+B.3). The derivative with respect to the vertices contains how normals turn, but
+not how silhouette edges move. For derivatives with respect to the light alone,
 `renderer.transport.operators` is faster.
 
 Shapes use these letters: a view has S covered samples in P pixels, which show G
@@ -40,15 +40,15 @@ from renderer.errors import require_bounded
 from renderer.geometry.normals import SPARSE_VERTEX_RATIO, area_vectors, vertex_normals
 from renderer.light import harmonics
 from renderer.shading.gloss import SampleGloss, at_samples, toward_camera
-from renderer.shading.lobes import along, coat_bands
+from renderer.shading.lobes import coat_irradiance_factors, roughness_polynomials
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Number of normals that are shaded at once. The values of so many normals stay in
-# the cache of the processor.
+# Number of normals whose irradiance is computed at once. Their intermediate values fit
+# into the cache of the processor.
 BLOCK = 2**14
 # Number of color channels.
 COLORS = 3
@@ -87,20 +87,19 @@ def radiance(
     # Float16 would lose too much precision.
     wide = torch.promote_types(vertices.dtype, torch.float32)
     albedo = albedo.to(wide)
-    # Either shade the seen faces, or shade the normals at the samples.
     if normals is None:
-        # Samples of the same face and pixel are joined to runs. The weights are
-        # the albedo of the runs, divided by the number of samples in a pixel.
+        # All samples of a face in a pixel have the same irradiance. They are merged: the
+        # weight of a pair of face and pixel is their mean albedo times their share of the
+        # samples of the pixel.
         pixel, seen_face, weights = fragments.merge(albedo)
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shade = irradiance(face_normals, light, wide).index_select(1, seen_face)
+        incoming = irradiance(face_normals, light, wide).index_select(1, seen_face)
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
-        shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
-    # Reflected radiance of each run or sample in three channels, shape (3, runs or S).
-    reflected = shade * weights.T
-    # With one sample per pixel, each sample is a pixel, and no sum is needed.
+        incoming = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
+    reflected = incoming * weights.T
+    # With one sample per pixel, each column of `reflected` is a pixel already.
     if fragments.samples > 1:
         zeros = reflected.new_zeros(COLORS, len(fragments.pixels))
         reflected = zeros.index_add(1, pixel, reflected)
@@ -137,8 +136,8 @@ def glossy_radiance(
         InputError: If an argument holds NaN.
     """
     wide = torch.promote_types(vertices.dtype, torch.float32)
-    # Unit normals at the samples, shape (S, 3). `unit` and `area_vectors` have the
-    # three components along the first axis.
+    # The functions `unit` and `area_vectors` have the three components along the first
+    # axis, but `shading_normals` has them along the second axis.
     if normals is None:
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
         shading_normals = unit(face_normals).T[fragments.sample_to_seen_face].to(wide)
@@ -148,10 +147,8 @@ def glossy_radiance(
     albedo = albedo.to(wide)
     light = light.to(wide)
     gloss = gloss.to(shading_normals)
-    # Albedo of the diffuse surface below the coat, as the camera sees it.
-    diffuse_albedo = albedo * gloss.diffuse(shading_normals, to_camera)[:, None]
-    # `radiance` lets all light reach the diffuse surface. The light that the coat
-    # reflects does not reach it, so its diffuse reflection is subtracted.
+    # Albedo of the diffuse layer below the transparent coat, as the camera sees it.
+    diffuse_albedo = albedo * gloss.diffuse_factor(shading_normals, to_camera)[:, None]
     specular_blocks = []
     for first in range(0, len(shading_normals), BLOCK):
         block = slice(first, first + BLOCK)
@@ -163,8 +160,10 @@ def glossy_radiance(
             gloss.at(block),
         )
         coat_irradiance = _coat_irradiance(shading_normals[block].T, light, gloss.at(block))
+        # `radiance` below lets all light reach the diffuse layer. Subtract the diffuse
+        # reflection of the light that the coat reflects and that does not reach it.
         specular_blocks.append(reflected - diffuse_albedo[block].T * coat_irradiance)
-    # The empty first part keeps the shape (3, 0) if there are no samples.
+    # The empty first tensor gives the result the shape (3, 0) if there are no samples.
     specular = torch.cat([light.new_zeros(COLORS, 0), *specular_blocks], dim=1)
     specular = specular / fragments.samples**2
     diffuse = radiance(fragments, vertices, light, diffuse_albedo, normals)
@@ -188,10 +187,10 @@ def _lobe_radiance(
     Returns:
         Radiance, shape (3, S).
     """
-    # Radiance per unit of each coefficient of the light, in the axes of `frame`,
-    # shape (K, S). Metals multiply the `colored` part by the albedo. The `white`
-    # part has the color of the light.
-    colored, white, frame = gloss.transfer(normals, to_camera, harmonics.degree_of(light))
+    degree = harmonics.degree_of(light)
+    # The reflection of metals (colored) is multiplied by the albedo. All other specular
+    # reflection (white) has the color of the light.
+    colored, white, frame = gloss.specular_transfer(normals, to_camera, degree)
     light_in_frame = frame.from_world(light).T
     reflected = light_in_frame @ white
     if colored is not None:
@@ -202,8 +201,8 @@ def _lobe_radiance(
 def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
     """Compute the irradiance that the dielectric coat reflects at S samples.
 
-    This is the part of the irradiance that does not reach the diffuse surface
-    below the coat.
+    The coat is a transparent layer on a diffuse layer. The reflected irradiance
+    does not reach the diffuse layer.
 
     Args:
         normals: Unit normals, shape (3, S).
@@ -214,21 +213,20 @@ def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tens
         Irradiance, shape (3, S).
     """
     degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
-    # Only these first coefficients reach a diffuse surface. There are K of them.
+    # Coefficients of higher degrees do not change the irradiance of a diffuse surface.
     light = light[: (degree + 1) ** 2]
-    # The factor by which the coat reflects a coefficient is a sum over R
-    # polynomials of the roughness. Coefficients of this sum, shape (K, R).
-    factor_coefficients = coat_bands(degree).to(light)[harmonics.bands(degree)]
-    # Values of the polynomials, shape (R, S), or (R, 1) if all samples have the
-    # same roughness.
-    polynomials = along(gloss.roughness)
+    # The coat multiplies each coefficient of the light by a factor, which is a sum over R
+    # polynomials of the roughness. One row for each coefficient, one column for each
+    # polynomial.
+    factor_coefficients = coat_irradiance_factors(degree).to(light)[harmonics.bands(degree)]
+    # One row for each polynomial, one column for each sample (or one for all samples).
+    polynomials = roughness_polynomials(gloss.roughness)
     if len(gloss.roughness) == 1:
-        # Coefficients of the reflected light, shape (K, 3).
         reflected_light = (factor_coefficients @ polynomials) * light
         return gloss.specular_factor * _HarmonicSum.apply(normals, reflected_light)
-    # One reflected light for each polynomial, shape (K, R · 3).
+    # One reflected light for each polynomial, with 3 colors each, shape (K, R · 3).
     lights = (factor_coefficients[..., None] * light[:, None]).flatten(1)
-    # Irradiance under each of these lights, shape (R, 3, S).
+    # Irradiance with the axes: polynomial, color, sample.
     irradiances = _HarmonicSum.apply(normals, lights).unflatten(0, (-1, COLORS))
     return gloss.specular_factor * (irradiances * polynomials[:, None]).sum(0)
 
@@ -238,14 +236,14 @@ class _HarmonicSum(torch.autograd.Function):
 
     On the sphere, the harmonics of all even degrees together are one homogeneous
     polynomial, and so are those of all odd degrees. If p is a homogeneous
-    polynomial of degree d, its value follows from its gradient (called slope):
-    p(n) = n · ∇p(n) / d. The slope is also needed for the derivative by the
-    normal, so only the slope is evaluated.
+    polynomial of degree d, its value follows from its gradient:
+    p(n) = n · ∇p(n) / d. The gradient is also needed for the derivative with
+    respect to the normal, so only the gradient is evaluated.
     """
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
-        """Compute the sums.
+        """Compute the sum Σ_k c_k Y_k(n) for each channel and each normal n.
 
         Args:
             ctx: Context of autograd.
@@ -256,45 +254,50 @@ class _HarmonicSum(torch.autograd.Function):
             Sums, shape (C, N).
         """
         degree = math.isqrt(len(coefficients)) - 1
-        # Band 0 (degree 0) is constant: Y_0 = 1 / √(4π). Shape (C, 1).
+        # The harmonic of degree 0 has the constant value 1 / √(4π).
         value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
-        slope = normals.new_zeros(3, coefficients.shape[1], 1)
-        # One polynomial has the degree of the light, and the other one degree less.
+        gradient = normals.new_zeros(3, coefficients.shape[1], 1)
+        # The harmonics with the parity of `degree` are one homogeneous polynomial of this
+        # degree. All others are one polynomial of degree `degree` - 1.
         for power in range(max(degree - 1, 1), degree + 1):
-            # Gradients of the harmonics in monomials, shape (3 axes, monomials, K).
-            harmonic_slopes = _slopes(power).to(coefficients)[..., : len(coefficients)]
-            # Gradient of the sum in monomials, for the C channels, shape (3 axes, monomials, C).
-            slope_coefficients = harmonic_slopes @ coefficients[: harmonic_slopes.shape[2]]
-            # Gradient of the sum at the N normals, shape (3 axes, C, N).
-            polynomial_slope = slope_coefficients.mT @ harmonics.monomials(normals, power - 1)
-            value = value + (polynomial_slope * normals[:, None]).sum(0) / power
-            slope = slope + polynomial_slope
-        ctx.save_for_backward(normals, slope)
+            # Gradient of each harmonic, with the axes: direction of the derivative,
+            # monomial, harmonic.
+            harmonic_gradients = _gradients(power).to(coefficients)[..., : len(coefficients)]
+            # Gradient of the sum, with the axes: direction of the derivative, monomial,
+            # channel.
+            in_monomials = harmonic_gradients @ coefficients[: harmonic_gradients.shape[2]]
+            # Gradient at the normals, with the axes: direction, channel, normal.
+            polynomial_gradient = in_monomials.mT @ harmonics.monomials(normals, power - 1)
+            value = value + (polynomial_gradient * normals[:, None]).sum(0) / power
+            gradient = gradient + polynomial_gradient
+        ctx.save_for_backward(normals, gradient)
         ctx.degree = degree
         return value.expand(-1, normals.shape[1])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Compute the gradients by the normals and by the coefficients.
+        """Compute the gradients with respect to the normals and the coefficients.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the sums, shape (C, N).
+            upstream: Gradient with respect to the sums, shape (C, N).
 
         Returns:
-            Gradient by the normals, shape (3, N), and gradient by the
-            coefficients, shape (K, C). None if a gradient is not needed.
+            A tuple of
+            - the gradient with respect to the normals, shape (3, N);
+            - the gradient with respect to the coefficients, shape (K, C).
+            A gradient that is not needed is None.
         """
-        normals, slope = ctx.saved_tensors
+        normals, gradient = ctx.saved_tensors
         normal_gradient = None
         coefficient_gradient = None
         if ctx.needs_input_grad[0]:
-            normal_gradient = (slope * upstream).sum(1)
+            normal_gradient = (gradient * upstream).sum(1)
         if ctx.needs_input_grad[1]:
-            # Values of the K harmonics at the normals, shape (N,) each.
-            rows = harmonics.evaluate_harmonics(normals, range((ctx.degree + 1) ** 2))
-            coefficient_gradient = torch.stack(rows) @ upstream.T
+            # One tensor for each of the K harmonics, with its values at the normals.
+            values = harmonics.evaluate_harmonics(normals, range((ctx.degree + 1) ** 2))
+            coefficient_gradient = torch.stack(values) @ upstream.T
         return normal_gradient, coefficient_gradient
 
 
@@ -304,8 +307,8 @@ def irradiance(
     """Compute the irradiance of environment light on surfaces with N normals.
 
     The result is differentiable with respect to the normals and the light. The
-    source is the paper's equation for R in appendix B.2, and its derivative by
-    the normal in appendix D. Both are evaluated as polynomials of the normal.
+    irradiance is the function R in appendix B.2 of Liu et al. 2019. Appendix D has
+    its derivative. Both are evaluated as polynomials of the normal.
 
     Args:
         normals: Finite normals of any length, shape (3, N). They are divided by
@@ -314,8 +317,8 @@ def irradiance(
         dtype: Data type of all other computations, float32 or float64.
 
     Returns:
-        Irradiance in three color channels, shape (3, N). Its gradient by the
-        coefficients that do not reach a diffuse surface is exactly zero.
+        Irradiance in three color channels, shape (3, N). Some coefficients do not
+        change the irradiance (odd degrees from 3 on). Their gradient is exactly 0.
 
     Raises:
         InputError: If the light holds NaN, or if its shape is not
@@ -328,10 +331,10 @@ def irradiance(
 
 
 class _Irradiance(torch.autograd.Function):
-    """Irradiance of environment light, with its derivatives, see `irradiance`.
+    """Irradiance of environment light, differentiable in the normals and the light.
 
-    The forward pass computes the irradiance from its gradient by the normal,
-    called slope. It stores the slope for the backward pass.
+    The forward pass first computes the gradient of the irradiance with respect to
+    the normal, and from it the irradiance. The backward pass uses the gradient.
     """
 
     @staticmethod
@@ -349,46 +352,50 @@ class _Irradiance(torch.autograd.Function):
         directions, lengths = unit_vectors(normals)
         directions = directions.to(light.dtype)
         polynomial = _IrradiancePolynomial(light)
-        # Pairs of the value, shape (3 colors, BLOCK), and the slope, shape
-        # (3 axes, 3 colors, BLOCK).
+        # Each pair has the irradiance of a block of normals, and its gradient.
         pairs = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
-        value, slope = (torch.cat(blocks, dim=-1) for blocks in zip(*pairs, strict=True))
+        value, gradient = (torch.cat(blocks, dim=-1) for blocks in zip(*pairs, strict=True))
         # Deleting the list releases the memory of the blocks.
         del pairs
         zero_normals = torch.nonzero(lengths == 0).squeeze(1)
         if len(zero_normals):
-            # The polynomial equals the harmonics only at unit vectors. At a zero
-            # vector, the harmonics themselves are evaluated.
             degree = math.isqrt(len(light)) - 1
+            # The polynomial is the irradiance only for unit normals. For normals of length
+            # 0, the harmonics are evaluated instead.
             nonzero, irradiance_per_unit = _diffuse_basis(directions[:, zero_normals], degree)
             value[:, zero_normals] = light[nonzero].T @ irradiance_per_unit
-        ctx.save_for_backward(directions, lengths, slope if ctx.needs_input_grad[0] else None)
+        ctx.save_for_backward(directions, lengths, gradient if ctx.needs_input_grad[0] else None)
         ctx.light_shape = light.shape
         return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Compute the gradients by the normals and by the light.
+        """Compute the gradients with respect to the normals and the light.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the irradiance, shape (3, N).
+            upstream: Gradient with respect to the irradiance, shape (3, N).
 
         Returns:
-            Gradient by the normals, shape (3, N), and gradient by the SH
-            coefficients, shape (K, 3). None if a gradient is not needed.
+            A tuple of
+            - the gradient with respect to the normals, shape (3, N);
+            - the gradient with respect to the SH coefficients, shape (K, 3).
+            A gradient that is not needed is None.
         """
-        directions, lengths, slope = ctx.saved_tensors
+        # The gradient of the irradiance has the axes: direction, color, normal.
+        directions, lengths, color_gradients = ctx.saved_tensors
         normal_gradient = None
         light_gradient = None
         if ctx.needs_input_grad[0]:
-            # Sum over the colors, in place to save memory, shape (3 axes, N).
-            gradient = slope[:, 0] * upstream[0]
-            gradient.addcmul_(slope[:, 1], upstream[1]).addcmul_(slope[:, 2], upstream[2])
-            # Only turning a normal changes the irradiance, so the part along the
-            # normal is removed. A zero normal has the gradient 0.
+            # Add up red, green and blue. The additions are in place to save memory.
+            gradient = color_gradients[:, 0] * upstream[0]
+            gradient.addcmul_(color_gradients[:, 1], upstream[1])
+            gradient.addcmul_(color_gradients[:, 2], upstream[2])
+            # The length of a normal does not change the irradiance, so the component of
+            # the gradient along the normal is removed.
             tangential = gradient - directions * (directions * gradient).sum(0)
+            # A normal of length 0 gets the gradient 0.
             normal_gradient = tangential / lengths.masked_fill(lengths == 0, torch.inf)
         if ctx.needs_input_grad[1]:
             degree = math.isqrt(ctx.light_shape[0]) - 1
@@ -403,43 +410,43 @@ class _Irradiance(torch.autograd.Function):
 class _IrradiancePolynomial:
     """Irradiance under one light, as a polynomial of the unit normal n.
 
-    A band is the set of harmonics of one degree. On the unit sphere, the bands of
-    even degree from 2 on together are one homogeneous polynomial p(n) of degree
-    d. Band 0 is a constant c, and band 1 a linear function a · n. Other bands do
-    not reach a diffuse surface. The irradiance is c + a · n + p(n). The gradient
-    ∇p is a sum over the J monomials of degree d - 1.
+    The irradiance is c + a · n + p(n). The constant c comes from the harmonics of
+    degree 0, and the linear function a · n from those of degree 1. On the unit
+    sphere, the harmonics of the even degrees from 2 on are together one
+    homogeneous polynomial p(n) of degree d. Its gradient ∇p is a sum over the J
+    monomials of degree d - 1. All other degrees do not change the irradiance.
 
     Attributes:
-        degree: Degree d.
-        even_slope: Coefficients of ∇p in the monomials, for 3 axes and 3 colors,
-            shape (9, J).
-        linear_slope: Vector a for 3 axes and 3 colors, shape (9, 1).
-        constant: Constant c for 3 colors, shape (3, 1).
+        degree: Degree d of p.
+        even_gradient: Coefficients of ∇p in the monomials, with one row for each
+            of 3 directions of the derivative and 3 colors, shape (9, J).
+        linear_gradient: The vector a, with one row for each of 3 directions and 3
+            colors, shape (9, 1).
+        constant: The constant c for 3 colors, shape (3, 1).
     """
 
     def __init__(self, light: Tensor):
-        """Compute the coefficients of the polynomial.
+        """Compute the coefficients of the irradiance c + a · n + p(n).
 
         Args:
             light: SH coefficients, shape (K, 3).
         """
         light_degree = math.isqrt(len(light)) - 1
-        # Slopes per unit of each coefficient that reaches a diffuse surface. The J entries of
-        # ∇p come first, and then the one entry of a, shape (3 axes, J + 1, coefficients).
-        slopes_per_light = _slopes_per_light(light_degree, light.dtype, light.device)
-        # Slopes of this light, shape (3 axes, J + 1, 3 colors). They are reordered to the
-        # shape (3 axes · 3 colors, J + 1).
-        slopes_by_axis = slopes_per_light @ light[: slopes_per_light.shape[2]]
-        slopes = slopes_by_axis.mT.flatten(0, 1)
+        matrices = _gradient_of_light(light_degree, light.dtype, light.device)
+        # Gradients with the axes: direction of the derivative, coefficient (those of ∇p
+        # first, then the one of a), color.
+        gradients = matrices @ light[: matrices.shape[2]]
+        # One row for each direction and color, one column for each coefficient.
+        gradients_by_row = gradients.mT.flatten(0, 1)
         self.degree = _even_degree(light_degree)
-        self.even_slope = slopes[:, :-1]
-        self.linear_slope = slopes[:, -1:]
-        # Irradiance from band 0: the factor π of a Lambertian surface, times the coefficient
-        # U_0, times the harmonic Y_0 = 1 / √(4π).
+        self.even_gradient = gradients_by_row[:, :-1]
+        self.linear_gradient = gradients_by_row[:, -1:]
+        # For degree 0, the irradiance is π U_0 Y_0 with the coefficient U_0 of the light
+        # and the harmonic Y_0 = 1 / √(4π).
         self.constant = light[:1].T * math.sqrt(math.pi / 4)
 
     def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the irradiance and its slope at N unit normals.
+        """Compute the irradiance c + a · n + p(n) and its gradient at N unit normals n.
 
         Args:
             directions: Unit normals n, shape (3, N).
@@ -447,28 +454,32 @@ class _IrradiancePolynomial:
         Returns:
             A tuple of
             - the irradiance, shape (3 colors, N);
-            - the slope a + ∇p(n), shape (3 axes, 3 colors, N). Its part
-              tangential to the sphere is the derivative of the irradiance. Its
-              part along n has no meaning.
+            - the gradient a + ∇p(n), shape (3 components, 3 colors, N). Only its
+              component tangential to the sphere is the derivative of the
+              irradiance. Its component along n has no meaning.
         """
         # A tensor of monomials with a name would stay in memory until the function
         # returns.
-        slope = torch.addmm(
-            self.linear_slope, self.even_slope, harmonics.monomials(directions, self.degree - 1)
+        gradient = torch.addmm(
+            self.linear_gradient,
+            self.even_gradient,
+            harmonics.monomials(directions, self.degree - 1),
         ).unflatten(0, (3, COLORS))
-        # The irradiance is c + a · n + p(n) with p(n) = n · ∇p(n) / d. The loop adds
-        # n · slope / d = p(n) + a · n / d. The first line adds the rest,
-        # c + (1 - 1/d) a · n.
-        linear = self.linear_slope.view(3, COLORS).T
+        # Because p(n) = n · ∇p(n) / d, the irradiance is the sum of two terms: first
+        # c + (1 - 1/d) a · n, and then n · (a + ∇p(n)) / d, which the loop adds.
+        linear = self.linear_gradient.view(3, COLORS).T
         value = torch.addmm(self.constant, linear, directions, alpha=1 - 1 / self.degree)
-        for slope_along_axis, normal_component in zip(slope, directions, strict=True):
-            value.addcmul_(slope_along_axis, normal_component, value=1 / self.degree)
-        return value, slope
+        for gradient_component, normal_component in zip(gradient, directions, strict=True):
+            value.addcmul_(gradient_component, normal_component, value=1 / self.degree)
+        return value, gradient
 
 
 @harmonics.cache_tensors
-def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Compute the matrices that map the SH coefficients of a light to `_IrradiancePolynomial`.
+def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Compute the matrices that map SH coefficients of a light to the gradient of irradiance.
+
+    The irradiance is the polynomial c + a · n + p(n) of the normal n, see
+    `_IrradiancePolynomial`.
 
     Args:
         degree: Degree of the light.
@@ -476,36 +487,36 @@ def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> 
         device: Device of the result.
 
     Returns:
-        Matrix for each of the 3 axes, shape (3, J + 1, K'). The first J rows map
-        to the coefficients of ∇p in monomials, and the last row maps to the
-        vector a of band 1. K' counts the coefficients of the light up to the
-        degree of p.
+        One matrix for each of the 3 components of the gradient,
+        shape (3, J + 1, K'). The first J rows give the coefficients of ∇p in
+        monomials, and the last row gives the vector a. The K' columns belong to
+        the SH coefficients up to the degree of p.
     """
     even_degree = _even_degree(degree)
-    # `_slopes(1)` has a column for each of the 4 harmonics up to degree 1.
-    linear_slopes = F.pad(_slopes(1), (0, (even_degree + 1) ** 2 - 4))
-    slopes = torch.cat([_slopes(even_degree), linear_slopes], dim=1)
-    irradiance_slopes = slopes * harmonics.lambertian_factors(even_degree)
-    return irradiance_slopes[..., : (degree + 1) ** 2].to(device, dtype)
+    # `_gradients(1)` has a column for each of the 4 harmonics up to degree 1.
+    linear_gradients = F.pad(_gradients(1), (0, (even_degree + 1) ** 2 - 4))
+    gradients = torch.cat([_gradients(even_degree), linear_gradients], dim=1)
+    irradiance_gradients = gradients * harmonics.lambertian_factors(even_degree)
+    return irradiance_gradients[..., : (degree + 1) ** 2].to(device, dtype)
 
 
 def _even_degree(degree: int) -> int:
-    """Return the degree of the polynomial that the even bands of a light are together.
+    """Return the degree of the polynomial of all harmonics with an even degree from 2 on.
 
-    Band 0 does not count, so the result is at least 2. Bands above
-    `harmonics.DIFFUSE_DEGREE` do not reach a diffuse surface.
+    Harmonics above `harmonics.DIFFUSE_DEGREE` are ignored, because they hardly
+    change the irradiance of a diffuse surface.
 
     Args:
         degree: Degree of the light.
 
     Returns:
-        Even degree.
+        Largest even degree of a harmonic, at least 2.
     """
     return max(min(degree, harmonics.DIFFUSE_DEGREE) - degree % 2, 2)
 
 
 @harmonics.cache_tensors
-def _slopes(degree: int) -> Tensor:
+def _gradients(degree: int) -> Tensor:
     """Compute the gradients of spherical harmonics that are extended to homogeneous polynomials.
 
     The harmonic Y_k of degree l, with l of the same parity as `degree`, equals the
@@ -517,29 +528,29 @@ def _slopes(degree: int) -> Tensor:
         degree: Degree of the polynomials.
 
     Returns:
-        Coefficients of the gradients, shape (3 axes, monomials, (degree + 1)²),
-        with one column for each harmonic. Columns are zero for degree 0 and for
-        degrees l of the other parity.
+        Coefficients of the gradients,
+        shape (3 components, monomials, (degree + 1)²), with one column for each
+        harmonic. Columns are zero for l = 0 and for l of the other parity.
     """
     band = harmonics.bands(degree)
-    gradients = harmonics.homogeneous_gradients(degree)[:, : degree**2]
-    slopes = harmonics.monomial_coefficients(degree - 1) @ gradients
+    in_harmonics = harmonics.homogeneous_gradients(degree)[:, : degree**2]
+    in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
     has_same_parity = band % 2 == degree % 2
-    return slopes * ((band > 0) & has_same_parity)
+    return in_monomials * ((band > 0) & has_same_parity)
 
 
 def _diffuse_basis(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
-    """Compute the irradiance per unit of each SH coefficient that reaches a diffuse surface.
+    """Compute the irradiance of N diffuse surfaces from each spherical harmonic.
 
     Args:
-        directions: Unit or zero normals, shape (3, N).
+        directions: Unit or zero normals of the surfaces, shape (3, N).
         degree: Degree of the light.
 
     Returns:
         A tuple of
-        - the ascending indices of the M coefficients that reach a diffuse
-          surface;
-        - the irradiance per unit of each of these coefficients, shape (M, N).
+        - the ascending indices of the M harmonics that change the irradiance;
+        - the irradiance if the coefficient of one of these harmonics is 1 and
+          all others are 0, shape (M, N).
     """
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
     factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
@@ -562,15 +573,16 @@ def normals_in_sight(
     """
     is_seen_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     is_seen_vertex[fragments.corners.T.flatten()] = True
-    # A vertex normal is an average over all faces around the vertex, so faces with
-    # at least one seen vertex are needed.
+    # The normal of a vertex is an average over all faces around it. All faces with at
+    # least one vertex of a seen face are therefore needed.
     has_seen_corner = is_seen_vertex.index_select(0, faces.flatten()).view(-1, 3)
     first, second, third = has_seen_corner.T
     needed_faces = faces[first | second | third]
     vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
     if len(vertices) < SPARSE_VERTEX_RATIO * needed_faces.numel():
         return vertex_normals(vertices, needed_faces)
-    # If the needed faces have few of the vertices, compute normals of these only.
+    # If the needed faces have few of the vertices, it is faster to renumber these vertices
+    # and to compute the normals of these only.
     used_vertices, renumbered_faces = needed_faces.unique(return_inverse=True)
     normals = vertex_normals(vertices.index_select(0, used_vertices), renumbered_faces)
     zeros = torch.zeros_like(vertices, requires_grad=False)
@@ -591,8 +603,8 @@ def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float
         Interpolated normals, which are not of unit length, shape (S, 3).
     """
     corner_vertices = fragments.corners.T.flatten()
-    # Vertex normals at the corners of the seen faces, shape (3 components, 3 corners, G).
+    # Vertex normals with the axes: component, corner, seen face.
     corner_normals = normals.T.index_select(1, corner_vertices).unflatten(1, (3, -1))
     facing_normals = corner_normals * fragments.facing.T.to(normals)
-    # `interpolate` takes the shape (G, 3 corners, 3 components).
+    # `interpolate` takes the axes in the order: seen face, corner, component.
     return fragments.interpolate(facing_normals.permute(2, 1, 0))

@@ -223,10 +223,10 @@ def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
     normals = surface.normals[sample]
     path_gloss = gloss.at(sample)
     # Metals tint the `colored` part of the specular reflection with their albedo.
-    colored, white = path_gloss.along(normals, at_samples(surface.toward, sample), to_light)
-    leaving = gloss.diffuse(surface.normals, surface.toward)[sample]
+    colored, white = path_gloss.reflect_beams(normals, at_samples(surface.toward, sample), to_light)
+    leaving = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
     # Light enters the diffuse layer below the coat, and leaves it again.
-    diffuse = leaving * path_gloss.entering((normals * to_light).sum(1))
+    diffuse = leaving * path_gloss.coat_transmittance((normals * to_light).sum(1))
     return path_albedo * (diffuse + colored)[:, None] + white[:, None]
 
 

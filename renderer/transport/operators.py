@@ -1322,7 +1322,7 @@ def _glossy_box_filter(
         to_camera = at_samples(surface.toward, block.samples)
         block_gloss = gloss.at(block.samples)
         # Metals multiply the `colored` reflection by the albedo.
-        colored, white, frame = block_gloss.transfer(normals, to_camera, basis.degree)
+        colored, white, frame = block_gloss.specular_transfer(normals, to_camera, basis.degree)
         diffuse = _diffuse_transfer(block_gloss, normals, to_camera, diffuse_degree)
         # If all colors share a channel, zip stops before the second channel.
         for channel, weight in zip(block.transfer, weights[block.samples].T, strict=False):
@@ -1351,8 +1351,8 @@ def _diffuse_transfer(
         Radiance per unit of each coefficient, shape (S, K).
     """
     # Irradiance below the coat, shape (S, K).
-    entering = harmonics.basis(normals, degree) * gloss.entering_bands(degree).T
-    return entering * gloss.diffuse(normals, to_camera)[:, None]
+    entering = harmonics.basis(normals, degree) * gloss.factors_below_coat(degree).T
+    return entering * gloss.diffuse_factor(normals, to_camera)[:, None]
 
 
 class _Block(NamedTuple):

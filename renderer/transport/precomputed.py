@@ -258,7 +258,9 @@ class Transport:
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            diffuse_albedo = albedo_by_channel * gloss.diffuse(surface.normals, surface.toward)
+            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(
+                surface.normals, surface.toward
+            )
         for hits in self.rays.hits(surface, self._directions):
             if not hits.weight.any():
                 continue
@@ -271,7 +273,7 @@ class Transport:
                 # that enters the diffuse layer below the coat, shape (B, D).
                 colored, white = self._lobes(gloss, surface, sample_of_ray)
                 cosine = self._cosines(surface, sample_of_ray)
-                entering = gloss.at(sample_of_ray).entering(cosine)
+                entering = gloss.at(sample_of_ray).coat_transmittance(cosine)
             for channel, channel_change in enumerate(change):
                 # Reflected radiance per irradiance along each ray, shape (B, D).
                 reflectance = diffuse_albedo[channel][sample_of_ray]
@@ -344,13 +346,13 @@ class Transport:
         """
         to_camera = at_samples(surface.toward, sample_of_ray)
         normals = surface.normals[sample_of_ray]
-        colored, white = gloss.at(sample_of_ray).along(normals, to_camera, self._directions)
+        colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, self._directions)
         cosine = self._cosines(surface, sample_of_ray).clamp(min=0)
         # Uniform light of irradiance 1 has the radiance 1/π. Each of D directions
         # has the solid angle 4π / D. The sum over the directions is therefore
         # 4 times the mean.
         sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
-        exact_colored, exact = gloss.even(surface.normals, surface.toward)
+        exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
         if exact_colored is not None:
             exact = exact + exact_colored
         smallest = torch.finfo(sampled.dtype).tiny

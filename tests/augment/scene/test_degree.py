@@ -24,7 +24,7 @@ from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import quadrature
 from renderer.light.highlights import required_degree
 from renderer.light.presets import directional, load_light, probe
-from renderer.shading.gloss import Gloss, smoothest
+from renderer.shading.gloss import Gloss, smallest_roughness
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}
@@ -111,7 +111,7 @@ def test_the_degree_shows_every_varnish_that_is_drawn():
     roughness = []
     for seed in range(20):
         drawn = vary(scene, varied, torch.Generator().manual_seed(seed))
-        roughness.append(smoothest(drawn.objects[0].mesh))
+        roughness.append(smallest_roughness(drawn.objects[0].mesh))
     assert 0.22 <= min(roughness) < 0.3
 
 

@@ -212,7 +212,7 @@ def test_lobes_are_the_projected_reflectance_of_gltf(roughness, tolerance, view_
         found = []
         for seen in views:
             normals = (UP @ turn.T).expand_as(seen)
-            colored, white, frame = gloss.transfer(normals, seen @ turn.T, 6)
+            colored, white, frame = gloss.specular_transfer(normals, seen @ turn.T, 6)
             found.append(frame.to_world(colored if part == "colored" else white).T)
         for cosine, row in zip(cosines, torch.cat(found), strict=True):
             scale = project(whole_lobe, cosine).norm()
@@ -240,7 +240,9 @@ def test_a_direction_below_the_surface_passes_the_coat_like_one_at_its_horizon()
     varnish = SampleGloss(double(0.4), double(0.0), double(1.0))
     below = torch.tensor([-0.01, -0.5, -0.99], dtype=DOUBLE)
     horizon = torch.zeros(3, dtype=DOUBLE)
-    torch.testing.assert_close(varnish.entering(below), varnish.entering(horizon))
+    torch.testing.assert_close(
+        varnish.coat_transmittance(below), varnish.coat_transmittance(horizon)
+    )
 
 
 @pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.3, 0.6])
@@ -285,8 +287,8 @@ def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_
     gloss = SampleGloss(roughness, metallic, specular_factor)
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
     normals = UP.expand_as(views)
-    colored, white, _ = gloss.transfer(normals, views, 0)
-    diffuse = gloss.diffuse(normals, views) * gloss.entering_bands(0)[0] / math.pi
+    colored, white, _ = gloss.specular_transfer(normals, views, 0)
+    diffuse = gloss.diffuse_factor(normals, views) * gloss.factors_below_coat(0)[0] / math.pi
     specular = (colored + white)[0] * math.sqrt(4 * math.pi) / math.pi
     reflected = diffuse + specular
     assert diffuse.min() >= 0
