@@ -1,7 +1,8 @@
-"""Scores of a network on photographs in the light of a projector, and their files.
+"""Attacks on a network through the light of a projector on photographs, and their results.
 
-The photographs need no labels. The class of each is what the network predicts
-for it unchanged.
+The projector shows a slide, which is a random picture. A network loses a photograph
+if the light of the slide changes the predicted class. The photographs need no labels,
+because the prediction for the unchanged photograph counts as right.
 """
 
 import json
@@ -31,17 +32,17 @@ from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
 from train.runs.run_config import read_json
 
-# File with the predictions for all photographs.
+# Name of the file with the predictions for all photographs.
 RELIT = "relit.json"
-# Number of photographs of which `attack_folder` writes pictures.
-PICTURED = 8
-# Lights by the titles of their columns.
+# Pictures are written for this many photographs.
+PICTURE_COUNT = 8
+# For each kind of light, the title of its column in tables.
 TITLES = {
     SLIDE: "random slide",
     RANDOM: "random search",
     ADVERSARIAL: "gradient",
 }
-# Sentence of reports on the limits of the model.
+# Sentences of reports about what the simulation of the light leaves out.
 MODELED = (
     "This models a flat print of each photograph in the light of a projector, with the shading of "
     "a random smooth surface. There are no cast shadows, highlights or changes of the shape."
@@ -50,14 +51,18 @@ MODELED = (
 
 @dataclass(frozen=True)
 class RelitPhotograph:
-    """Predictions of a network for one photograph.
+    """Predictions of a network for one photograph in the light of several slides.
+
+    There are up to three kinds of light: "slide" is a random slide, "random" is
+    the slide after a random search, and "adversarial" is the slide after a
+    gradient attack.
 
     Attributes:
-        path: Path in its folder.
+        path: Path of the photograph, relative to its folder.
         predicted: Predicted class of the unchanged photograph.
-        kept: Number of slides under which the photograph keeps this class, by
-            light.
-        becomes: Predicted classes under the slides, by light.
+        kept: For each kind of light, the number of slides under which the
+            predicted class stays the same.
+        becomes: For each kind of light, the predicted class under each slide.
     """
 
     path: str
@@ -68,17 +73,19 @@ class RelitPhotograph:
 
 @dataclass(frozen=True)
 class RelitScores:
-    """Predictions of a network for relit photographs.
+    """Predictions of a network for photographs in the light of a projector.
 
     Attributes:
         folder: Folder of the photographs.
         slides: Number of slides for each photograph.
-        gain: Largest factor of a channel of a slide.
-        passes: Passes through the network of each search.
+        gain: Largest factor by which an attack multiplies a color channel of a
+            slide.
+        passes: Number of passes through the network in each attack.
         photographs: Predictions for each photograph.
-        pictures: File name of a picture by the index of its photograph.
+        pictures: For the indices of some photographs, the file name of a
+            picture that shows the photograph in each kind of light.
         found: Number of photographs in the folder.
-        unreadable: Paths of photographs that could not be read.
+        unreadable: Paths of the photographs that could not be read.
     """
 
     folder: str
@@ -92,58 +99,61 @@ class RelitScores:
 
     @property
     def lights(self) -> list[str]:
-        """Lights of the predictions: "slide", "random" and, with gradients, "adversarial"."""
+        """Kinds of light that were tested: "slide", "random" and perhaps "adversarial".
+
+        A network without gradients is not tested in adversarial light.
+        """
         return list(self.photographs[0].kept)
 
     def kept(self, light: str) -> Proportion:
-        """Count the photographs that keep their class under all of their slides.
+        """Compute the fraction of photographs whose predicted class no slide changes.
 
         Args:
-            light: One of `lights`.
+            light: Kind of light, such as "random".
 
         Returns:
-            Their fraction, with its 95% interval.
+            Fraction of the photographs, with its 95% interval.
         """
-        hits = sum(photograph.kept[light] == self.slides for photograph in self.photographs)
-        return fraction(hits, len(self.photographs))
+        is_kept = [photograph.kept[light] == self.slides for photograph in self.photographs]
+        return fraction(sum(is_kept), len(is_kept))
 
     def summary_table(self) -> Table:
-        """Make a table of the fraction of photographs that keep their class, by light."""
+        """Make a table of the photographs that keep their class, with a row for each light."""
         rows = []
         for light in self.lights:
             rows.append([TITLES[light], format_fraction(self.kept(light))])
         return Table("photographs that keep their class", ["light", "kept"], rows)
 
     def class_table(self) -> Table:
-        """Make a table of the photographs that keep their class, by predicted class.
+        """Make a table with a row for each predicted class of the unchanged photographs.
 
-        The classes that lose most photographs come first.
+        A row has the number of photographs and, for each kind of light, the
+        number that keep their class. The classes that lose most photographs
+        come first.
         """
-        groups: dict[str, list[RelitPhotograph]] = {}
+        photographs_of_class: dict[str, list[RelitPhotograph]] = {}
         for photograph in self.photographs:
-            groups.setdefault(photograph.predicted, []).append(photograph)
+            photographs_of_class.setdefault(photograph.predicted, []).append(photograph)
         rows: list[list[object]] = []
-        for name, members in sorted(groups.items()):
-            counts: list[object] = []
+        for name, photographs in sorted(photographs_of_class.items()):
+            kept_counts: list[object] = []
             for light in self.lights:
-                counts.append(sum(item.kept[light] == self.slides for item in members))
-            rows.append([name, len(members), *counts])
-        rows.sort(key=_kept_fraction)
+                kept_counts.append(sum(item.kept[light] == self.slides for item in photographs))
+            rows.append([name, len(photographs), *kept_counts])
+        rows.sort(key=_sum_of_kept_fractions)
         titles = [f"kept: {TITLES[light]}" for light in self.lights]
         return Table("by predicted class", ["class", "photographs", *titles], rows)
 
 
-def _kept_fraction(row: Sequence[Any]) -> float:
-    """Sum the fraction of the photographs that keep their class over all lights.
+def _sum_of_kept_fractions(row: Sequence[Any]) -> float:
+    """Add up the fractions of photographs that keep their class in each kind of light.
 
     Args:
-        row: Row of `RelitScores.class_table`: the class, the number of
-            photographs, and for each light the number that keep their class.
-
-    Returns:
-        Sum of one fraction for each light.
+        row: Name of a class, number of its photographs, and for each kind of
+            light the number of these photographs that keep their class.
     """
-    return sum(row[2:]) / row[1]
+    _, photograph_count, *kept_counts = row
+    return sum(kept_counts) / photograph_count
 
 
 def attack_folder(
@@ -157,28 +167,30 @@ def attack_folder(
     seed: int = 0,
     limit: int | None = None,
 ) -> RelitScores:
-    """Attack a network through the light on the photographs of a folder, and write the results.
+    """Attack a network through the light on photographs, and write the results to files.
 
     Args:
         classifier: Network to attack.
-        folder: Folder of photographs, with sub-folders or without.
-        settings: Settings of the attack.
-        out: Folder of the results. If it does not exist, it is made.
-        sensor_noise: Standard deviation of the noise, in steps of 8 bits.
-        batch_size: Photographs per pass.
-        seed: Seed of all draws.
-        limit: Largest number of photographs. From more, evenly spaced ones are
-            attacked. None for all.
+        folder: Folder of photographs. Subfolders are searched, too.
+        settings: Settings of the attack, such as the number of slides.
+        out: Folder for the results. It is created if it does not exist.
+        sensor_noise: Standard deviation of the simulated noise of a camera, in
+            units of 1/255.
+        batch_size: Number of photographs in one pass through the network.
+        seed: Seed of the slides, the random searches and the noise.
+        limit: Largest number of photographs to attack. If the folder has more,
+            photographs at equal distances in the list are chosen. None attacks
+            all photographs.
 
     Returns:
-        The predictions, as they are written.
+        Predictions for each photograph in each kind of light.
 
     Raises:
         InputError: If the folder holds no photograph that can be read.
     """
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, limit or len(found))
-    shown, images, unreadable = load_photographs(
+    readable, images, unreadable = load_photographs(
         folder, chosen, classifier.size, skip_unreadable=True
     )
     result = attack_photographs(
@@ -197,7 +209,7 @@ def attack_folder(
         "passes": settings.passes,
         "found": len(found),
         "unreadable": unreadable,
-        "photographs": _describe(result, shown),
+        "photographs": _describe(result, readable),
         "pictures": _write_pictures(result, out),
     }
     atomic_write(out / RELIT, json.dumps(content, indent=1) + "\n", durable=True)
@@ -205,13 +217,13 @@ def attack_folder(
 
 
 def read_relit(folder: Path) -> RelitScores:
-    """Read the predictions that `attack_folder` wrote.
+    """Read the predictions that `attack_folder` wrote to relit.json.
 
     Args:
         folder: Folder of the results.
 
     Returns:
-        The predictions.
+        Predictions for each photograph in each kind of light.
 
     Raises:
         InputError: If the file is missing or damaged.
@@ -225,14 +237,15 @@ def read_relit(folder: Path) -> RelitScores:
 def _describe(
     result: PhotographAttackResult, photographs: Sequence[Photograph]
 ) -> list[dict[str, Any]]:
-    """Describe the predictions for each photograph by names of classes.
+    """Convert the result of an attack to entries of relit.json.
 
     Args:
-        result: Result of the attack on N photographs, with several slides each.
-        photographs: The N photographs.
+        result: Result of the attack on N photographs.
+        photographs: The N photographs, in the same order.
 
     Returns:
-        Fields of `RelitPhotograph` by name, for each photograph.
+        For each photograph, a dictionary of the attributes of
+        `RelitPhotograph`.
     """
     classes = result.classifier.classes
     described = []
@@ -254,48 +267,51 @@ def _describe(
 
 
 def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:
-    """Write pictures of at most PICTURED photographs in all lights, side by side.
+    """Write pictures that show photographs in each kind of light, side by side.
 
-    Photographs whose class changes in one light come first. Usually this light
-    is the gradient attack. Photographs whose class changes in two lights follow,
-    and so on. Photographs that no light changes come last.
+    Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes
+    in only one kind of light come first, which is usually the gradient attack.
+    Photographs whose class changes in more kinds of light follow. Photographs
+    whose class never changes come last.
 
     Args:
         result: Result of the attack.
-        out: Folder of the pictures.
+        out: Folder for the pictures.
 
     Returns:
-        File name of each picture by the index of its photograph.
+        For the index of each chosen photograph, the file name of its picture.
     """
-    # Number of lights in which a photograph changes its class under any slide,
-    # shape (N,).
-    number_of_losses = torch.stack([mask.any(1) for mask in result.changed.values()]).sum(0)
-    is_lost = number_of_losses > 0
-    # Adding 100 puts the photographs without a change at the end.
-    order = torch.argsort(number_of_losses + 100 * ~is_lost, stable=True)
+    # For each kind of light, whether any slide changes the class of each photograph.
+    is_changed = [changed.any(dim=1) for changed in result.changed.values()]
+    change_count = torch.stack(is_changed).sum(dim=0)
+    # A rank above all counts puts photographs that never change at the end.
+    rank = torch.where(change_count > 0, change_count, len(is_changed) + 1)
+    order = torch.argsort(rank, stable=True)
     names = {}
-    for photograph in order[:PICTURED].tolist():
+    for photograph in order[:PICTURE_COUNT].tolist():
         slide = _slide_to_show(result, photograph)
-        shown: list[Tensor] = [result.image(photograph, UNCHANGED)]
+        images: list[Tensor] = [result.image(photograph, UNCHANGED)]
         for light in result.changed:
-            shown.append(result.image(photograph, light, slide))
+            images.append(result.image(photograph, light, slide))
+        side_by_side = torch.cat(images, dim=2)
         name = f"relit_{photograph:04d}.png"
-        strip = torch.cat(shown, dim=2).permute(1, 2, 0).cpu().numpy()
-        write_image(out / name, Image.fromarray(strip))
+        pixels = side_by_side.permute(1, 2, 0).cpu().numpy()
+        write_image(out / name, Image.fromarray(pixels))
         names[photograph] = name
     return names
 
 
 def _slide_to_show(result: PhotographAttackResult, photograph: int) -> int:
-    """Choose the slide under which a picture shows a photograph.
+    """Choose the slide with which a picture shows a photograph.
 
     Args:
         result: Result of the attack.
         photograph: Index of the photograph.
 
     Returns:
-        Index of the first slide that changes the class in the last, strongest
-        light. 0 if no slide does.
+        Index of the first slide that changes the predicted class in the
+        strongest kind of light. 0 if no slide changes it.
     """
-    changed = [*result.changed.values()][-1][photograph]
-    return int(changed.int().argmax())
+    # The kinds of light are in the order of their strength.
+    *_, changed_in_strongest = result.changed.values()
+    return int(changed_in_strongest[photograph].int().argmax())

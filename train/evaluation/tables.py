@@ -1,4 +1,4 @@
-"""Estimates with their intervals, and tables, as text for people."""
+"""Metrics with their 95% intervals, and tables, as text for people."""
 
 import shutil
 import sys
@@ -23,10 +23,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Proportion(Estimate):
-    """Fraction of images for which something is true, with its Wilson interval.
+    """Fraction of images that meet a condition, with its 95% Wilson interval.
 
     Attributes:
-        hits: Number of images for which it is true.
+        hits: Number of images that meet the condition.
         n: Number of images. If it is 0, the fraction is unknown.
     """
 
@@ -38,13 +38,14 @@ class Proportion(Estimate):
 class Table:
     """Table with a title. `str` converts it to Markdown with aligned columns.
 
-    If the terminal is too narrow for all columns, the text has several tables
-    below each other. Each of them begins with the first column.
+    If the terminal is too narrow for all columns, they are divided into several
+    tables below each other. Each of them repeats the first column.
 
     Attributes:
         title: Title above the table. It may be empty.
         header: Titles of the columns.
-        rows: Cells of each row. `as_text` converts them to text.
+        rows: One list of cells for each row. `as_text` converts the cells to
+            text.
     """
 
     title: str
@@ -53,13 +54,13 @@ class Table:
 
     @property
     def known(self) -> "Table":
-        """Return a copy without the columns in which every cell is "-"."""
-        kept = []
+        """Copy of the table without the columns whose cells are all "-", for unknown."""
+        known_columns = []
         for column in range(len(self.header)):
             if any(row[column] != "-" for row in self.rows):
-                kept.append(column)
-        header = [self.header[column] for column in kept]
-        rows = [[row[column] for column in kept] for row in self.rows]
+                known_columns.append(column)
+        header = [self.header[column] for column in known_columns]
+        rows = [[row[column] for column in known_columns] for row in self.rows]
         return Table(self.title, header, rows)
 
     def __str__(self) -> str:
@@ -70,54 +71,55 @@ class Table:
         return "\n\n".join(paragraphs)
 
 
-# Cells of a column, all of the same width: the header, a line, and one per row.
+# Column of a Markdown table: the header, a line of dashes, and a cell for each row.
+# All cells have the same width.
 Column = list[str]
 
 
 def _align(cells: Sequence[str]) -> Column:
-    """Pad the cells of a column to the same width, and add a line below the header."""
+    """Pad the header and the cells of a column to the same width, and underline the header."""
     header, *others = cells
     width = max(map(len, cells))
     return [cell.ljust(width) for cell in (header, "-" * width, *others)]
 
 
 def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
-    """Divide the columns of a table into several tables that fit the terminal.
+    """Divide the columns of a table into several tables that fit the width of the terminal.
 
     Args:
         columns: Columns of a table. The first one has the titles of the rows.
 
     Returns:
-        Columns of each table. Each table begins with the first column. If the
-        output is no terminal, there is one table.
+        One list of columns for each table. Each begins with the first column.
+        If the output is a file, there is one table.
     """
     terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     first, *others = columns
     tables = [[first]]
     for column in others:
         has_other_column = len(tables[-1]) > 1
-        if has_other_column and _width([*tables[-1], column]) > terminal_width:
-            # A new table begins.
+        is_too_wide = _width([*tables[-1], column]) > terminal_width
+        if has_other_column and is_too_wide:
             tables.append([first])
         tables[-1].append(column)
     return tables
 
 
 def _width(columns: Sequence[Column]) -> int:
-    """Count the characters of a line of a table, with its separators."""
+    """Count the characters of a line of a Markdown table, including the separators."""
     return sum(len(column[0]) + 3 for column in columns) + 1
 
 
 def _to_markdown(columns: Sequence[Column]) -> str:
-    """Join columns of padded cells to the lines of a Markdown table."""
+    """Join padded columns to the text of a Markdown table."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
 
 
 def as_text(value: object) -> str:
-    """Write a cell of a table as text.
+    """Convert a cell of a table to text.
 
-    Numbers get thousands separators, and fractions get three significant
-    digits. None becomes an empty text.
+    Integers get thousands separators, such as "1,000". Floats below 1000 get
+    three significant digits. None becomes an empty text.
     """
     match value:
         case None:
@@ -135,7 +137,7 @@ def fraction(hits: int, n: int) -> Proportion:
     """Compute hits / n with its 95% Wilson score interval (Wilson 1927).
 
     Args:
-        hits: Number of images for which something is true.
+        hits: Number of images that meet a condition.
         n: Number of images. If it is 0, the fraction is unknown.
 
     Returns:
@@ -143,7 +145,7 @@ def fraction(hits: int, n: int) -> Proportion:
     """
     if n == 0:
         return Proportion()
-    # This import takes a second.
+    # This import is here because it takes a second.
     from scipy.stats import binomtest
 
     ends = binomtest(hits, n).proportion_ci(method="wilson")
@@ -157,13 +159,13 @@ def fraction(hits: int, n: int) -> Proportion:
 
 
 def format_fraction(proportion: Proportion) -> str:
-    """Write a proportion as text.
+    """Format a fraction of images with its interval.
 
     Args:
         proportion: Fraction of images, as `fraction` returns it.
 
     Returns:
-        Text such as "8 of 40 [10%, 35%]", or "-" without images.
+        Text such as "8 of 40 [10%, 35%]". If there are no images, "-".
     """
     if proportion.n == 0:
         return "-"
@@ -172,15 +174,15 @@ def format_fraction(proportion: Proportion) -> str:
 
 
 def format_interval(estimate: Estimate | None, sign: str = "") -> str:
-    """Write the value of a metric with its interval as text.
+    """Format the value of a metric with its interval.
 
     Args:
-        estimate: Value and interval. None if the metric is not there.
-        sign: "+" to show the sign of positive numbers, too.
+        estimate: Value and interval. None if the metric was not computed.
+        sign: "+" writes positive numbers with a plus sign.
 
     Returns:
-        Text such as "0.500 [0.250, 0.750]". The interval is left out if it is
-        unknown. If the value is unknown, the text is "-".
+        Text such as "0.500 [0.250, 0.750]". If the interval is unknown, only
+        the value. If the value is unknown, "-".
     """
     if estimate is None or estimate.value is None:
         return "-"

@@ -11,7 +11,7 @@ from renderer.errors import InputError
 from scripts.attack import list_parameters, main
 from tests.helpers import bright_or_dark
 from train.commands.attack_meshes import run
-from train.evaluation.relit import PICTURED, RELIT, read_relit
+from train.evaluation.relit import PICTURE_COUNT, RELIT, read_relit
 
 
 def load_bright_or_dark():
@@ -71,7 +71,7 @@ def test_the_tables_count_the_photographs_that_keep_their_class_under_all_slides
 
 def test_pictures_show_the_photograph_and_its_lights(out, photographs):
     scores = read_relit(out)
-    assert 0 < len(scores.pictures) <= PICTURED
+    assert 0 < len(scores.pictures) <= PICTURE_COUNT
     for index, name in scores.pictures.items():
         with Image.open(out / name) as strip:
             pixels = torch.from_numpy(np.array(strip)).permute(2, 0, 1)

@@ -1,13 +1,14 @@
 """Metrics of an evaluation with 95% intervals: recall, false-positive rate, AUC and top-1.
 
-A `Pool` holds predictions that are scored together and computes their
-`Metrics`. `Pooled` holds all pools of one evaluation: the pool of all images,
-and those of each label, source, mesh and class. Below them are the statistics
-that they use: the bootstrap, the AUC, the recall at a given false-positive rate,
-and the means over classes.
+A `Pool` is a set of predictions that are scored together. It computes their
+`Metrics`. `Pooled` has all pools of one evaluation: the pool of all images, and
+the pools of each label, source, mesh and class. The functions below them compute
+the statistics: the bootstrap, the AUC, the recall at a given false-positive
+rate, and means over classes.
 
-A label is the name of a positive class. For a prediction about a label, an
-image is positive if it shows this class, and negative otherwise.
+A label is the name of a positive class. A prediction scores how well an image
+fits a label. The image is a positive if it shows this class. Otherwise it is a
+negative.
 """
 
 import fractions
@@ -22,24 +23,30 @@ import numpy as np
 from train.evaluation.scores.predictions import Prediction
 from train.evaluation.tables import Estimate, Proportion, fraction
 
-# False-positive rates at which recall is reported. They are decimal strings,
-# because `thresholds` needs exact numbers.
+# False-positive rates at which the recall is reported. Decimal strings are exact,
+# while a float such as 0.1 is not.
 RATES = ("0.05", "0.10", "0.20")
-# Names of the metrics that `auc_and_recalls` computes, in its order.
-RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
-# Names of the metrics that `Pool` computes only if it has thresholds: the
-# recall and the false-positive rate at these thresholds.
+# Names of the metrics that depend on the ranking of the images, in the order in which
+# `auc_and_recalls` returns them.
+ROC_METRICS = ("auc", *(f"recall_at/{rate}" for rate in RATES))
+# Names of the metrics that need a threshold on the log-odds of each label.
 AT_THRESHOLD: tuple[str, ...] = ("recall_at_threshold", "false_positive_rate_at_threshold")
-# Names of the metrics among all classes of the network, and the highest rank of
-# the true class that counts. They are means over the classes of the images.
+# Top-1 and top-5 accuracy among all classes of the network, as means over classes.
+# The value is the largest rank of the true class that counts as correct.
 TOP_RANKS = {"class_top1": 1, "class_top5": 5}
-# Names of the metrics that `Pool.outcomes` computes as fractions of images. The
-# table of an evaluation shows them in this order.
-COUNTED: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
-# Names of the metrics that the tables of reports show, in this order. A slash
-# separates the keys of nested entries of summary.json.
-METRICS: tuple[str, ...] = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD, *TOP_RANKS)
-# Titles by which `metric_title` replaces these names in tables.
+# Names of the metrics that are fractions of images. The table of an evaluation shows
+# them in this order.
+FRACTION_METRICS: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
+# Names of the metrics that reports show, in this order. "recall_at/0.05" is the entry
+# "0.05" of the entry "recall_at" in summary.json.
+METRICS: tuple[str, ...] = (
+    "recall",
+    "false_positive_rate",
+    *ROC_METRICS,
+    *AT_THRESHOLD,
+    *TOP_RANKS,
+)
+# For each name of a metric, its title in tables.
 TITLES = {
     "recall": "recall",
     "top5": "top-5",
@@ -51,20 +58,21 @@ TITLES = {
     "class_top5": "top-5, mean over classes",
 }
 
-# Operating points: for each label, the log-odds above which an image counts as
-# a detection.
+# For each label, its operating point: the threshold on the log-odds above which an
+# image counts as a detection.
 Thresholds = Mapping[str, float]
 
 
-# Number of replicates that `bootstrap` draws for an interval.
+# Number of random resamples (replicates) of the images from which the bootstrap
+# computes an interval.
 REPLICATES = 2000
-# Number of replicates that `bootstrap` computes at a time, which limits the
-# memory.
+# Number of bootstrap replicates that are computed at once. A smaller number needs
+# less memory.
 BLOCK = 250
-# Random seeds: `bootstrap` draws images with IMAGES, `replicate_difference`
-# draws runs with RUNS. The seeds differ, so that both are drawn independently.
-IMAGES = 0
-RUNS = 1
+# Images and training runs are drawn with different random seeds, so that the draws
+# are independent.
+IMAGE_SEED = 0
+RUN_SEED = 1
 
 
 @dataclass(frozen=True)
@@ -87,35 +95,39 @@ class AreaUnderCurve(Estimate):
 
     @property
     def has_repeated_objects(self) -> bool:
-        """Whether an object has several images, so that its interval is over objects, too."""
-        positives_repeat = self.positive_objects != self.positives
-        negatives_repeat = self.negative_objects != self.negatives
-        return positives_repeat or negatives_repeat
+        """Whether some object is shown in several images.
+
+        The bootstrap of the interval then draws objects as well as images.
+        """
+        is_in_positives = self.positive_objects != self.positives
+        is_in_negatives = self.negative_objects != self.negatives
+        return is_in_positives or is_in_negatives
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """Metrics of a `Pool`, in the order of summary.json.
+    """Metrics of predictions that are scored together, in the order of summary.json.
+
+    A positive is an image of the positive class. A negative is any other image.
 
     Attributes:
         n: Number of images, positives and negatives together.
-        recall: Fraction of the positives that are predicted as the class under
-            study.
-        top5: Fraction of the positives whose class is among the five most
-            probable classes.
-        false_positive_rate: Fraction of the negatives that are predicted as the
-            positive class.
+        recall: Fraction of the positives whose predicted class is the positive
+            class.
+        top5: Fraction of the positives for which the positive class is among
+            the five most probable classes.
+        false_positive_rate: Fraction of the negatives whose predicted class is
+            the positive class.
         recall_at_threshold: Fraction of the positives whose log-odds exceed the
             threshold. None without a threshold.
         false_positive_rate_at_threshold: Fraction of the negatives whose
             log-odds exceed the threshold. None without a threshold.
         auc: Area under the ROC curve.
         recall_at: Recall at each false-positive rate in `RATES`.
-        class_top1: Fraction of the images whose class is the most probable of
-            all classes of the network, as a mean over the classes. Images of
-            classes that the network lacks do not count. None if there are no
-            others.
-        class_top5: The same for the five most probable classes.
+        class_top1: Top-1 accuracy among all classes of the network, as a mean
+            over the classes of the images. Images of classes that the network
+            lacks do not count. None if all images are of such classes.
+        class_top5: Top-5 accuracy, computed like `class_top1`.
     """
 
     n: int
@@ -130,21 +142,20 @@ class Metrics:
     class_top5: Estimate | None = None
 
     def find(self, name: str) -> Estimate | None:
-        """Return the metric with a name.
+        """Return a metric by its name.
 
         Args:
-            name: Name in `METRICS`, or "top5".
+            name: Name of the metric in `METRICS`, such as "auc" or
+                "recall_at/0.05", or "top5".
 
         Returns:
-            Metric with this name. None if it needs a threshold and there is
-            none.
+            The metric. None if it was not computed, such as a recall at a
+            threshold without a threshold.
         """
-        # The name of a recall ends with a rate, as in "recall_at/0.05". Other
-        # names are names of fields.
-        field_name, _, rate = name.partition("/")
+        attribute, _, rate = name.partition("/")
         if rate:
             return self.recall_at[rate]
-        return getattr(self, field_name)
+        return getattr(self, attribute)
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the metrics to entries of summary.json. Metrics that are None are left out."""
@@ -152,19 +163,24 @@ class Metrics:
         return {name: entry for name, entry in entries.items() if entry is not None}
 
 
-class Ranked(NamedTuple):
-    """Positive and negative predictions that a ROC curve separates by their log-odds."""
+class RocPredictions(NamedTuple):
+    """Predictions whose log-odds give a ROC curve.
+
+    Attributes:
+        positives: Predictions for images of the positive class.
+        negatives: Predictions for other images.
+    """
 
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
 
 
 class Outcome(NamedTuple):
-    """Predictions of which a fraction is reported as a metric.
+    """Predictions, and which of them are hits. A metric is the fraction of hits.
 
     Attributes:
-        predictions: Predictions in the denominator of the fraction.
-        hits: Whether each of them also counts in the numerator.
+        predictions: Predictions over which the fraction is taken.
+        hits: Whether each prediction is a hit.
     """
 
     predictions: Sequence[Prediction]
@@ -173,44 +189,44 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Pool:
-    """Predictions that are scored together.
+    """Set of predictions that are scored together.
 
-    With several labels, a photograph has one prediction about each of them. All
-    of these predictions count.
+    With several labels, a photograph has one prediction for each label. All of
+    these predictions count.
 
     Attributes:
-        positives: Predictions for photographs that show the positive class.
+        positives: Predictions for photographs that show the label.
         negatives: Predictions for all other photographs.
-        ranked: Predictions for the ROC curve. They may include other sources or
-            meshes than `positives` and `negatives`.
-        thresholds: Operating point of each label. If it is empty, the metrics
-            in `AT_THRESHOLD` are None.
+        for_roc: Predictions for the ROC curve. They may include photographs of
+            other sources or meshes than `positives` and `negatives` do.
+        thresholds: Threshold on the log-odds of each label. If it is empty, the
+            metrics in `AT_THRESHOLD` are None.
     """
 
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
-    ranked: Ranked
+    for_roc: RocPredictions
     thresholds: Thresholds = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        """Labels of the predictions, such as "orange" or "orange or lemon"."""
+        """Labels of the predictions as text, such as "orange" or "orange or lemon"."""
         predictions = [*self.positives, *self.negatives]
-        # A dictionary keeps each label once, in order of first appearance.
+        # The keys of a dictionary are unique, and keep the order of first appearance.
         return " or ".join(dict.fromkeys(prediction.label for prediction in predictions))
 
     @property
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
-        """Log-odds of the positives (n,) and of the negatives (m,) of the ROC curve."""
-        positives = np.array([prediction.log_odds for prediction in self.ranked.positives])
-        negatives = np.array([prediction.log_odds for prediction in self.ranked.negatives])
+        """Log-odds for the ROC curve: of the positives, shape (n,), and of the negatives, (m,)."""
+        positives = np.array([prediction.log_odds for prediction in self.for_roc.positives])
+        negatives = np.array([prediction.log_odds for prediction in self.for_roc.negatives])
         return positives, negatives
 
     @property
     def outcomes(self) -> dict[str, Outcome]:
-        """Outcomes of the metrics that are fractions of images, by the name of the metric."""
-        # The rank is None if the model does not have the class. It then counts
-        # as worse than any rank.
+        """For each metric that is a fraction of images, which predictions are hits."""
+        # `true_rank` is None if the network lacks the class. No prediction is then a
+        # hit, because infinity is above every rank.
         ranks = [prediction.true_rank or np.inf for prediction in self.positives]
         false_positives = [item.predicted == item.label for item in self.negatives]
         outcomes = {
@@ -225,63 +241,67 @@ class Pool:
         return outcomes
 
     def _above_threshold(self, predictions: Sequence[Prediction]) -> Outcome:
-        """Test which predictions are above their threshold.
+        """Find the predictions whose log-odds exceed the threshold of their label.
 
         Args:
-            predictions: Predictions about labels that have a threshold.
+            predictions: Predictions. Each of their labels has a threshold.
 
         Returns:
-            The predictions. A hit is a prediction whose log-odds exceed the
-            threshold of its label.
+            The predictions. Those above the threshold are hits.
         """
         hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
         return Outcome(predictions, hits)
 
     @cached_property
     def metrics(self) -> Metrics:
-        """Metrics of the pool with their intervals."""
+        """Metrics of the predictions with their 95% intervals."""
         proportions = {}
         for name, outcome in self.outcomes.items():
             proportions[name] = fraction(sum(outcome.hits), len(outcome.hits))
-        auc, *recalls = self._ranked_estimates()
-        tops = self._top_estimates()
+        auc, *recalls = self._roc_estimates()
+        top_accuracies = self._top_estimates()
         auc_with_counts = AreaUnderCurve(
             value=auc.value,
             low=auc.low,
             high=auc.high,
-            positives=len(self.ranked.positives),
-            positive_objects=len(np.unique(_object_indices(self.ranked.positives))),
-            negatives=len(self.ranked.negatives),
-            negative_objects=len(np.unique(_object_indices(self.ranked.negatives))),
+            positives=len(self.for_roc.positives),
+            positive_objects=_count_objects(self.for_roc.positives),
+            negatives=len(self.for_roc.negatives),
+            negative_objects=_count_objects(self.for_roc.negatives),
         )
         return Metrics(
             n=len(self.positives) + len(self.negatives),
             auc=auc_with_counts,
             recall_at=dict(zip(RATES, recalls, strict=True)),
             **proportions,
-            class_top1=tops.get("class_top1"),
-            class_top5=tops.get("class_top5"),
+            class_top1=top_accuracies.get("class_top1"),
+            class_top5=top_accuracies.get("class_top5"),
         )
 
     @cached_property
     def classified(self) -> list[Prediction]:
-        """One prediction for each photograph of a class that the network has."""
-        by_path: dict[PurePosixPath, Prediction] = {}
+        """One prediction for each photograph whose class is a class of the network.
+
+        With several labels, a photograph has several predictions. All of them
+        have the same predicted class, so the first one is taken.
+        """
+        prediction_of_path: dict[PurePosixPath, Prediction] = {}
         for prediction in (*self.positives, *self.negatives):
             if prediction.true_rank is not None:
-                by_path.setdefault(prediction.photograph.path, prediction)
-        return list(by_path.values())
+                prediction_of_path.setdefault(prediction.photograph.path, prediction)
+        return list(prediction_of_path.values())
 
     def _top_estimates(self) -> dict[str, Estimate]:
-        """Compute the metrics in `TOP_RANKS` with their bootstrap intervals.
+        """Compute top-1 and top-5 accuracy with their bootstrap intervals.
 
         Returns:
-            Each metric by name. Empty if no image has a class of the network.
+            "class_top1" and "class_top5". Empty if no photograph shows a class
+            of the network.
         """
         if not self.classified:
             return {}
         values = self._top_statistic(np.ones(len(self.classified)))
-        object_count = len(np.unique(_object_indices(self.classified)))
+        object_count = _count_objects(self.classified)
         estimates = {}
         for name, value, replicates in zip(TOP_RANKS, values, self._top_replicates, strict=True):
             estimates[name] = _estimate_or_wilson(float(value), replicates, object_count)
@@ -289,63 +309,63 @@ class Pool:
 
     @property
     def _top_statistic(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Function that computes the metrics in `TOP_RANKS` of drawn images.
+        """Function that computes top-1 and top-5 accuracy on resampled photographs.
 
-        Its argument says how often each of the n images in `classified` is
-        drawn, shape (..., n). It returns both metrics, shape (2, ...).
+        Its argument is how often each of the n photographs in `classified` is
+        drawn, shape (..., n). It returns the two accuracies, shape (2, ...).
         """
         names = [prediction.photograph.label for prediction in self.classified]
         ranks = np.array([prediction.true_rank for prediction in self.classified])
-        # Whether the true class is among the 1 or the 5 most probable classes,
-        # shape (2, n).
-        hits = np.stack([ranks <= rank for rank in TOP_RANKS.values()])
+        # The first row says which photographs are correct for top-1, the second row
+        # for top-5, shape (2, n).
+        hits = np.stack([ranks <= max_rank for max_rank in TOP_RANKS.values()])
         return partial(class_means, hits, names)
 
     @cached_property
     def _top_replicates(self) -> np.ndarray:
-        """Bootstrap replicates of the metrics in `TOP_RANKS`, shape (2, REPLICATES)."""
+        """Bootstrap replicates of top-1 and of top-5 accuracy, shape (2, REPLICATES)."""
         return bootstrap(self._top_statistic, _object_indices(self.classified))
 
-    def _ranked_estimates(self) -> list[Estimate]:
-        """Compute the metrics in `RANKED` with their bootstrap intervals.
+    def _roc_estimates(self) -> list[Estimate]:
+        """Compute the AUC and the recalls with their bootstrap intervals.
 
         Returns:
-            The AUC, and the recall at each rate in `RATES`, in this order. All
-            are unknown without positives or without negatives.
+            The AUC, followed by the recall at each false-positive rate in
+            `RATES`. All are unknown without positives or without negatives.
         """
-        if not self._can_rank:
-            return [Estimate() for _ in RANKED]
-        estimates = []
+        if not self._has_roc_curve:
+            return [Estimate() for _ in ROC_METRICS]
+        positives, negatives = self.for_roc
+        object_count = min(_count_objects(positives), _count_objects(negatives))
         values = auc_and_recalls(*self.scores)
-        groups = (self.ranked.positives, self.ranked.negatives)
-        object_count = min(len(np.unique(_object_indices(group))) for group in groups)
-        for value, replicates in zip(values, self._ranked_replicates, strict=True):
+        estimates = []
+        for value, replicates in zip(values, self._roc_replicates, strict=True):
             estimates.append(_estimate_or_wilson(float(value), replicates, object_count))
         return estimates
 
     @property
-    def _can_rank(self) -> bool:
-        """Whether the ROC curve has both positives and negatives."""
-        return bool(self.ranked.positives) and bool(self.ranked.negatives)
+    def _has_roc_curve(self) -> bool:
+        """Whether there are both positives and negatives, which a ROC curve needs."""
+        return bool(self.for_roc.positives) and bool(self.for_roc.negatives)
 
     @cached_property
-    def _ranked_replicates(self) -> np.ndarray:
-        """Bootstrap replicates of the four metrics in `RANKED`, shape (4, REPLICATES)."""
+    def _roc_replicates(self) -> np.ndarray:
+        """Bootstrap replicates of the AUC and of the three recalls, shape (4, REPLICATES)."""
         statistic = partial(auc_and_recalls, *self.scores)
-        positive_objects = _object_indices(self.ranked.positives)
-        negative_objects = _object_indices(self.ranked.negatives)
+        positive_objects = _object_indices(self.for_roc.positives)
+        negative_objects = _object_indices(self.for_roc.negatives)
         return bootstrap(statistic, positive_objects, negative_objects)
 
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
-        """Bootstrap replicates of each metric that is known, by name, shape (REPLICATES,) each."""
+        """For each metric that is known, its bootstrap replicates, shape (REPLICATES,)."""
         replicates = {}
         for name, outcome in self.outcomes.items():
             if outcome.hits:
                 statistic = partial(weighted_mean, np.array(outcome.hits))
                 replicates[name] = bootstrap(statistic, _object_indices(outcome.predictions))
-        if self._can_rank:
-            replicates.update(zip(RANKED, self._ranked_replicates, strict=True))
+        if self._has_roc_curve:
+            replicates.update(zip(ROC_METRICS, self._roc_replicates, strict=True))
         if self.classified:
             replicates.update(zip(TOP_RANKS, self._top_replicates, strict=True))
         return replicates
@@ -354,61 +374,69 @@ class Pool:
 def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:
     """Add a 95% interval to the value of a metric.
 
-    The interval is the percentile interval of the bootstrap. If all replicates
-    are equal, the percentile interval has no width. Wilson's interval for a
-    fraction of the objects then replaces it, as if each object had one image.
+    This is the percentile interval of the bootstrap, except if all replicates
+    are equal. The percentile interval would then have no width. It is replaced
+    by Wilson's interval, which treats the value as a fraction of the objects.
 
     Args:
         value: Value of the metric, in [0, 1].
         replicates: Bootstrap replicates of the metric, shape (REPLICATES,).
-        object_count: Number of different objects in the images.
+        object_count: Number of different objects that the images show.
 
     Returns:
         The value with its interval.
     """
-    metric = estimate(value, replicates)
-    if metric.low != metric.high:
-        return metric
+    with_percentiles = estimate(value, replicates)
+    if with_percentiles.low != with_percentiles.high:
+        return with_percentiles
     wilson = fraction(round(value * object_count), object_count)
     assert wilson.low is not None and wilson.high is not None
     return Estimate(value=value, low=min(wilson.low, value), high=max(wilson.high, value))
 
 
 def _object_indices(predictions: Sequence[Prediction]) -> np.ndarray:
-    """Number the objects that the images show, in order of first appearance.
+    """Number the different objects in photographs, in order of first appearance.
 
-    An object is known by its mesh. An image without a known mesh counts as an
-    object of its own.
+    Photographs show the same object if they have the same mesh. A photograph
+    with an unknown mesh counts as a different object.
+
+    Args:
+        predictions: One prediction for each of n photographs.
 
     Returns:
-        Index of the object that each image shows, shape (n,).
+        Number of the object in each photograph, from 0, shape (n,).
     """
-    object_index_by_name: dict[str | PurePosixPath, int] = {}
+    index_of_object: dict[str | PurePosixPath, int] = {}
     object_indices = []
     for prediction in predictions:
         name = prediction.photograph.mesh or prediction.photograph.path
-        next_index = len(object_index_by_name)
-        object_indices.append(object_index_by_name.setdefault(name, next_index))
+        next_index = len(index_of_object)
+        object_indices.append(index_of_object.setdefault(name, next_index))
     return np.array(object_indices)
 
 
+def _count_objects(predictions: Sequence[Prediction]) -> int:
+    """Count the different objects in the photographs of predictions."""
+    return len(np.unique(_object_indices(predictions)))
+
+
 def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
-    """Create the pool of predictions, in which all positives are ranked against all negatives.
+    """Create a pool whose ROC curve compares all of its positives with all of its negatives.
 
     Args:
-        predictions: Predictions about one or several labels.
-        thresholds: Operating point of each label. None omits the metrics in
-            `AT_THRESHOLD`.
+        predictions: Predictions that are scored together.
+        thresholds: Threshold on the log-odds of each label. None omits the
+            metrics in `AT_THRESHOLD`.
 
     Returns:
-        Pool of these predictions.
+        Pool of the predictions.
     """
     positives = [prediction for prediction in predictions if prediction.positive]
     negatives = [prediction for prediction in predictions if not prediction.positive]
     return Pool(
         positives=positives,
         negatives=negatives,
-        ranked=Ranked(positives, negatives),
+        for_roc=RocPredictions(positives, negatives),
         thresholds=thresholds or {},
     )
 
@@ -418,10 +446,11 @@ class Pooled:
     """All pools of one evaluation: of all images, and of each label, source, mesh and class.
 
     Attributes:
-        predictions: Predictions about one or several labels.
-        exclude: Sources whose images count only in `by_source`.
-        thresholds: Operating point of each label. If it is empty, the metrics
-            in `AT_THRESHOLD` are None.
+        predictions: Predictions for one or several labels.
+        exclude: Names of sources that are left out of all pools except
+            `by_source`.
+        thresholds: Threshold on the log-odds of each label. If it is empty, the
+            metrics in `AT_THRESHOLD` are None.
     """
 
     predictions: Sequence[Prediction]
@@ -435,71 +464,76 @@ class Pooled:
 
     @cached_property
     def by_label(self) -> dict[str, Pool]:
-        """Pool of the predictions about each label."""
+        """Pool of the predictions for each label."""
         groups = _group(self._included, lambda prediction: prediction.label)
         return {label: pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
     def by_source(self) -> dict[str, Pool]:
-        """Pool of the images of each source, excluded sources included.
+        """Pool of the images of each source, including excluded sources.
 
-        The positives of a source are ranked against its negatives. A photograph
-        can also name other sources as hard negatives. The positives are ranked
-        against the negatives of these sources as well.
+        The ROC curve compares the positives of a source with its negatives. A
+        positive can name other sources in its `hard_negatives`. The negatives
+        of these sources are added.
         """
         groups = _group(self.predictions, lambda prediction: prediction.photograph.source)
         pools = {}
         for source, group in groups.items():
             source_pool = pool(group, self.thresholds)
             hard_negatives = self._hard_negatives(source_pool.positives, source)
-            ranked = Ranked(
+            for_roc = RocPredictions(
                 positives=source_pool.positives,
                 negatives=[*source_pool.negatives, *hard_negatives],
             )
-            pools[source] = replace(source_pool, ranked=ranked)
+            pools[source] = replace(source_pool, for_roc=for_roc)
         return pools
 
     def _hard_negatives(self, positives: Sequence[Prediction], source: str) -> list[Prediction]:
-        """Find the negatives of all other sources that positives name as hard negatives.
-
-        A positive is ranked only against predictions about its own label.
+        """Find the negatives in the sources that positives name as hard negatives.
 
         Args:
-            positives: Positives of one source.
-            source: Name of this source. Its own negatives are not returned.
+            positives: Positives of one source. The photograph of each may name
+                other sources in `hard_negatives`.
+            source: Name of the source of the positives. Its own negatives are
+                not returned.
+
+        Returns:
+            Negatives from the named sources. Each has the label of a positive
+            that names its source.
         """
-        named_labels_and_sources = set()
+        wanted = set()
         for prediction in positives:
             for other_source in prediction.photograph.hard_negatives:
                 if other_source != source:
-                    named_labels_and_sources.add((prediction.label, other_source))
+                    wanted.add((prediction.label, other_source))
         hard_negatives = []
         for prediction in self.predictions:
             label_and_source = (prediction.label, prediction.photograph.source)
-            if not prediction.positive and label_and_source in named_labels_and_sources:
+            if not prediction.positive and label_and_source in wanted:
                 hard_negatives.append(prediction)
         return hard_negatives
 
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
-        """Pool of the images of each mesh, see `_by_content`."""
+        """Pool of the images of each mesh. Images of an unknown mesh are left out."""
         return self._by_content(lambda prediction: prediction.photograph.mesh)
 
     @cached_property
     def by_class(self) -> dict[str, Pool]:
-        """Pool of the images of each class, see `_by_content`."""
+        """Pool of the images of each class."""
         return self._by_content(lambda prediction: prediction.photograph.label)
 
     def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
-        """Make a pool of the images of each mesh, or of each class.
+        """Make a pool for each mesh, or for each class, that images show.
 
-        For the ROC curve, the images of a positive class are ranked against the
-        negatives of all meshes and classes. Images of other things are ranked
-        against the positives of all meshes and classes.
+        The ROC curve of a positive mesh or class compares its images with all
+        negatives. The ROC curve of a negative mesh or class compares all
+        positives with its images.
 
         Args:
-            name_of: Function that returns the name of the mesh or class that
-                the image of a prediction shows. None if it is unknown.
+            name_of: Function that returns the name of the mesh or class in the
+                image of a prediction. If it returns None, the image is left
+                out.
 
         Returns:
             Pools by the name of the mesh or class.
@@ -508,19 +542,19 @@ class Pooled:
         pools = {}
         for name, group in _group(self._included, name_of).items():
             own_pool = pool(group, self.thresholds)
-            # With the labels orange and lemon, an image of an orange has two
-            # predictions: a positive about orange, and a negative about lemon.
-            # The negative about lemon is left out here. Otherwise the oranges
-            # would be ranked only against predictions for the same oranges.
-            negatives = []
-            for prediction in own_pool.negatives:
-                if prediction.photograph.label not in labels:
-                    negatives.append(prediction)
-            ranked = Ranked(
+            # With the labels orange and lemon, an image of an orange is a positive
+            # for orange and a negative for lemon. Without this condition, the
+            # oranges would be compared only with themselves, as negatives for lemon.
+            negatives = [
+                prediction
+                for prediction in own_pool.negatives
+                if prediction.photograph.label not in labels
+            ]
+            for_roc = RocPredictions(
                 positives=own_pool.positives or self.all.positives,
                 negatives=negatives or self.all.negatives,
             )
-            pools[name] = replace(own_pool, ranked=ranked)
+            pools[name] = replace(own_pool, for_roc=for_roc)
         return pools
 
     @cached_property
@@ -532,12 +566,12 @@ class Pooled:
 def _group(
     predictions: Sequence[Prediction], name_of: Callable[[Prediction], str | None]
 ) -> dict[str, list[Prediction]]:
-    """Group predictions by a name, such as that of their source.
+    """Group predictions by a name, such as the name of their source.
 
     Args:
         predictions: Predictions to group.
-        name_of: Function that returns the name of the group of a prediction. If
-            it returns None, the prediction is left out.
+        name_of: Function from a prediction to the name of its group. If it
+            returns None, the prediction is left out.
 
     Returns:
         Predictions of each group by its name, in alphabetical order of the
@@ -552,81 +586,84 @@ def _group(
 
 
 def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
-    """Evaluate a statistic on bootstrap replicates of objects and images.
+    """Evaluate a statistic on random resamples (bootstrap replicates) of images.
 
-    A group is a sequence of images, such as the positives. For each replicate,
-    as many objects are drawn as the group shows, with replacement. For each
-    drawn object, as many of its images are drawn as it has, again with
-    replacement (Davison and Hinkley 1997, section 3.8). With one image per
-    object, this is the ordinary bootstrap over images. Equal groups get equal
-    draws in every call, so metrics of networks on the same images are paired.
+    Images of the same object are not independent. Each replicate therefore
+    draws objects with replacement, as many as there are. For each drawn object,
+    it draws images of the object with replacement, as many as the object has
+    (Davison and Hinkley 1997, section 3.8). With one image per object, this is
+    the ordinary bootstrap over images.
 
-    The variance of a mean over k objects is too small by a factor of
-    (k - 1) / k. With several objects, the variance over images is counted about
-    twice.
+    The draws depend only on `groups`. Metrics of two networks on the same
+    images are therefore paired: replicate i has the same images for both.
+
+    The interval is approximate. The variance of a mean over k objects is too
+    small by a factor of (k - 1) / k. With several objects, the variance over
+    images is counted about twice.
 
     Args:
         statistic: Function that is evaluated for BLOCK replicates at a time.
-            For each group, it takes how often each replicate draws each image,
-            shape (BLOCK, n). It returns an array of shape (..., BLOCK).
-        *groups: For each group of n ≥ 1 images, the index of the object that
-            each image shows, shape (n,). Objects are numbered from 0 in order
-            of first appearance.
+            Its arguments are one array for each group: how often each replicate
+            draws each image, shape (BLOCK, n). It returns an array of shape
+            (..., BLOCK).
+        *groups: Groups of images that are resampled separately, such as the
+            positives and the negatives. For each group of n ≥ 1 images, the
+            index of the object that each image shows, shape (n,). Objects are
+            numbered from 0 in order of first appearance.
 
     Returns:
-        Statistic of each replicate, shape (..., REPLICATES).
+        Value of the statistic for each replicate, shape (..., REPLICATES).
     """
-    generator = np.random.default_rng(IMAGES)
+    generator = np.random.default_rng(IMAGE_SEED)
     blocks = []
     for _ in range(REPLICATES // BLOCK):
-        draw_counts = [_draw(object_indices, generator) for object_indices in groups]
+        draw_counts = [_draw_images(object_of_image, generator) for object_of_image in groups]
         blocks.append(statistic(*draw_counts))
     return np.concatenate(blocks, axis=-1)
 
 
-def _draw(object_of_image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw the images of BLOCK replicates.
+def _draw_images(object_of_image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Draw the images of BLOCK bootstrap replicates: first objects, then images of each object.
 
     Args:
-        object_of_image: Index of the object that each image shows, shape (n,),
-            as in `bootstrap`.
-        generator: Source of the random numbers.
+        object_of_image: Index of the object that each image shows, shape (n,).
+            Objects are numbered from 0 in order of first appearance.
+        generator: Random number generator.
 
     Returns:
         How often each replicate draws each image, shape (BLOCK, n).
     """
     image_count = len(object_of_image)
-    # Number of images of each object, shape (objects,).
-    object_sizes = np.bincount(object_of_image)
-    object_count = len(object_sizes)
-    # The drawn objects of all replicates, one replicate after the other, and
-    # the replicate that draws each, shape (BLOCK · objects,).
+    images_per_object = np.bincount(object_of_image)
+    object_count = len(images_per_object)
+    # One row for each replicate, flattened to shape (BLOCK · objects,).
     drawn_objects = generator.integers(object_count, size=(BLOCK, object_count)).ravel()
-    replicates = np.arange(BLOCK).repeat(object_count)
+    replicate_of_draw = np.arange(BLOCK).repeat(object_count)
     if object_count == image_count:
-        # Each object has one image, and image i shows object i.
+        # Each object has a single image, and image i shows object i.
         drawn_images = drawn_objects
     else:
-        drawn_sizes = object_sizes[drawn_objects]
-        # The images in the order of their objects, and the position at which
-        # the images of each object start.
+        drawn_sizes = images_per_object[drawn_objects]
+        # `images_by_object` lists the images of object 0, then of object 1, and so on.
+        # `first_position` is the position in this list at which each object starts.
         images_by_object = object_of_image.argsort(kind="stable")
-        first_position = object_sizes.cumsum() - object_sizes
-        # The following arrays have one entry for each drawn image.
+        first_position = images_per_object.cumsum() - images_per_object
+        # `repeat` gives each drawn object one entry for each of its images.
         position_in_object = generator.integers(drawn_sizes.repeat(drawn_sizes))
         object_start = first_position[drawn_objects].repeat(drawn_sizes)
         drawn_images = images_by_object[object_start + position_in_object]
-        replicates = replicates.repeat(drawn_sizes)
-    # Each pair of a replicate and an image has an index of its own.
-    pairs = replicates * image_count + drawn_images
-    draw_counts = np.bincount(pairs, minlength=BLOCK * image_count)
+        replicate_of_draw = replicate_of_draw.repeat(drawn_sizes)
+    # Each pair of a replicate and an image has its own number, so that `bincount`
+    # counts how often the pair is drawn.
+    pair_numbers = replicate_of_draw * image_count + drawn_images
+    draw_counts = np.bincount(pair_numbers, minlength=BLOCK * image_count)
     return draw_counts.reshape(BLOCK, image_count)
 
 
 def weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Compute the mean of values of which each counts several times.
+    """Compute the mean of values, each counted several times.
 
-    With fixed `values`, this is a statistic for `bootstrap`.
+    `functools.partial(weighted_mean, values)` is a statistic for `bootstrap`.
 
     Args:
         values: Values, shape (n,).
@@ -639,37 +676,39 @@ def weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> np.ndarray:
-    """Compute the mean over classes of the fraction of hits in each class.
+    """Compute the fraction of hits in each class, and average it over the classes.
 
-    An image weighs 1 / n if its class has n images. The mean of all images with
-    these weights is the mean over classes. With fixed `hits` and `names`, this
-    is a statistic for `bootstrap`, whose replicates vary with the classes of
-    the drawn objects, too.
+    This is the mean over all images if an image of a class with n images has
+    the weight 1 / n. `functools.partial(class_means, hits, names)` is a
+    statistic for `bootstrap`.
 
     Args:
-        hits: Whether each image is a hit in each of K ways, shape (K, n).
-        names: Name of the class of each image.
+        hits: Whether each image is a hit, by K definitions of a hit such as
+            top-1 and top-5. One row for each definition, shape (K, n).
+        names: Name of the class of each of the n images.
         counts: How often each image counts, shape (..., n).
 
     Returns:
-        Mean over classes, shape (K, ...).
+        Mean over classes for each definition of a hit, shape (K, ...).
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
     weights = 1 / class_sizes[class_of_image]
-    total = counts @ weights
-    return np.stack([counts @ (weights * row) / total for row in hits])
+    total_weight = counts @ weights
+    return np.stack([counts @ (weights * row) / total_weight for row in hits])
 
 
 def estimate(value: float, replicates: np.ndarray) -> Estimate:
-    """Add the 95% percentile interval to the value of a metric.
+    """Add the 95% percentile interval of the bootstrap to the value of a metric.
 
-    This is the interval of Efron and Tibshirani (1993), chapter 13. It stays
-    within the range of the metric. Their BCa interval would be undefined if all
-    replicates are equal, as at a recall of 1.
+    The interval is described by Efron and Tibshirani (1993), chapter 13. Unlike
+    an interval of standard errors, it stays within the range of the metric.
+    Unlike their BCa interval, it is defined if all replicates are equal, as at
+    a recall of 1.
 
     Args:
-        value: Value of the metric for all images.
-        replicates: Bootstrap replicates of the metric, shape (REPLICATES,).
+        value: Value of the metric on all images.
+        replicates: Values of the metric on bootstrap replicates, shape
+            (REPLICATES,).
 
     Returns:
         Value with its interval.
@@ -679,23 +718,25 @@ def estimate(value: float, replicates: np.ndarray) -> Estimate:
 
 
 def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np.ndarray:
-    """Compute how much the mean metric of two groups of runs differs in each replicate.
+    """Compute bootstrap replicates of the difference between two groups of training runs.
 
-    In each replicate, as many runs are drawn as a group has, with replacement.
+    A group has runs with different random seeds. Each replicate also resamples
+    the runs: it draws as many runs as the group has, with replacement, and
+    averages the metric over them.
 
     Args:
-        one: Replicates of the metric for each run of the first group, shape
-            (S, REPLICATES).
-        other: Replicates of the metric for each run of the second group, shape
-            (T, REPLICATES).
-        paired: If True, S and T are equal, and run s of the first group is
-            drawn together with run s of the second group.
+        one: Bootstrap replicates of the metric of each of the S runs of the
+            first group, shape (S, REPLICATES).
+        other: Bootstrap replicates of the metric of each of the T runs of the
+            second group, shape (T, REPLICATES).
+        paired: Whether run i of the first group and run i of the second group
+            are drawn together. S and T must then be equal.
 
     Returns:
-        Mean of the first group minus mean of the second group, shape
-        (REPLICATES,).
+        Mean of the first group minus mean of the second group in each
+        replicate, shape (REPLICATES,).
     """
-    generator = np.random.default_rng(RUNS)
+    generator = np.random.default_rng(RUN_SEED)
     if paired:
         return _mean_of_drawn_runs(one - other, generator)
     mean_of_one = _mean_of_drawn_runs(one, generator)
@@ -703,61 +744,65 @@ def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np
     return mean_of_one - mean_of_other
 
 
-def _mean_of_drawn_runs(runs: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw S runs in each replicate, with replacement, and average them.
+def _mean_of_drawn_runs(values: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Resample training runs in each bootstrap replicate, and average a metric over them.
 
     Args:
-        runs: Replicates for each run, shape (S, REPLICATES).
-        generator: Source of the random numbers.
+        values: Metric of each of S runs in each replicate, shape
+            (S, REPLICATES).
+        generator: Random number generator, which draws S runs with replacement
+            for each replicate.
 
     Returns:
-        Mean of the drawn runs in each replicate, shape (REPLICATES,).
+        Mean over the drawn runs in each replicate, shape (REPLICATES,).
     """
-    drawn_runs = generator.integers(len(runs), size=runs.shape)
-    return np.take_along_axis(runs, drawn_runs, axis=0).mean(axis=0)
+    drawn_runs = generator.integers(len(values), size=values.shape)
+    return np.take_along_axis(values, drawn_runs, axis=0).mean(axis=0)
 
 
 def auc_and_recalls(
     positives: np.ndarray,
     negatives: np.ndarray,
-    drawn: np.ndarray | None = None,
-    others: np.ndarray | None = None,
+    positive_counts: np.ndarray | None = None,
+    negative_counts: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Compute the metrics in `RANKED`: the AUC, and the recall at each rate in `RATES`.
+    """Compute the AUC, and the recall at each false-positive rate in `RATES`.
 
-    The AUC is the probability that a positive scores above a negative, with
-    ties counted half (Mann and Whitney 1947). The recall is the fraction of the
-    positives that score above the threshold of `thresholds`. A positive at the
-    threshold is missed.
+    The AUC is the probability that a random positive has a higher score than a
+    random negative. A tie counts half (Mann and Whitney 1947). The recall is the
+    fraction of the positives that score above the threshold for a
+    false-positive rate. A positive at the threshold counts as missed.
 
     Args:
         positives: Scores of the positives, shape (n,).
         negatives: Scores of the negatives, shape (m,).
-        drawn: How often each positive counts, shape (..., n). None counts each
-            once.
-        others: How often each negative counts, shape (..., m). None counts each
-            once.
+        positive_counts: How often each positive counts, shape (..., n). None
+            counts each once.
+        negative_counts: How often each negative counts, shape (..., m). None
+            counts each once.
 
     Returns:
-        AUC and recalls, shape (4, ...).
+        AUC and three recalls, shape (4, ...).
     """
-    positive_counts = np.ones(len(positives), int) if drawn is None else drawn
-    negative_counts = np.ones(len(negatives), int) if others is None else others
+    if positive_counts is None:
+        positive_counts = np.ones(len(positives), int)
+    if negative_counts is None:
+        negative_counts = np.ones(len(negatives), int)
     positive_total = positive_counts.sum(axis=-1)
 
     order = negatives.argsort()
     sorted_negatives = negatives[order]
-    # Entry i is the number of negatives among the i lowest scores, for i from 0
-    # to m, shape (..., m + 1).
-    cumulative = np.insert(negative_counts[..., order].cumsum(axis=-1), 0, 0, axis=-1)
-    negative_total = cumulative[..., -1]
-    # Number of negatives that score below each positive, without and with ties,
-    # shape (..., n).
-    below = cumulative[..., sorted_negatives.searchsorted(positives, "left")]
-    below_or_tied = cumulative[..., sorted_negatives.searchsorted(positives, "right")]
-    # A negative below the positive counts in both sums, a tie in one of them.
-    wins = (positive_counts * below).sum(axis=-1)
-    wins_and_ties = (positive_counts * below_or_tied).sum(axis=-1)
+    # Entry i of `counts_below` is how often the negatives with the i lowest scores
+    # count together, for i from 0 to m, shape (..., m + 1).
+    counts_below = np.insert(negative_counts[..., order].cumsum(axis=-1), 0, 0, axis=-1)
+    negative_total = counts_below[..., -1]
+    # Number of negatives with a lower score than each positive, shape (..., n).
+    lower = counts_below[..., sorted_negatives.searchsorted(positives, "left")]
+    # Number of negatives with a lower or an equal score.
+    lower_or_equal = counts_below[..., sorted_negatives.searchsorted(positives, "right")]
+    wins = (positive_counts * lower).sum(axis=-1)
+    wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)
+    # The mean of both numbers counts a tie half.
     auc = (wins + wins_and_ties) / (2 * positive_total * negative_total)
 
     recalls = []
@@ -774,33 +819,32 @@ def thresholds(
 ) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
 
-    The threshold is the lowest of the scores of the negatives that is high
-    enough: at most the given fraction of the negatives score above it. With the
-    rate 0.10 and 20 negatives, at most 2 score above the threshold.
+    The threshold is the score of a negative. It is the lowest such score that
+    at most the given fraction of the negatives exceed. With the rate 0.10 and
+    20 negatives, at most 2 negatives exceed the threshold.
 
     Args:
         negatives: Scores of the negatives, shape (m,).
         counts: How often each negative counts, shape (..., m).
-        rates: False-positive rates as decimal strings, which keeps them exact.
+        rates: False-positive rates as decimal strings, which are exact.
 
     Returns:
-        An array of thresholds for each rate, shape (...) each.
+        For each rate, an array of thresholds of shape (...).
     """
     order = negatives.argsort()
     sorted_negatives = negatives[order]
-    # Entry i is the number of negatives among the i + 1 lowest scores, shape
-    # (..., m).
-    cumulative = counts[..., order].cumsum(axis=-1)
-    total = cumulative[..., -1]
+    # Entry i is how often the negatives with the i + 1 lowest scores count together,
+    # shape (..., m).
+    counts_up_to = counts[..., order].cumsum(axis=-1)
+    total = counts_up_to[..., -1]
     thresholds_by_rate = []
     for rate in rates:
-        # Floating-point products such as 0.29 * 100 can fall below the whole
-        # number.
+        # With floats, 0.29 * 100 would be less than 29 and be rounded down to 28.
         exact_rate = fractions.Fraction(rate)
-        may_exceed = exact_rate.numerator * total // exact_rate.denominator
-        must_not_exceed = total - may_exceed
-        # Index of the lowest score that at most `may_exceed` negatives exceed.
-        index = (cumulative < must_not_exceed[..., None]).sum(axis=-1)
+        allowed_above = exact_rate.numerator * total // exact_rate.denominator
+        needed_up_to = total - allowed_above
+        # The index is the number of scores that too many negatives exceed.
+        index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
         thresholds_by_rate.append(sorted_negatives[index])
     return thresholds_by_rate
 
@@ -809,11 +853,11 @@ def roc_curve(
     positives: np.ndarray,
     negatives: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the ROC curve, from (0, 0) to (1, 1).
+    """Compute the points of the ROC curve, from (0, 0) to (1, 1).
 
-    An image is predicted as positive if its score exceeds the threshold. The
-    curve has one point per distinct score, and a last one at minus infinity,
-    which all scores exceed.
+    An image counts as detected if its score exceeds a threshold. Each distinct
+    score is the threshold of one point of the curve. The last point has the
+    threshold minus infinity, which all scores exceed.
 
     Args:
         positives: Scores of the positives, shape (n,).
@@ -826,87 +870,97 @@ def roc_curve(
         - the threshold, in descending order.
     """
     distinct_scores = np.unique([*positives, *negatives])
-    cutoffs = np.append(distinct_scores[::-1], -np.inf)
-    false_positive_rate = _fraction_above(negatives, cutoffs)
-    recall = _fraction_above(positives, cutoffs)
-    return false_positive_rate, recall, cutoffs
+    descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
+    false_positive_rate = _fraction_above(negatives, descending_thresholds)
+    recall = _fraction_above(positives, descending_thresholds)
+    return false_positive_rate, recall, descending_thresholds
 
 
-def _fraction_above(scores: np.ndarray, cutoffs: np.ndarray) -> np.ndarray:
-    """Compute the fraction of the scores that exceed each cutoff.
+def _fraction_above(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """Compute the fraction of the scores that exceed each threshold.
 
     Args:
         scores: Scores, shape (n,).
-        cutoffs: Cutoffs, shape (c,).
+        thresholds: Thresholds, shape (k,).
 
     Returns:
-        Fraction for each cutoff, in [0, 1], shape (c,).
+        Fraction for each threshold, in [0, 1], shape (k,).
     """
-    at_or_below = np.sort(scores).searchsorted(cutoffs, "right")
-    return (len(scores) - at_or_below) / len(scores)
+    count_at_or_below = np.sort(scores).searchsorted(thresholds, "right")
+    return (len(scores) - count_at_or_below) / len(scores)
 
 
 def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return the entry of a metric, or an empty dictionary if there is none.
+    """Find the entry of a metric in the content of a JSON file.
 
     The metric "recall_at/0.05" is summary["recall_at"]["0.05"] in summary.json,
     and summary["recall_at/0.05"] in the file of a published network.
+
+    Args:
+        summary: Content of the file.
+        name: Name of the metric.
+
+    Returns:
+        Entry of the metric. An empty dictionary if the file lacks the metric.
     """
+    if name in summary:
+        return summary[name] or {}
     entry: Any = summary
     for key in name.split("/"):
-        # An entry that is missing is empty, and so are all entries below it.
         entry = entry.get(key, {})
-    return entry or summary.get(name, {})
+    return entry
 
 
 def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
-    """Read a metric from summary.json.
+    """Read a metric from the content of summary.json.
 
     Args:
-        summary: Contents of summary.json, or the entry of one label, source or
-            mesh below "by_label", "by_source" or "by_mesh".
-        name: Name in `METRICS`, or "top5".
+        summary: Content of the file, or an entry of its dictionaries
+            "by_label", "by_source" and "by_mesh".
+        name: Name of the metric in `METRICS`, such as "auc" or
+            "recall_at/0.05", or "top5".
 
     Returns:
-        Metric with its counts, if the file has them. None if the file lacks the
-        metric.
+        Metric with its interval, and with the numbers of images if the file has
+        them. None if the file lacks the metric.
 
     Raises:
-        KeyError, TypeError, ValueError: If the entry is damaged.
+        KeyError, TypeError, ValueError: If the entry of the metric is damaged.
     """
     entry = _find_entry(summary, name)
     if not entry:
         return None
-    ends: dict[str, float | None] = dict.fromkeys(("value", "low", "high"))
+    numbers: dict[str, float | None] = dict.fromkeys(("value", "low", "high"))
     if entry.get("value") is not None:
-        ends = {end: float(entry[end]) for end in ends}
+        numbers = {key: float(entry[key]) for key in numbers}
     if "hits" in entry:
-        return Proportion(**ends, hits=entry["hits"], n=entry["n"])
+        return Proportion(**numbers, hits=entry["hits"], n=entry["n"])
     if "positives" in entry:
         positives = entry["positives"]
         negatives = entry["negatives"]
-        # Files of older versions lack the numbers of objects.
+        # Older versions of the library did not write the numbers of objects.
         return AreaUnderCurve(
-            **ends,
+            **numbers,
             positives=positives,
             positive_objects=entry.get("positive_objects", positives),
             negatives=negatives,
             negative_objects=entry.get("negative_objects", negatives),
         )
-    return Estimate(**ends)
+    return Estimate(**numbers)
 
 
 def metric_title(name: str) -> str:
     """Return the title of a metric in tables.
 
     Args:
-        name: Name in `METRICS`, or "top5".
+        name: Name of the metric in `METRICS`, such as "auc" or
+            "recall_at/0.10", or "top5".
 
     Returns:
         Title such as "AUC" or "recall at 10% FPR".
     """
     if name in TITLES:
         return TITLES[name]
-    # The name is one of a recall, such as "recall_at/0.10".
+    # All other names have the form "recall_at/RATE".
     _, _, rate = name.partition("/")
     return f"recall at {float(rate):.0%} FPR"

@@ -1,4 +1,8 @@
-"""A model's predictions for photographs, and the table predictions.csv."""
+"""Predictions of a model for photographs, and the table predictions.csv.
+
+A label is the name of a positive class. A model has one prediction for each pair
+of a photograph and a label.
+"""
 
 import csv
 import hashlib
@@ -29,34 +33,33 @@ from train.data.photographs import (
 )
 from train.settings import label_names
 
-# Name of the file in the folder of an evaluation.
+# Name of the table of predictions in the folder of an evaluation.
 PREDICTIONS = "predictions.csv"
-# Number of images that `compute_logits` gives to the model at a time.
+# Number of images for which the model computes logits in one call.
 BATCH = 256
-# A module or a function from images to logits.
+# A PyTorch module, or a function, that maps images to logits.
 Model = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction for a photograph, and its score for one positive class.
+    """Prediction of a model for a photograph, and its score for one positive class.
 
-    Probabilities are in [0, 1]. Ranks order the classes of the model by their
-    logits. The predicted class has rank 1.
+    Probabilities are in [0, 1]. The class with the highest logit has rank 1.
 
     Attributes:
         photograph: The photograph.
-        label: The positive class, a class of the model.
-        predicted: Predicted class.
+        label: Name of the positive class, which is a class of the model.
+        predicted: Name of the predicted class.
         probability: Probability of the predicted class.
-        true_probability: Probability of the class of the photograph. None if
-            the model does not have this class.
-        true_rank: Rank of the class of the photograph. None if the model does
-            not have this class.
+        true_probability: Probability of the class that the photograph shows.
+            None if the model does not have this class.
+        true_rank: Rank of the class that the photograph shows. None if the
+            model does not have this class.
         label_probability: Probability of the positive class.
         label_rank: Rank of the positive class.
-        log_odds: Log-odds of the positive class against all other classes. ROC
-            curves rank photographs by them.
+        log_odds: Log-odds of the positive class against all other classes,
+            which are the scores for ROC curves.
     """
 
     photograph: Photograph
@@ -81,14 +84,16 @@ class FolderPredictions:
 
     Attributes:
         folder: Folder of the photographs.
-        predictions: Predictions for each positive class, one class after the
-            other. The predictions for one class are in the order of the images.
-        images: Photographs, uint8 sRGB, shape (N, 3, size, size).
-        labels: Positive classes.
+        predictions: Predictions of all photographs for the first positive
+            class, then for the next one, and so on. Those for one class are in
+            the order of `images`.
+        images: Pixels of the photographs, uint8 sRGB, shape
+            (N, 3, size, size).
+        labels: Names of the positive classes.
         unreadable: Paths of the photographs that could not be read.
         left_out: Paths of the files whose type is not supported.
-        images_hash: Hash of the labels and the photographs. It is equal where
-            the metrics of two networks can be compared.
+        images_hash: Hash of the labels and the photographs. If it is equal for
+            two networks, their metrics can be compared.
     """
 
     folder: Path
@@ -101,23 +106,24 @@ class FolderPredictions:
 
     @property
     def size(self) -> int:
-        """Pixels per side of the images that the model was shown."""
+        """Pixels per side of the images that the model classified."""
         return self.images.shape[-1]
 
     @property
     def photographs(self) -> list[Prediction]:
-        """One prediction for each photograph: the prediction for the first label."""
+        """One prediction for each photograph: the one for the first positive class."""
         return self.predictions[: len(self.images)]
 
 
 @dataclass
 class Predictor:
-    """A model that predicts the classes of photographs.
+    """Model that predicts the classes of photographs.
 
     Attributes:
-        model: Module or function from images (N, 3, size, size), float32 sRGB
-            in [0, 1], to logits (N, len(classes)). A module is called in eval
-            mode. Its mode is restored afterwards.
+        model: Module or function that maps images to logits. The images are
+            float32 sRGB in [0, 1], shape (N, 3, size, size). The logits have
+            the shape (N, len(classes)). A module is called in eval mode. Its
+            mode is restored afterwards.
         classes: Names of the classes of the model.
         size: Pixels per side of the images.
         device: Device of the model.
@@ -150,11 +156,12 @@ class Predictor:
         Args:
             folder: Folder of photographs, as `find_photographs` takes it.
             label: Positive class, or a list of several.
-            skip_unreadable: Whether to leave out photographs that cannot be
-                read. Otherwise they raise InputError.
+            skip_unreadable: Whether photographs that cannot be read are left
+                out. If False, they raise an InputError.
 
         Returns:
-            Predictions for each positive class, with the photographs.
+            Predictions for each photograph and positive class, with the pixels
+            of the photographs.
 
         Raises:
             InputError: If the folder or a photograph cannot be used (see
@@ -183,12 +190,13 @@ class Predictor:
 
 
 def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
-    """Compute the SHA-256 of the positive classes and the photographs.
+    """Hash the positive classes and the photographs with SHA-256.
 
     Args:
         folder: Folder of the photographs.
-        photographs: Photographs, whose fields and bytes are hashed.
-        labels: Positive classes.
+        photographs: Photographs. Their attributes and the bytes of their files
+            are hashed.
+        labels: Names of the positive classes.
     """
     digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
@@ -252,25 +260,24 @@ def rank_classes(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[Prediction]:
-    """Convert logits to probabilities, ranks and log-odds.
+    """Convert logits to predicted classes with their probabilities, ranks and log-odds.
 
     Args:
-        photographs: The N photographs.
+        photographs: N photographs.
         logits: Logits of the photographs, shape (N, C).
         classes: Names of the C classes of the model.
-        labels: Positive classes, all of them classes of the model.
+        labels: Names of the positive classes, which are classes of the model.
 
     Returns:
-        Predictions of all photographs for the first label, then for the next
-        one, and so on.
+        Predictions of all photographs for the first positive class, then for
+        the next one, and so on.
     """
     logits = logits.double()
     probabilities = logits.softmax(dim=1).tolist()
-    # Ranks come from the logits, whose order survives if probabilities round to
-    # 0. Of classes with equal logits, the first one has the lower rank.
-    # `class_at_rank` has the index of the class at each place, and `ranks` the place
-    # of each class, from 1. Both have shape (N, C).
+    # Classes are sorted by logits, because small probabilities may all round to 0.
+    # Column k of `class_at_rank` has the index of the class with rank k + 1.
     class_at_rank = logits.argsort(dim=1, descending=True, stable=True)
+    # The inverse permutation has the rank of each class, from 1, shape (N, C).
     ranks = (class_at_rank.argsort(dim=1) + 1).tolist()
     predicted = class_at_rank[:, 0].tolist()
 
@@ -301,13 +308,13 @@ def rank_classes(
 
 
 def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
-    """Group predictions by the positive class that they are about.
+    """Group predictions by their positive class.
 
     Args:
-        predictions: Predictions about one or several positive classes.
+        predictions: Predictions for one or several positive classes.
 
     Returns:
-        Predictions by class. The order of the predictions is kept.
+        For each positive class, its predictions in the given order.
     """
     groups: dict[str, list[Prediction]] = {}
     for prediction in predictions:
@@ -316,21 +323,21 @@ def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
 
 
 def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
-    """Write predictions.csv, with a row for each photograph.
+    """Write predictions to the table predictions.csv, which has a row for each photograph.
 
     The columns path, label, source, hard_negatives, mesh, predicted,
-    probability, true_probability and true_rank hold what is the same for all
-    positive classes. Each positive class, such as orange, adds the columns
-    orange_probability, orange_rank and orange_log_odds. None becomes an empty
-    cell.
+    probability, true_probability and true_rank do not depend on the positive
+    class. For each positive class, such as orange, there are the columns
+    orange_probability, orange_rank and orange_log_odds. The cell of a value
+    that is None is empty.
 
     Args:
-        path: Path of the file.
-        predictions: Predictions of the same photographs for each positive
-            class, one class after the other.
+        path: Path of the table.
+        predictions: Predictions of all photographs for the first positive
+            class, then for the next one, and so on.
     """
-    predictions_of_label = by_label(predictions).values()
-    rows = [_to_row(of_photograph) for of_photograph in zip(*predictions_of_label, strict=True)]
+    predictions_by_class = by_label(predictions).values()
+    rows = [_to_row(predictions) for predictions in zip(*predictions_by_class, strict=True)]
     table = io.StringIO()
     writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -339,13 +346,13 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
 
 
 def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
-    """Make the row of a photograph in predictions.csv.
+    """Convert the predictions for one photograph to a row of predictions.csv.
 
     Args:
         predictions: Predictions for the photograph, one for each positive class.
 
     Returns:
-        Cells by the name of the column, see `write_predictions`.
+        Cell for each name of a column, as `write_predictions` lists them.
     """
     photograph = predictions[0].photograph
     row: dict[str, object] = {
@@ -368,17 +375,18 @@ def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
 
 
 def read_predictions(path: Path, label: Label) -> list[Prediction]:
-    """Read predictions that `write_predictions` wrote.
+    """Read the table predictions.csv, which `write_predictions` wrote.
 
     Args:
-        path: Path of predictions.csv.
+        path: Path of the table.
         label: Positive class, or a list of several.
 
     Returns:
-        Predictions for each positive class, one class after the other.
+        Predictions of all photographs for the first positive class, then for
+        the next one, and so on.
 
     Raises:
-        InputError: If the file is missing or damaged, or has no columns of a
+        InputError: If the file is missing or damaged, or has no columns for a
             positive class.
     """
     try:
@@ -387,25 +395,25 @@ def read_predictions(path: Path, label: Label) -> list[Prediction]:
         return [_from_row(row, name) for name in label_names(label) for row in rows]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(
-            f"{path} cannot be used ({single_line(error)}): "
-            f"score the photographs again, with label={label}",
+            f"{path} is not a table of predictions for label={label} ({single_line(error)}): "
+            f"score the photographs again with pnb-evaluate label={label}",
         ) from error
 
 
 def _from_row(row: Mapping[str, str], label: str) -> Prediction:
-    """Read the prediction for a positive class from a row of predictions.csv.
+    """Convert a row of predictions.csv to the prediction for one positive class.
 
     Args:
-        row: Cells of a photograph by the name of the column.
-        label: Positive class. The row has the columns LABEL_probability,
-            LABEL_rank and LABEL_log_odds.
+        row: Row of a photograph: a cell for each name of a column. There are
+            the columns LABEL_probability, LABEL_rank and LABEL_log_odds.
+        label: Name of the positive class, LABEL.
     """
     photograph = Photograph(
         path=PurePosixPath(row["path"]),
         label=row["label"],
         source=row["source"] or None,
         hard_negatives=split_sources(row["hard_negatives"]),
-        # Files of earlier versions do not have this column.
+        # Earlier versions of the library did not write the column "mesh".
         mesh=row.get("mesh") or None,
     )
     true_probability = row["true_probability"]

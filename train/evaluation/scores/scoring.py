@@ -1,7 +1,10 @@
-"""Scores of a model on a folder of photographs, in files and as text.
+"""Scores of a model on a folder of photographs, as files and as text.
 
-`evaluate_photographs` goes through the three steps: `Predictor.predict`,
-`score` and `write`.
+`evaluate_photographs` has three steps: `Predictor.predict` classifies the
+photographs, `score` computes metrics, and `write` writes them to files.
+
+A label is the name of a positive class. The operating point of a label is a
+threshold on its log-odds. An image above the threshold counts as detected.
 """
 
 import json
@@ -23,8 +26,8 @@ from renderer.io.images import write_image
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
 from train.evaluation.scores.metrics import (
-    COUNTED,
-    RANKED,
+    FRACTION_METRICS,
+    ROC_METRICS,
     TOP_RANKS,
     Metrics,
     Pool,
@@ -45,11 +48,11 @@ from train.settings import GROUPS
 
 SUMMARY = "summary.json"
 CONTACT_SHEET = "contact_sheet.png"
-# Number of wrong classes that are named for each class, the most common ones.
+# For the images of each class, the 5 most common wrong predictions are listed.
 WRONG_CLASSES = 5
-# Words after the number of negatives, if there are several labels.
+# Words after the number of negatives, if there are several positive classes.
 COUNTED_EACH = ", once for each of these classes"
-# Metrics that the table of all images leaves out. `format_scores` shows them.
+# Metrics that `format_overall` leaves out, because they matter less.
 DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
 
 
@@ -58,13 +61,15 @@ class ClassScores:
     """Scores of the photographs of one class, in the order of summary.json.
 
     Attributes:
-        n: Number of photographs.
-        recall: Fraction of them that are predicted as their class. It is
-            unknown if the model lacks the class.
-        top5: Fraction whose class is among the five most probable classes.
-        predicted_label: Fraction that is predicted as a positive class.
-        most_common_wrong: Number of photographs by the wrong class that they
-            are predicted as, for the most common of these classes.
+        n: Number of photographs of the class.
+        recall: Fraction of the photographs whose predicted class is right. It
+            is unknown if the model lacks the class.
+        top5: Fraction of the photographs whose class is among the five most
+            probable classes. It is unknown if the model lacks the class.
+        predicted_label: Fraction of the photographs whose predicted class is a
+            positive class.
+        most_common_wrong: For each of the most common wrong predictions, the
+            number of photographs with this prediction.
     """
 
     n: int
@@ -79,16 +84,19 @@ class Scores:
     """Scores of a model on a folder of photographs.
 
     Attributes:
-        predicted: Predictions that are scored.
-        pooled: Pools of these predictions.
-        points: Operating point of each label, or none.
+        predicted: Predictions for the photographs.
+        pooled: The same predictions, grouped by label, source, mesh and class.
+        points: Operating point of each label. May be empty.
         overall: Metrics of all photographs. With several labels, a photograph
-            counts once for each of them.
+            counts once for each label.
         by_label: Metrics of each label. Empty with a single label.
-        by_source: Metrics of each source.
-        by_mesh: Metrics of each mesh. None if they were not asked for.
-        by_class: Scores of the photographs of each class.
-        class_metrics: Metrics of each class. None if they were not asked for.
+        by_source: Metrics of the photographs of each source.
+        by_mesh: Metrics of the photographs of each mesh. None if `score` was
+            not called with by="mesh".
+        by_class: Recall and wrong predictions for the photographs of each
+            class.
+        class_metrics: Metrics of the photographs of each class. None if `score`
+            was not called with by="class".
     """
 
     predicted: FolderPredictions
@@ -108,10 +116,10 @@ class Scores:
 
     @property
     def point_entries(self) -> list[dict[str, Any]]:
-        """Convert the operating points to entries of summary.json.
+        """Operating points as entries of summary.json.
 
-        The entry "in_sample" says whether a point was chosen on the very images
-        that are scored.
+        The value "in_sample" tells whether an operating point was chosen on the
+        same images that are scored.
         """
         images_hash = self.predicted.images_hash
         return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
@@ -125,19 +133,21 @@ class Scores:
               hash of the photographs;
             - n: numbers of photographs, positives, negatives, unreadable files
               and files that were left out;
-            - the fields of `Metrics` for all photographs;
-            - operating_point: the operating point, if there is one. It is a
-              list if there are several labels;
-            - by_label, by_source, by_mesh: fields of `Metrics` by name. The
-              first is there with several labels, the last if it was asked for;
-            - by_class: fields of `ClassScores` by class;
-            - class_metrics: fields of `Metrics` by class, if they were asked for;
+            - each attribute of `Metrics`, for all photographs;
+            - operating_point: the operating point, or with several labels a
+              list of them. Missing if there is none;
+            - by_label: metrics of each label. Missing with a single label;
+            - by_source: metrics of each source;
+            - by_mesh: metrics of each mesh. Missing if `by_mesh` is None;
+            - by_class: attributes of `ClassScores` for each class;
+            - class_metrics: metrics of each class. Missing if `class_metrics`
+              is None;
             - unreadable, left_out: paths of these files.
         """
         predicted = self.predicted
-        has_several = len(predicted.labels) > 1
+        has_several_labels = len(predicted.labels) > 1
         summary: dict[str, Any] = {
-            "label": predicted.labels if has_several else predicted.labels[0],
+            "label": predicted.labels if has_several_labels else predicted.labels[0],
             "size": predicted.size,
             "images": predicted.images_hash,
         }
@@ -151,8 +161,8 @@ class Scores:
         }
         if self.points:
             entries = self.point_entries
-            summary["operating_point"] = entries if has_several else entries[0]
-        if has_several:
+            summary["operating_point"] = entries if has_several_labels else entries[0]
+        if has_several_labels:
             summary["by_label"] = _entries(self.by_label)
         summary["by_source"] = _entries(self.by_source)
         if self.by_mesh is not None:
@@ -166,13 +176,14 @@ class Scores:
 
 
 def _entries(metrics_by_name: Mapping[str, Metrics]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to entries of summary.json.
+    """Convert the metrics of several groups to entries of summary.json.
 
     Args:
-        metrics_by_name: Metrics by the name of a label, source, mesh or class.
+        metrics_by_name: Metrics by the name of the label, source, mesh or
+            class.
 
     Returns:
-        Entries by the same names.
+        For each name, its metrics as a dictionary.
     """
     return {name: metrics.to_summary() for name, metrics in metrics_by_name.items()}
 
@@ -184,21 +195,22 @@ def evaluate_photographs(
     out: Path,
     skip_unreadable: bool = False,
 ) -> Scores:
-    """Score a model on every photograph of a folder, and write the scores.
+    """Score a model on all photographs of a folder, and write the scores to files.
 
     Args:
-        predictor: Model that is scored.
+        predictor: Model to score.
         folder: Folder of photographs, as `find_photographs` takes it.
-        label: Positive class, or several.
-        out: Folder that `write` writes to. It must lie outside `folder`.
-        skip_unreadable: Whether to leave out photographs that cannot be read.
-            Otherwise they are an error.
+        label: Positive class, or a list of several.
+        out: Folder for the files. It must lie outside `folder`.
+        skip_unreadable: Whether photographs that cannot be read are left out.
+            If False, they raise an InputError.
 
     Returns:
-        Scores, with intervals.
+        Scores with their intervals.
 
     Raises:
-        InputError: See `Predictor.predict`. Also if `out` is inside `folder`.
+        InputError: If `out` lies inside `folder`, or if the photographs cannot
+            be classified (see `Predictor.predict`).
     """
     folder = as_folder("folder", folder)
     out = as_folder("out", out)
@@ -216,36 +228,38 @@ def score(
 ) -> Scores:
     """Score predictions for photographs.
 
-    Fractions have 95% Wilson intervals. The AUC, the recall at a
-    false-positive rate and the means over classes have bootstrap intervals over
-    images and, where photos.csv names them, over objects.
+    Fractions of images have 95% Wilson intervals. All other metrics have
+    bootstrap intervals, which draw images, and objects if photos.csv names
+    them.
 
     Args:
         predicted: Predictions for the photographs of a folder.
-        by: "mesh" to score each mesh, too, "class" to score each class in the
-            same metrics. Otherwise "source".
-        points: Operating point of each label, or none.
+        by: Which groups of photographs are scored in addition to labels and
+            sources: "mesh", "class", or "source" for no other groups.
+        points: Operating point of each label. May be empty.
 
     Returns:
-        Scores of all photographs, and of each label, source, mesh and class.
+        Scores of all photographs, and of each group.
 
     Raises:
-        InputError: If `by` is none of these, or if it is "mesh" and no mesh is known.
+        InputError: If `by` has another value, or if it is "mesh" and photos.csv
+            names no mesh.
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
         raise InputError(
-            f"by=mesh: {predicted.folder} has no {TABLE} with a column mesh: leave it out",
+            f"by=mesh needs the meshes of the photographs, but {predicted.folder} has no "
+            f"{TABLE} with a column mesh: add this table, or remove by=mesh",
         )
-    limits = {point.label: point.threshold for point in points}
-    pooled = Pooled(predicted.predictions, thresholds=limits)
-    has_several = len(predicted.labels) > 1
+    thresholds_by_label = {point.label: point.threshold for point in points}
+    pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
+    has_several_labels = len(predicted.labels) > 1
     return Scores(
         predicted=predicted,
         pooled=pooled,
         points=points,
         overall=pooled.all.metrics,
-        by_label=_metrics_of(pooled.by_label) if has_several else {},
+        by_label=_metrics_of(pooled.by_label) if has_several_labels else {},
         by_source=_metrics_of(pooled.by_source),
         by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
         by_class=_score_classes(predicted),
@@ -254,20 +268,30 @@ def score(
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of each pool by its name. The bootstrap intervals take a while."""
+    """Compute the metrics of several pools of predictions, and show the progress.
+
+    Args:
+        pools: Pools by the name of their label, source, mesh or class.
+
+    Returns:
+        For each name, the metrics of its pool.
+    """
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
 
 def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
-    """Score the photographs of each class that the folder has.
+    """Score the photographs of each class in a folder separately.
 
     Returns:
-        Scores by the name of the class, in alphabetical order.
+        For each class, in alphabetical order, the scores of its photographs.
     """
-    by_class: dict[str, list[Prediction]] = {}
+    predictions_by_class: dict[str, list[Prediction]] = {}
     for prediction in predicted.photographs:
-        by_class.setdefault(prediction.photograph.label, []).append(prediction)
-    return {name: _score_class(by_class[name], predicted.labels) for name in sorted(by_class)}
+        predictions_by_class.setdefault(prediction.photograph.label, []).append(prediction)
+    scores = {}
+    for name in sorted(predictions_by_class):
+        scores[name] = _score_class(predictions_by_class[name], predicted.labels)
+    return scores
 
 
 def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
@@ -275,31 +299,33 @@ def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> Cl
 
     Args:
         predictions: One prediction for each photograph of the class.
-        labels: Positive classes.
+        labels: Names of the positive classes.
     """
-    # The rank is None if the model lacks the class.
+    # `true_rank` is None for all photographs if the model lacks the class.
     ranks = [item.true_rank for item in predictions if item.true_rank is not None]
-    wrong = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
-    predicted_label = [item.predicted in labels for item in predictions]
+    wrong_classes = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
+    is_predicted_label = [item.predicted in labels for item in predictions]
     return ClassScores(
         n=len(predictions),
         recall=fraction(ranks.count(1), len(ranks)),
         top5=fraction(sum(rank <= 5 for rank in ranks), len(ranks)),
-        predicted_label=fraction(sum(predicted_label), len(predictions)),
-        most_common_wrong=dict(wrong.most_common(WRONG_CLASSES)),
+        predicted_label=fraction(sum(is_predicted_label), len(predictions)),
+        most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
     )
 
 
 def write(scores: Scores, out: Path) -> None:
-    """Write scores into a folder.
+    """Write scores to the files of a folder.
 
-    The files are summary.json; predictions.csv, with a row per photograph;
-    contact_sheet.png; and roc.csv and roc.png with the ROC curves of all images
-    and of each label or, with one label, each source.
+    - summary.json: all metrics;
+    - predictions.csv: a row for each photograph;
+    - contact_sheet.png: photographs with right and wrong predictions;
+    - roc.csv and roc.png: ROC curves of all images and of each label. With a
+      single label, of each source instead.
 
     Args:
         scores: Scores of a model on photographs.
-        out: Folder, which is made if it does not exist.
+        out: Folder for the files. It is created if it does not exist.
     """
     predicted = scores.predicted
     out.mkdir(parents=True, exist_ok=True)
@@ -321,25 +347,26 @@ def choose_operating_points(
     rate: float,
     skip_unreadable: bool = False,
 ) -> list[OperatingPoint]:
-    """Choose a threshold on the log-odds of each label for a false-positive rate.
+    """Choose a threshold on the log-odds of each label for a given false-positive rate.
 
-    The threshold is the lowest log-odds of a negative at which the
-    false-positive rate is at most `rate`. With rate 0.1 and 20 negatives, at
-    most 2 negatives score above the threshold.
+    The threshold is the log-odds of a negative. It is the lowest of these
+    values at which the false-positive rate is at most `rate`. With rate 0.1 and
+    20 negatives, at most 2 negatives score above the threshold.
 
     Args:
-        predictor: Model whose threshold is chosen.
+        predictor: Model for which thresholds are chosen.
         folder: Folder of photographs, as `find_photographs` takes it.
-        label: Positive class, or several.
-        rate: False-positive rate, in (0, 1).
-        skip_unreadable: Whether to leave out photographs that cannot be read.
+        label: Positive class, or a list of several.
+        rate: Largest false-positive rate, in (0, 1).
+        skip_unreadable: Whether photographs that cannot be read are left out.
+            If False, they raise an InputError.
 
     Returns:
-        Operating point of each label.
+        Operating point of each label, with its threshold.
 
     Raises:
-        InputError: See `Predictor.predict`. Also if the folder has fewer than
-            1 / rate negatives.
+        InputError: If the folder has fewer than 1 / rate negatives, or if its
+            photographs cannot be classified (see `Predictor.predict`).
     """
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
@@ -349,10 +376,10 @@ def choose_operating_points(
         log_odds = np.array([item.log_odds for item in predictions if not item.positive])
         count = len(log_odds)
         if count * exact_rate < 1:
-            fault = f"folder={folder} has {count} negatives for {name}"
-            least = math.ceil(1 / exact_rate)
+            min_count = math.ceil(1 / exact_rate)
             raise InputError(
-                f"{fault}: give at least {least} for false_positive_rate={rate}",
+                f"folder={folder} has {count} negatives for {name}: "
+                f"give at least {min_count} for false_positive_rate={rate}",
                 "folder",
             )
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
@@ -370,21 +397,25 @@ def choose_operating_points(
 
 
 def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the operating points of a summary as a list, which may be empty.
+    """Read the operating points in the content of summary.json.
 
     Args:
-        summary: Content of summary.json, which holds no point, one point or a
-            list with a point for each label.
+        summary: Content of summary.json. Its entry "operating_point" is missing,
+            a dictionary, or a list with a dictionary for each label.
+
+    Returns:
+        List of the operating points, which may be empty.
     """
-    chosen = summary.get("operating_point", [])
-    return chosen if isinstance(chosen, list) else [chosen]
+    entry = summary.get("operating_point", [])
+    return entry if isinstance(entry, list) else [entry]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:
-    """Describe the false-positive rate and the images for which an operating point was chosen.
+    """Describe for which false-positive rate and on which images an operating point was chosen.
 
     Args:
-        point: Entry `operating_point` of a summary.
+        point: Operating point, as in the entry "operating_point" of
+            summary.json.
 
     Returns:
         Text such as "5.0% FPR on photographs, 120 negatives".
@@ -396,21 +427,21 @@ def describe_point(point: Mapping[str, Any]) -> str:
 
 
 def format_scores(scores: Scores) -> str:
-    """Write scores as Markdown tables, by mesh or by source.
+    """Format scores as Markdown tables, with a row for each label and each source or mesh.
 
     Args:
         scores: Scores of a model on photographs.
 
     Returns:
-        Paragraphs without a newline at the end.
+        Text of several paragraphs, without a newline at the end.
     """
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
     each = COUNTED_EACH if scores.by_label else ""
     paragraphs = [
         f"{positives} images of {scores.label}, {negatives} negatives{each}",
-        str(_counted_table(scores)),
-        str(_ranked_table(scores)),
+        str(_fraction_table(scores)),
+        str(_bootstrap_table(scores)),
         str(_class_table(scores)),
         *_notes(scores),
     ]
@@ -418,31 +449,38 @@ def format_scores(scores: Scores) -> str:
 
 
 def format_overall(scores: Scores) -> str:
-    """Write the scores of all images as one Markdown table, with 95 % intervals.
+    """Format the metrics of all images as one Markdown table, with 95 % intervals.
+
+    The table has a row for each metric. The metrics in `DETAILS` are left out.
 
     Args:
         scores: Scores of a model on photographs.
 
     Returns:
-        The table below a line that counts the images, and notes about thresholds and files.
-        The metrics in `DETAILS` are left out.
+        A line with the numbers of images, the table, and notes about thresholds
+        and about files that were not scored.
     """
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
     title = f"{positives} images of {scores.label}, {negatives} negatives"
-    rows = []
-    for table in (_counted_table(scores), _ranked_table(scores)):
-        rows += list(zip(table.header[1:], table.rows[0][1:], strict=True))
     details = {metric_title(name) for name in DETAILS}
-    rows = [row for row in rows if row[0] not in details]
-    table = Table(f"{title}; 95 % intervals", ["metric", scores.label], rows)
-    return "\n".join([str(table), *_notes(scores)])
+    rows = []
+    for table in (_fraction_table(scores), _bootstrap_table(scores)):
+        # The first row is about all images. Its first cell is the title of the row.
+        metric_titles = table.header[1:]
+        cells = table.rows[0][1:]
+        for metric, cell in zip(metric_titles, cells, strict=True):
+            if metric not in details:
+                rows.append((metric, cell))
+    overall_table = Table(f"{title}; 95 % intervals", ["metric", scores.label], rows)
+    return "\n".join([str(overall_table), *_notes(scores)])
 
 
-def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
-    """Yield the title and the metrics of each row of a table.
+def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:
+    """Yield the title and the metrics of each row of a table of scores.
 
-    The rows are all images, each label, and then each mesh, class or source.
+    The first row is about all images. Rows about each label follow, and then
+    rows about each mesh, each class or each source.
     """
     yield "all", scores.overall
     yield from scores.by_label.items()
@@ -450,24 +488,23 @@ def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
     yield from groups.items()
 
 
-def _counted_table(scores: Scores) -> Table:
-    """Make the table of the metrics that are fractions of images."""
-    counted = [name for name in COUNTED if scores.overall.find(name) is not None]
+def _fraction_table(scores: Scores) -> Table:
+    """Make the table of the metrics that are fractions of images, such as recall."""
+    names = [name for name in FRACTION_METRICS if scores.overall.find(name) is not None]
     rows = []
-    for title, metrics in _rows_of(scores):
-        proportions: list[Proportion] = [getattr(metrics, name) for name in counted]
+    for title, metrics in _metrics_of_rows(scores):
+        proportions: list[Proportion] = [getattr(metrics, name) for name in names]
         rows.append([title, *map(format_fraction, proportions)])
-    return Table("95 % intervals over images", ["", *map(metric_title, counted)], rows)
+    return Table("95 % intervals over images", ["", *map(metric_title, names)], rows)
 
 
-def _ranked_table(scores: Scores) -> Table:
-    """Make the table of the metrics with bootstrap intervals.
+def _bootstrap_table(scores: Scores) -> Table:
+    """Make the table of the metrics that have bootstrap intervals, such as the AUC.
 
-    The title says whether the bootstrap draws images alone, or objects and
-    images.
+    The title tells whether the bootstrap draws only images, or also objects.
     """
     auc = scores.overall.auc
-    resampled_metrics = (*RANKED, *TOP_RANKS)
+    names = (*ROC_METRICS, *TOP_RANKS)
     resampled = "images"
     if auc.has_repeated_objects:
         counts = (
@@ -475,25 +512,26 @@ def _ranked_table(scores: Scores) -> Table:
         )
         resampled = f"objects and images ({counts})"
     rows = []
-    for title, metrics in _rows_of(scores):
-        rows.append([title, *(format_interval(metrics.find(name)) for name in resampled_metrics)])
-    header = ["", *map(metric_title, resampled_metrics)]
+    for title, metrics in _metrics_of_rows(scores):
+        rows.append([title, *(format_interval(metrics.find(name)) for name in names)])
+    header = ["", *map(metric_title, names)]
     return Table(f"95 % intervals over {resampled}", header, rows)
 
 
 def _class_table(scores: Scores) -> Table:
-    """Make the table of recall, top-5 and wrong predictions, with a row for each class."""
+    """Make a table of recall and wrong predictions with a row for each class of photographs."""
     header = ["class", "recall", "top-5", f"predicted {scores.label}", "most common wrong classes"]
     rows = []
-    for name, part in scores.by_class.items():
-        proportions = (part.recall, part.top5, part.predicted_label)
-        wrong = ", ".join(f"{other} {count}" for other, count in part.most_common_wrong.items())
+    for name, of_class in scores.by_class.items():
+        proportions = (of_class.recall, of_class.top5, of_class.predicted_label)
+        wrong_counts = of_class.most_common_wrong.items()
+        wrong = ", ".join(f"{wrong_class} {count}" for wrong_class, count in wrong_counts)
         rows.append([name, *map(format_fraction, proportions), wrong])
     return Table("", header, rows)
 
 
 def _notes(scores: Scores) -> Iterator[str]:
-    """Yield a sentence for each threshold, and for the files that were not scored."""
+    """Yield a sentence for each threshold, and sentences about files that were not scored."""
     for point in scores.point_entries:
         label = f" of {point['label']}" if scores.by_label else ""
         threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"

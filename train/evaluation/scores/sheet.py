@@ -1,4 +1,4 @@
-"""Images of an evaluation: a contact sheet of photographs with predictions, and ROC curves."""
+"""Pictures of an evaluation: a contact sheet of photographs with predictions, and ROC curves."""
 
 import csv
 import io
@@ -21,40 +21,43 @@ if TYPE_CHECKING:
 
 ROC_TABLE = "roc.csv"
 ROC_FIGURE = "roc.png"
-# Largest number of images in a section of the contact sheet.
-PER_SECTION = 40
-# Number of images in a row of a section.
+# Each section of the contact sheet, such as the false positives, shows at most 40
+# photographs.
+MAX_IMAGES = 40
+# Each row of the contact sheet has 10 photographs.
 COLUMNS = 10
-# Side of an enlarged image in pixels.
-IMAGE = 96
-# Width of the frame of an image in pixels.
-FRAME = 4
-# `_shortened` cuts captions of more characters than this.
-LONGEST_CAPTION = 18
+# Width and height of a photograph on the contact sheet, in pixels.
+IMAGE_SIZE = 96
+# Width of the colored frame around a photograph, in pixels.
+FRAME_WIDTH = 4
+# A caption with more characters is cut off.
+MAX_CAPTION_LENGTH = 18
 LEGEND = (
     "Under each image: the predicted class and its probability. "
     "If the prediction is wrong, the true class follows in gray."
 )
-# Colors of the frames.
+# Colors of the frames: true positives, false negatives and false positives.
 GREEN = "#2e9e5b"
 RED = "#d03b3b"
 YELLOW = "#e8a317"
 
 Item = TypeVar("Item")
-# Log-odds of the positives, shape (n,), and of the negatives, shape (m,).
+# Data of one ROC curve: the log-odds of the positives, shape (n,), and of the
+# negatives, shape (m,).
 Pair = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class _Section:
-    """A section of the contact sheet about one class.
+    """Section of the contact sheet, such as the true positives of one class.
 
     Attributes:
         name: Title of the section, such as "true positives".
-        color: Color of the frames.
-        shown: Predictions with their images, by falling probability.
-        total: Number of all positives, for true positives and false negatives.
-            Number of all negatives, for false positives.
+        color: Color of the frames around its images.
+        shown: Predictions with their images, in descending order of the
+            probability of the predicted class.
+        total: Number of positives, if the section shows true positives or false
+            negatives. Number of negatives, if it shows false positives.
     """
 
     name: str
@@ -64,22 +67,24 @@ class _Section:
 
 
 def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
-    """Draw what is right and wrong about each positive class.
+    """Draw a contact sheet of right and wrong predictions for each positive class.
 
-    True positives, false negatives and false positives have a section each, with up to
-    PER_SECTION images that are evenly spread by probability.
+    Each positive class has three sections: true positives, false negatives and
+    false positives. A section has at most MAX_IMAGES images. If there are more,
+    it shows images at equal distances in the order of probability.
 
     Args:
-        predictions: The predictions, about the first class for all images, then about the next.
-        images: The images, uint8 sRGB, shape (N, 3, H, W). They are enlarged without smoothing,
-            so that one sees the pixels that the classifier saw.
+        predictions: Predictions of all images for the first positive class,
+            then for the next one, and so on.
+        images: Classified images, uint8 sRGB, shape (N, 3, H, W). They are
+            enlarged without smoothing, so that the pixels are visible.
 
     Returns:
-        The sheet.
+        Contact sheet.
     """
     grids = [draw_grid([], heading=LEGEND)]
-    for label, items in by_label(predictions).items():
-        for section in _sections(label, items, images):
+    for label, predictions_of_label in by_label(predictions).items():
+        for section in _sections(label, predictions_of_label, images):
             grids.append(_section_grid(label, section))
     width = max(grid.width for grid in grids)
     sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
@@ -95,17 +100,19 @@ def _sections(
     predictions: Sequence[Prediction],
     images: torch.Tensor,
 ) -> list[_Section]:
-    """Divide the predictions about a class into the sections of the contact sheet.
+    """Divide images into true positives, false negatives and false positives of a class.
 
-    True negatives have no section.
+    True negatives are left out.
 
     Args:
-        label: The class.
-        predictions: Predictions about this class for all images.
-        images: The images, uint8, shape (N, 3, H, W).
+        label: Name of the positive class.
+        predictions: Prediction of each of the N images for this class.
+        images: Classified images, uint8, shape (N, 3, H, W).
+
+    Returns:
+        The three sections. The most confident predictions come first.
     """
     pairs = list(zip(predictions, images, strict=True))
-    # The images with the most confident predictions come first.
     pairs.sort(key=lambda pair: pair[0].probability, reverse=True)
     positives = [(item, image) for item, image in pairs if item.positive]
     negatives = [(item, image) for item, image in pairs if not item.positive]
@@ -120,78 +127,85 @@ def _sections(
 
 
 def _section_grid(label: str, section: _Section) -> Image.Image:
-    """Draw the heading of a section and, below it, at most PER_SECTION of its images."""
+    """Draw the images of a section of the contact sheet in a grid below a heading.
+
+    Args:
+        label: Name of the positive class, for the heading.
+        section: Images with their predictions. If there are more than
+            MAX_IMAGES, some of them are drawn, at equal distances.
+    """
     count = len(section.shown)
     heading = f"{label}: {count} {section.name} of {section.total}"
-    if count > PER_SECTION:
-        heading += f" ({PER_SECTION} shown, evenly by probability)"
+    if count > MAX_IMAGES:
+        heading += f" ({MAX_IMAGES} shown, evenly by probability)"
     tiles = []
-    for prediction, image in evenly_spaced(section.shown, PER_SECTION):
+    for prediction, image in evenly_spaced(section.shown, MAX_IMAGES):
         tiles.append(_tile(prediction, image, section.color))
     rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
     return draw_grid(rows, heading=heading)
 
 
-def evenly_spaced(ordered: Sequence[Item], count: int) -> list[Item]:
-    """Choose items at equal distances, the first and the last among them.
+def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
+    """Choose items of a list at equal distances, including the first and the last one.
 
     Args:
-        ordered: The items.
-        count: The number of items to choose.
+        items: List to choose from.
+        count: Number of items to choose.
 
     Returns:
-        The chosen items; all items if there are no more.
+        Chosen items in their order. All items, if there are at most `count`.
     """
-    places = np.linspace(0, len(ordered) - 1, min(count, len(ordered)))
-    return [ordered[index] for index in places.round().astype(int)]
+    indices = np.linspace(0, len(items) - 1, min(count, len(items)))
+    return [items[index] for index in indices.round().astype(int)]
 
 
 def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
-    """Draw an image in a frame, with captions below it.
+    """Enlarge an image, and add a colored frame and captions.
+
+    The first caption is the predicted class with its probability. If the
+    prediction is wrong, the second caption is the true class.
 
     Args:
-        prediction: Prediction for the image. The first caption has the
-            predicted class with its probability. If it is wrong, the second
-            caption has the true class.
-        image: The image, uint8, shape (3, H, W).
+        prediction: Prediction for the image.
+        image: Classified image, uint8, shape (3, H, W).
         color: Color of the frame.
     """
     pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
-    enlarged = pixels.resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
+    enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
     lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
     if prediction.true_rank != 1:
         label = prediction.photograph.label
         probability = prediction.true_probability
         lines.append(label if probability is None else f"{probability:.0%} {label}")
     captions = tuple(_shortened(line) for line in lines)
-    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME, color)), captions)
+    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME_WIDTH, color)), captions)
 
 
 def _shortened(caption: str) -> str:
-    """Cut a caption of more than LONGEST_CAPTION characters, and end it with "…"."""
-    if len(caption) <= LONGEST_CAPTION:
+    """Cut off the end of a caption that is too long, and add "…"."""
+    if len(caption) <= MAX_CAPTION_LENGTH:
         return caption
-    return f"{caption[: LONGEST_CAPTION - 1]}…"
+    return f"{caption[: MAX_CAPTION_LENGTH - 1]}…"
 
 
 def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
-    """Write ROC curves as a table, roc.csv, and as a figure, roc.png.
+    """Write ROC curves to the table roc.csv and to the figure roc.png.
 
-    A curve is left out if it lacks positives or negatives.
+    There is a curve for all images, and one for each source or label. A curve
+    is left out if it lacks positives or negatives.
 
     Args:
-        folder: Folder that the files are written to.
-        overall: Scores of the positives and of the negatives among all images.
-        by_name: Scores of the positives and of the negatives of each source, or
-            of each label. In the table, the points of the curve of all images
-            come first, under an empty name. The points of the curve of each
-            source or label follow.
-        label: Positive classes, as axes name them.
+        folder: Folder for the two files.
+        overall: Log-odds of the positives and of the negatives among all
+            images. The name of this curve is empty in the table.
+        by_name: Log-odds of the positives and of the negatives of each source
+            or label, by its name.
+        label: Positive classes in words, for the title of an axis.
     """
-    # This import takes half a second.
+    # This import is here because it takes half a second.
     from matplotlib.figure import Figure
 
-    # A curve needs both positives and negatives.
+    # `all(map(len, pair))` is True if there are both positives and negatives.
     known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
     has_overall = all(map(len, overall))
     table = io.StringIO()
@@ -218,14 +232,16 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
 
 def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
-    """Make a row of roc.csv for each point of a curve.
+    """Make a row of roc.csv for each point of a ROC curve.
 
     Args:
         name: Name of the source or label of the curve. Empty for all images.
-        pair: Scores of the positives and of the negatives.
+        pair: Log-odds of the positives, shape (n,), and of the negatives,
+            shape (m,).
 
     Returns:
-        Rows of name, false-positive rate, recall and threshold.
+        Rows with the name, the false-positive rate, the recall and the
+        threshold of each point.
     """
     points = zip(*roc_curve(*pair), strict=True)
     return [(name, *map(float, point)) for point in points]
@@ -237,26 +253,29 @@ def draw_roc(
     label: str,
     styles: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Draw ROC curves with their mean AUC, and a line at each of RATES.
+    """Draw ROC curves, with the AUC in the legend.
+
+    Dotted vertical lines mark the false-positive rates in `RATES`.
 
     Args:
-        axes: The axes to draw on.
-        scores: The scores of positives and negatives by name. A name has several pairs if it has
-            several seeds.
+        axes: Axes of matplotlib to draw on.
+        scores: For each name in the legend, the log-odds of the positives and
+            of the negatives. Several training runs with different seeds have a
+            curve each, in the same style. The legend has the mean of their AUC.
         label: Positive classes in words, for the title of an axis.
-        styles: matplotlib's keywords for the lines of a name.
+        styles: For some names, keyword arguments of `axes.plot`.
     """
-    # A classifier that guesses has this line.
+    # The ROC curve of a random classifier is the diagonal.
     axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
     for rate in map(float, RATES):
         axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
     for name, pairs in scores.items():
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
-        # The legend names the curve of the first seed only.
-        title: str | None = f"{name}: AUC {np.mean(areas):.3f}" if areas else None
+        legend: str | None = f"{name}: AUC {np.mean(areas):.3f}" if areas else None
         for pair in pairs:
             rates, recalls, _ = roc_curve(*pair)
-            axes.plot(rates, recalls, label=title, **styles.get(name, {}))
-            title = None
+            axes.plot(rates, recalls, label=legend, **styles.get(name, {}))
+            # Further curves of the same name have no entry in the legend.
+            legend = None
     axes.set(xlabel="false positive rate", ylabel=f"recall of {label}")
     axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))

@@ -12,9 +12,9 @@ from scipy.stats import mannwhitneyu
 
 from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import (
-    RANKED,
     RATES,
     REPLICATES,
+    ROC_METRICS,
     auc_and_recalls,
     bootstrap,
     class_means,
@@ -72,7 +72,7 @@ def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_i
     generator = np.random.default_rng(3)
     positives = generator.normal(1, 1, 80).round(1)
     negatives = generator.normal(0, 1.5, 120).round(1)
-    column = RANKED.index(name)
+    column = ROC_METRICS.index(name)
     reference = scipy_bootstrap(
         (positives, negatives),
         lambda positives, negatives: auc_and_recalls(positives, negatives)[column],
