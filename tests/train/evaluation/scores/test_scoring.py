@@ -30,7 +30,7 @@ from train.evaluation.scores.scoring import (
     score,
     write,
 )
-from train.evaluation.scores.sheet import FRAME, IMAGE
+from train.evaluation.scores.sheet import FRAME_WIDTH, IMAGE_SIZE
 from train.evaluation.tables import fraction
 
 
@@ -600,7 +600,7 @@ def test_predictions_of_another_class_are_refused(tmp_path):
 
 # Colors of the frames of true positives, false negatives and false positives.
 FRAMES = [(46, 158, 91), (208, 59, 59), (232, 163, 23)]
-FRAMED = IMAGE + 2 * FRAME
+FRAMED = IMAGE_SIZE + 2 * FRAME_WIDTH
 
 
 def count_frames(sheet: Image.Image) -> list[int]:
@@ -609,7 +609,7 @@ def count_frames(sheet: Image.Image) -> list[int]:
     counts = []
     for color in FRAMES:
         area = int((pixels == color).all(axis=2).sum())
-        count, remainder = divmod(area, FRAMED**2 - IMAGE**2)
+        count, remainder = divmod(area, FRAMED**2 - IMAGE_SIZE**2)
         assert remainder == 0
         counts.append(count)
     return counts
@@ -631,7 +631,7 @@ def test_the_contact_sheet_shows_at_most_40_images_evenly_by_probability(known_m
         red, green, blue = np.moveaxis(np.asarray(sheet).astype(int), 2, 0)
     # The red of an image is its number.
     areas = np.bincount(red[(green == 0) & (blue == 0)])
-    shown = np.flatnonzero(areas >= IMAGE**2)
+    shown = np.flatnonzero(areas >= IMAGE_SIZE**2)
     assert len(shown) == 40
     assert shown[0] == 0
     assert shown[-1] == 100
