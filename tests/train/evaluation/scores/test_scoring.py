@@ -594,7 +594,7 @@ def test_written_predictions_are_read_bit_by_bit(tmp_path):
 
 def test_predictions_of_another_class_are_refused(tmp_path):
     write_predictions(tmp_path / "a.csv", PREDICTIONS)
-    with pytest.raises(InputError, match=r"a\.csv cannot be used .* label=pear"):
+    with pytest.raises(InputError, match=r"a\.csv is not a table .* label=pear"):
         read_predictions(tmp_path / "a.csv", "pear")
 
 
