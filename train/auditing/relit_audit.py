@@ -20,7 +20,7 @@ from train.evaluation.relit import (
     attack_folder,
     read_relit,
 )
-from train.evaluation.tables import Table
+from train.evaluation.tables import Table, join_words
 from train.report import plots
 from train.report.first_screen import FirstScreen, Number
 from train.report.plots import Picture
@@ -177,13 +177,8 @@ def _sentence(name: str, scores: RelitScores) -> str:
         scores: Predictions of the network for the photographs.
     """
     counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
-    return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {_join(counts)}."
-
-
-def _join(items: Sequence[str]) -> str:
-    """Join items to a list in words, such as "a, b and c"."""
-    *others, last = items
-    return f"{', '.join(others)} and {last}" if others else last
+    kept = join_words(counts, "and")
+    return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {kept}."
 
 
 def _section(name: str, folder: Path) -> RelitSection:

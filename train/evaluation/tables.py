@@ -133,6 +133,17 @@ def as_text(value: object) -> str:
     return str(value)
 
 
+def join_words(items: Sequence[str], conjunction: str) -> str:
+    """Join items to a list in words, such as "a, b and c".
+
+    Args:
+        items: At least one item.
+        conjunction: Word before the last item, such as "and".
+    """
+    *others, last = items
+    return f"{', '.join(others)} {conjunction} {last}" if others else last
+
+
 def fraction(hits: int, n: int) -> Proportion:
     """Compute hits / n with its 95% Wilson score interval (Wilson 1927).
 

@@ -10,7 +10,7 @@ from PIL import Image
 from renderer.io.images import read_square
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.tables import Estimate, Table
+from train.evaluation.tables import Estimate, Table, join_words
 from train.report import comparison as compare
 from train.report import plots
 from train.report.plots import Picture
@@ -240,7 +240,7 @@ def _describe_images(compared: Compared) -> str:
         f"objects) and {auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
     )
     if compared.trained_objects:
-        trained = " and ".join(compared.trained_objects)
+        trained = join_words(compared.trained_objects, "and")
         sentence += f" The images of {trained} show the objects of the training in new light."
     return sentence
 

@@ -161,7 +161,7 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     Args:
         methods: Pairs of the scores of the positives and of the negatives, one
             pair for each seed, by method.
-        label: Positive classes in words, for the title of an axis.
+        label: Positive classes in words, for the title of the plot.
 
     Returns:
         The plot. None if no seed has both positives and negatives.
@@ -184,8 +184,8 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
         if areas:
             means.append(f"{method} {np.mean(areas):.3f}")
-    alt = f"ROC; AUC: {', '.join(means)}"
-    return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", alt)
+    alt = f"ROC of {label}; AUC: {', '.join(means)}"
+    return _plot(lambda axes: draw_roc(axes, known, styles), f"ROC: {label}", alt)
 
 
 def by_radius(

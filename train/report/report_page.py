@@ -21,7 +21,14 @@ from renderer.io.files import atomic_write
 from train.evaluation.laboratory.kept_aside import can_be_generated
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.scores.sheet import evenly_spaced
-from train.evaluation.tables import Table, as_text, format_fraction, format_interval, fraction
+from train.evaluation.tables import (
+    Table,
+    as_text,
+    format_fraction,
+    format_interval,
+    fraction,
+    join_words,
+)
 from train.report import comparison as compare
 from train.report import plots, summary
 from train.report.first_screen import (
@@ -371,8 +378,8 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
         if agreements_known:
             agreement = fmean(agreements_known)
             sentences.append(
-                f"{method}: on images of any kind that training did not use, its agreement with "
-                f"the network that it began with is {agreement:.1%}."
+                f"{method}: on photographs that training did not use, the network predicts the "
+                f"same class as the original in {agreement:.1%} of the cases."
             )
             continue
         initial = [run.before.accuracy for run in runs if run.before]
@@ -450,7 +457,7 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     scored = group[method][0]
     names = ("before hardening", "after hardening") if initial else (base, method)
     subjects = NETWORKS if initial else (f"the network “{base}”", f"the network “{method}”")
-    label = " or ".join(map(in_words, scored.scores.labels))
+    label = join_words([in_words(name) for name in scored.scores.labels], "or")
     images = images_folder(scored.run, scored.name)
     rows = {}
     if images is not None:

@@ -178,7 +178,7 @@ def runs_on_two_sets(scored_run) -> list[Path]:
 
 def test_only_scores_on_the_same_images_share_a_plot(runs_on_two_sets, tmp_path):
     text = write_report(runs_on_two_sets, tmp_path / "out").read_text()
-    plots = re.findall(r'alt="ROC; AUC: ([^"]*)"', text)
+    plots = re.findall(r'alt="ROC of [^;]*; AUC: ([^"]*)"', text)
     assert plots == ["none 0.250, random 0.750", "adversarial 1.000"]
     assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
     assert text.count("the network “none” recognizes") == 1

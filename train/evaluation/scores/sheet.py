@@ -222,7 +222,8 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     curves = {"all": [overall]} if has_overall else {}
     curves |= {name: [pair] for name, pair in known.items()}
     bold = {"all": {"color": "black", "linewidth": 2.5, "zorder": 3}}
-    draw_roc(axes, curves, label, bold)
+    draw_roc(axes, curves, bold)
+    axes.set_title(f"ROC: {label}")
     axes.set_aspect("equal")
     if curves:
         axes.legend(loc="lower right")
@@ -250,7 +251,6 @@ def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
 def draw_roc(
     axes: "Axes",
     scores: Mapping[str, Sequence[Pair]],
-    label: str,
     styles: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Draw ROC curves, with the AUC in the legend.
@@ -262,7 +262,6 @@ def draw_roc(
         scores: For each name in the legend, the log-odds of the positives and
             of the negatives. Several training runs with different seeds have a
             curve each, in the same style. The legend has the mean of their AUC.
-        label: Positive classes in words, for the title of an axis.
         styles: For some names, keyword arguments of `axes.plot`.
     """
     # The ROC curve of a random classifier is the diagonal.
@@ -277,5 +276,5 @@ def draw_roc(
             axes.plot(rates, recalls, label=legend, **styles.get(name, {}))
             # Further curves of the same name have no entry in the legend.
             legend = None
-    axes.set(xlabel="false positive rate", ylabel=f"recall of {label}")
+    axes.set(xlabel="false positive rate", ylabel="recall")
     axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))
