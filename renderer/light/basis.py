@@ -336,20 +336,19 @@ class LocalBasis(Basis):
 
     @abstractmethod
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
-        """Create the entries of Mitsuba emitters that give the same light.
+        """Create the descriptions of emitters with the same light for the renderer Mitsuba.
 
         A diffuse surface reflects albedo / π times the irradiance in Mitsuba, and
         albedo times the irradiance in this project. The emitters are brighter to
         compensate for this.
 
         Args:
-            coefficients: Coefficients of the light, shape (size, 3).
-            albedo_scale: Factor for the albedo of the mesh. The emitters are
-                multiplied by it, because the materials in Mitsuba are not.
+            coefficients: RGB coefficients of the light, shape (size, 3).
+            albedo_scale: Factor for the albedo of the mesh. It multiplies the
+                emitters instead, which gives the same image.
 
         Returns:
-            Entry of a Mitsuba scene for each emitter (see
-            `renderer.io.mitsuba_entries`).
+            For each emitter, the dictionary that describes it in a Mitsuba scene.
         """
 
     @property
@@ -358,7 +357,14 @@ class LocalBasis(Basis):
         return [LocalPart(slice(0, self.size), self)]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Clamp coefficients to [0, power], see `Basis.project_nonnegative`."""
+        """Clamp RGB coefficients to [0, power], so that the light can exist.
+
+        Args:
+            coefficients: RGB coefficients of the lights, shape (..., size, 3).
+
+        Returns:
+            Clamped coefficients, shape (..., size, 3).
+        """
         return self.nearest_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:

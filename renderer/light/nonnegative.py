@@ -152,7 +152,8 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
         >>> physical.shape
         torch.Size([49, 3])
     """
-    # Equal channels, such as those of a gray light, are projected once.
+    # Find the distinct channels, so that the equal channels of a gray light are projected
+    # only once.
     unique_channels, unique_index = np.unique(
         _split_channels(coefficients)[:, 0], axis=0, return_inverse=True
     )
@@ -598,8 +599,8 @@ def _find_negative_minima(
     radiance = lights @ grid.harmonics
     largest = np.abs(radiance).max(1)
     light_index, grid_index = _choose_starts(radiance, largest, rounding_radiance, grid, limits)
-    # SH coefficients of the 3 first and the 9 second derivatives of the light of each
-    # start direction, shape (starts, 12, K).
+    # For each start direction, the SH coefficients of the 3 first and the 9 second
+    # derivatives of its light. Axes: start, derivative, coefficient.
     derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
     directions = grid.directions[grid_index]
     for _ in range(_NEWTON_STEPS):

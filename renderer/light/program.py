@@ -8,9 +8,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 
-# `shortest` stops if two errors are at most this number: the violation of the
-# inequalities, divided by the largest magnitude of their right sides, and the duality gap
-# (sum of the products of slacks and multipliers), divided by the squared length of y.
+# `shortest` stops if two errors are at most this number. The first is the violation of the
+# inequalities, relative to their right sides. The second is the duality gap (the sum of
+# the products of slacks and multipliers), relative to the squared length of y.
 _TOLERANCE = 1e-9
 # `shortest` stops only if y = matrixᵀ multipliers holds, too, up to this number times the
 # length of y.
@@ -100,7 +100,7 @@ class _Iterate:
     """
 
     def __init__(self, matrix: Array, lower_bounds: Array):
-        """Start with y = 0, and with positive slacks and multipliers."""
+        """Start with y = 0, positive slacks and equal positive multipliers."""
         self._matrix = matrix
         self._lower_bounds = lower_bounds
         self.y = np.zeros(matrix.shape[1])

@@ -412,7 +412,7 @@ def sample_gloss(
 
     Args:
         mesh: Mesh that the view shows, with F faces.
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
             of the mesh.
 
@@ -474,7 +474,7 @@ def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
     Args:
         face_values: A value for each of the F faces of the mesh, shape (F,), or
             one value that all faces share, shape (1,).
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
 
     Returns:
         Values at the samples, shape (S,). A shared value is returned as it is,
@@ -492,7 +492,7 @@ def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
     The vectors are differentiable with respect to the vertices.
 
     Args:
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
         vertices: Vertex positions in world axes, shape (V, 3).
 
     Returns:

@@ -67,7 +67,7 @@ def radiance(
     albedo.
 
     Args:
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         vertices: Vertex positions in world axes, shape (V, 3).
         light: SH coefficients of any degree, shape (K, 3).
         albedo: Linear albedo at the samples (see `renderer.surface.albedo`),
@@ -120,7 +120,7 @@ def glossy_radiance(
     albedo and the gloss.
 
     Args:
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         vertices: Vertex positions in world axes, shape (V, 3).
         light: SH coefficients of any degree, shape (K, 3).
         albedo: Linear albedo at the samples, shape (S, 3).
@@ -563,7 +563,7 @@ def normals_in_sight(
     """Compute the normals of the vertices of all faces that a view shows.
 
     Args:
-        fragments: Covered samples of the view, which show the seen faces.
+        fragments: Samples of the view that show the mesh. Their faces are seen.
         vertices: Vertex positions in world axes, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
 
@@ -596,7 +596,7 @@ def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float
     point to the side of the camera.
 
     Args:
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         normals: Vertex normals, shape (V, 3).
 
     Returns:

@@ -65,7 +65,7 @@ class Texture:
         require_bounded(texture=values)
         height = values.shape[0]
         width = values.shape[1]
-        # All texels of each channel in row-major order, shape (C, H · W).
+        # One row for each channel, with all texels in row-major order.
         channels = values.flatten(0, 1).T
         look_up = partial(torch.index_select, channels, 1)
         return Texture(height=height, width=width, look_up=look_up)
@@ -74,19 +74,19 @@ class Texture:
 def surface_albedo(
     mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
 ) -> Tensor:
-    """Compute the albedo of a mesh at the samples of a view.
+    """Compute the albedo of a mesh at the samples of a view that show the mesh.
 
-    The albedo is the interpolated color of the corners times the interpolated
+    The albedo is the interpolated color of the face corners times the interpolated
     texture. Colors and texels are decoded to linear values before they are
     interpolated.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         encoding: Encoding of the colors and textures of the mesh, "linear" or
             "srgb".
-        textures: Linear albedo that replaces the textures of the mesh, shape
-            (H, W, 3) each. The result is differentiable with respect to it.
+        textures: Textures of linear albedo that replace those of the mesh, shape
+            (H, W, 3) each. The result is differentiable with respect to them.
             None uses the textures of the mesh.
 
     Returns:
@@ -107,13 +107,13 @@ def surface_albedo(
 
 
 def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Interpolate the textures of a mesh at the samples of a view.
+    """Look up the textures of a mesh at the samples of a view, with interpolation.
 
     Args:
-        textures: Textures with C channels. `mesh.texture_ids` holds, for each
-            face, the index of its texture in this sequence.
+        textures: Textures with C channels. For each face, `mesh.texture_ids` has
+            the index of its texture in this sequence.
         mesh: Mesh that the view shows. It provides the texture coordinates.
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
 
     Returns:
         Linear values at the samples, shape (C, S). Samples of faces without a
@@ -121,13 +121,12 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
     """
     sample_uvs = _interpolated_uvs(mesh, fragments)
     texture_of_face = _texture_of_seen_face(mesh, fragments)
-    # In most meshes, all faces have the same texture. No samples need to be
-    # selected then.
+    # In most meshes, all faces have the same texture. Then it is looked up at all samples.
     if len(textures) == 1 and bool((texture_of_face == FIRST_TEXTURE).all()):
         return interpolate_texture(textures[0], sample_uvs)
     sample_to_seen_face = fragments.sample_to_seen_face
     texture_of_sample = texture_of_face.index_select(0, sample_to_seen_face)
-    # Interpolate each texture at the samples that show it.
+    # For each texture, the samples that show it, and the values of the texture there.
     samples_by_texture = []
     values_by_texture = []
     for texture_id, texture in enumerate(textures):
@@ -136,10 +135,10 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
         uvs = sample_uvs.index_select(1, samples)
         values_by_texture.append(interpolate_texture(texture, uvs))
     textured_samples = torch.cat(samples_by_texture)
-    # Values of the samples in the order of `textured_samples`, shape (C, textured samples).
+    # One row for each channel, one column for each sample in `textured_samples`.
     textured_values = torch.cat(values_by_texture, 1)
-    # Samples of faces with NO_TEXTURE keep the value 1.
     channel_count = len(textured_values)
+    # Samples of faces without a texture keep the value 1.
     values = textured_values.new_ones(channel_count, len(texture_of_sample))
     return values.index_copy(1, textured_samples, textured_values)
 
@@ -147,8 +146,9 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
 def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
     """Interpolate a texture bilinearly at N points.
 
-    The texture repeats outside of [0, 1]. Column i is centered at
-    u = (i + 0.5) / width. v points up, and the texture's lower edge is v = 0.
+    The texture coordinates are u (to the right) and v (up). The texture covers
+    [0, 1] in both and repeats beyond. The center of column i is at
+    u = (i + 0.5) / width.
 
     Args:
         texture: Texture with C channels.
@@ -158,31 +158,32 @@ def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
         Interpolated linear values, shape (C, N).
     """
     values_by_block = []
-    # Processing BLOCK points at a time limits the memory.
+    # The points are processed in blocks to limit the memory.
     for block_uvs in uvs.split(BLOCK, dim=1):
         weighted_texels = [
             weight * texture.look_up(texel)
             for weight, texel in _surrounding_texels(texture, block_uvs)
         ]
-        # Sum over the four texels, shape (C, points of the block).
+        # Add up the weighted values of the four texels around each point.
         values_by_block.append(reduce(torch.add, weighted_texels))
     return torch.cat(values_by_block, dim=1)
 
 
 def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Find the four texels between which each of N points lies, and their bilinear weights.
+    """Find the four texels around each of N points, and their weights for interpolation.
 
     Args:
         texture: Texture in which the points lie.
         uvs: Texture coordinates u and v of the points, shape (2, N).
 
     Returns:
-        Four pairs, one for each texel of a point. A pair has the weights of the
-        texels, shape (N,), and their indices, row · width + column, shape (N,).
-        The four weights of a point add up to 1.
+        Four pairs: for the upper left, upper right, lower left and lower right
+        texel of each point. A pair has the bilinear weights of these texels,
+        shape (N,), and their indices row · width + column, shape (N,). The four
+        weights of a point add up to 1.
     """
     u, v = uvs
-    # v points up, but row 0 is at the top.
+    # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)
     columns = _neighbors(u, texture.width)
     texels = []
@@ -194,20 +195,22 @@ def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Ten
 
 
 def _neighbors(coordinate: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
-    """Find the two lines of texels (rows or columns) between which each of N points lies.
+    """Find the two columns of texels, or the two rows, between which each of N points lies.
+
+    Columns and rows are both called lines.
 
     Args:
-        coordinate: Coordinate of the points across the lines, shape (N,). The
-            texture is [0, 1] and repeats beyond.
+        coordinate: Coordinate of the points in the direction in which the lines
+            are counted, shape (N,). The texture is [0, 1] and repeats beyond.
         count: Number of lines.
 
     Returns:
         Two pairs, the first for the line before each point and the second for
         the line after it. A pair has the index of the line, a whole
-        floating-point number in [0, count), and its linear weight, shape (N,)
-        each.
+        floating-point number in [0, count), and its weight for linear
+        interpolation, shape (N,) each.
     """
-    # Line i is centered at the position i.
+    # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5
     line_before = position.floor()
     fraction = position - line_before
@@ -231,7 +234,7 @@ def _modulo(index: Tensor, count: int) -> Tensor:
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
-    """Convert the textures of a mesh to `Texture` objects, which return linear values.
+    """Convert the 8-bit textures of a mesh to `Texture` objects, which return linear values.
 
     Args:
         mesh: Mesh with textures of eight bits per channel.
@@ -241,8 +244,8 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     Returns:
         Textures with three channels of linear albedo.
     """
-    # A channel has only 256 possible values. Each of them is decoded once here,
-    # and texels are looked up in the table of decoded values.
+    # A channel has only 256 possible values. A table with the linear value of each saves
+    # decoding every texel.
     eight_bit_values = torch.arange(256, dtype=torch.float64) / 255
     linear_values = decode(eight_bit_values, encoding).to(like)
     textures = []
@@ -269,19 +272,19 @@ def _look_up_packed(packed_texels: Tensor, linear_values: Tensor, texels: Tensor
         Linear red, green and blue, shape (3, N).
     """
     first_bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=packed_texels.device)
-    # Values from 0 to 255 of red, green and blue, shape (3, N).
+    # Values from 0 to 255: one row for each color, one column for each texel.
     eight_bit_values = (packed_texels.index_select(0, texels) >> first_bits) & 255
     return linear_values.index_select(0, eight_bit_values.long().flatten()).view(3, -1)
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
-    """Look up the albedo of the face that each sample shows, if each face has one albedo.
+    """Look up the albedo at the samples of a mesh with one albedo per face.
 
     The result is differentiable with respect to `albedo`.
 
     Args:
         albedo: Linear albedo of the F faces of the mesh, shape (F, 3).
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
 
     Returns:
         Linear albedo at the samples, shape (S, 3).
@@ -303,16 +306,16 @@ def paint_faces(
     added: Tensor,
     hue: Tensor | None = None,
 ) -> Tensor:
-    """Rotate the hue of the faces of a mesh, add a color to each face, and sample the albedo.
+    """Compute the albedo at samples after a change of the hue and color of each face.
 
-    The albedo is scaled and changed at corners and texels with
-    `changed_albedo`, and interpolated afterwards. Textures of image files can
-    therefore store the changed albedo (see `renderer.surface.texture_bake`). The
-    result is differentiable with respect to `added` and `hue`.
+    The albedo is scaled. Then the hue is rotated and a color is added at corners
+    and texels (`changed_albedo`), before they are interpolated. The changed albedo
+    can therefore be stored in image files (see `renderer.surface.texture_bake`).
+    The result is differentiable with respect to `added` and `hue`.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         encoding: Encoding of the colors and textures of the mesh, "linear" or
             "srgb".
         albedo_scale: Factor for the albedo of the mesh.
@@ -334,25 +337,25 @@ def paint_faces(
     hue_of_face = None
     hue_at_samples = None
     if hue is not None:
-        # The gradient of index_select is added up in the same order for any number
-        # of threads. The gradient of `hue[faces]` is not.
+        # Unlike `hue[faces]`, `index_select` adds up gradients in the same order for any
+        # number of threads.
         hue_of_face = hue.index_select(0, fragments.faces)
         hue_at_samples = hue_of_face.index_select(0, sample_to_seen_face)
 
     # First, change the corners and interpolate them, as if no face had a texture.
     seen_faces = fragments.faces.cpu().numpy()
     corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0)).to(added)
-    # Shape (G, 3, 3), for three corners and three channels.
+    # Axes: seen face, corner, channel.
     corner_albedo = decode(corner_colors, encoding) * albedo_scale
-    # The three corners of a face share its hue and its added color.
+    # A new axis for the corners, because the three corners of a face have the same hue.
     corner_hue = None if hue_of_face is None else hue_of_face[:, None]
     painted_corners = changed_albedo(corner_albedo, corner_hue, added_to_face[:, None])
     albedo = fragments.interpolate(painted_corners)
     if not mesh.textures:
         return albedo
 
-    # Then replace the samples of faces with a texture. Their texels are changed
-    # before they are interpolated.
+    # Then replace the albedo at samples of faces with a texture: change the texels of the
+    # texture, and interpolate them.
     colors = _interpolated_colors(mesh, fragments, encoding)
     scaled_colors = (colors * albedo_scale).to(added)
     sample_uvs = _interpolated_uvs(mesh, fragments)
@@ -377,7 +380,7 @@ def paint_faces(
 def _interpolate_painted_texels(
     texture: Texture, uvs: Tensor, colors: Tensor, hue: Tensor | None, added: Tensor
 ) -> Tensor:
-    """Rotate the hue of the four texels around each of N points, add a color, and interpolate.
+    """Interpolate a texture at N points after a change of the hue and color of its texels.
 
     Args:
         texture: Texture with three channels.
@@ -396,7 +399,6 @@ def _interpolate_painted_texels(
         texel_albedo = colors * texture.look_up(texel).T
         painted_texel = changed_albedo(texel_albedo, hue, added)
         weighted_texels.append(weight.to(added)[:, None] * painted_texel)
-    # Sum over the four texels.
     return reduce(torch.add, weighted_texels)
 
 
@@ -420,32 +422,31 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
     if hue is not None:
         angle = torch.deg2rad(hue)[..., None]
         gray = albedo.mean(-1, keepdim=True)
-        # Rodrigues' formula for a rotation about the gray axis (1, 1, 1) / √3. The
-        # cross product of the axis and the albedo is a difference of permuted
-        # channels.
+        # Cross product of the gray axis (1, 1, 1) / √3 and the albedo, for Rodrigues'
+        # formula of the rotation about this axis.
         cross_product = (albedo.roll(1, -1) - albedo.roll(-1, -1)) / math.sqrt(3)
         rotated = gray + angle.cos() * (albedo - gray) + angle.sin() * cross_product
     return clamp(rotated + added, albedo.clamp(min=1))
 
 
 def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | None:
-    """Return the albedo of the seen faces if all of them have the same albedo.
+    """Return the albedo of the faces that a view shows if all of them have the same albedo.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Covered samples of the view, which show the seen faces.
+        fragments: Samples of the view that show the mesh, with their faces.
         encoding: Encoding of the colors of the mesh, "linear" or "srgb".
 
     Returns:
         Linear albedo, float64, shape (3,). None if the mesh has a texture, if
-        two corners of seen faces differ in color, or if no face is seen.
+        two corners of these faces differ in color, or if the view shows no face.
 
     Raises:
         InputError: If a color has NaN or infinite values.
     """
     if mesh.packed_textures:
         return None
-    # Shape (3 G, 3), for the corners of the seen faces and three channels.
+    # One row for each corner of the seen faces, one column for each channel.
     albedo = _corner_albedo(mesh, fragments, encoding).flatten(0, 1)
     if len(albedo) == 0:
         return None
@@ -460,7 +461,7 @@ def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Ten
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
         encoding: Encoding of the colors, "linear" or "srgb".
 
     Returns:
@@ -469,11 +470,11 @@ def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Ten
     corner_albedo = _corner_albedo(mesh, fragments, encoding)
     if not mesh.one_color_per_face:
         return fragments.interpolate(corner_albedo)
-    # The corners of a face have the same color, so take the first corner. Shape
-    # (3, G) for G seen faces.
+    # All corners of a face have the same color, so take the first corner. One row for each
+    # channel, one column for each seen face.
     face_colors = corner_albedo[:, 0].T.contiguous()
     sample_to_seen_face = fragments.sample_to_seen_face
-    # In float64, gather takes a third of the time of index_select.
+    # In float64, `gather` takes a third of the time of `index_select`.
     return face_colors.gather(1, sample_to_seen_face.expand(3, -1)).T
 
 
@@ -482,7 +483,7 @@ def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
         encoding: Encoding of the colors, "linear" or "srgb".
 
     Returns:
@@ -504,13 +505,13 @@ def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Tensor:
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
 
     Returns:
         Texture coordinates u and v, float64, shape (2, S).
     """
     seen_faces = fragments.faces.cpu().numpy()
-    # Shape (G, 3, 2) for G seen faces, three corners, u and v.
+    # Axes: seen face, corner, texture coordinate (u or v).
     corner_uvs = torch.from_numpy(mesh.corner_uvs.take(seen_faces, axis=0))
     return fragments.interpolate(corner_uvs.to(fragments.coverage)).T
 
@@ -520,7 +521,7 @@ def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Tensor:
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
 
     Returns:
         Index of the texture, or `NO_TEXTURE`, shape (G,).
@@ -531,17 +532,16 @@ def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Tensor:
 
 
 def _at_samples(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up, at each sample, the values of the face that the sample shows.
+    """Look up the values of the face that each sample shows.
 
     Args:
         face_values: D values for each of the G faces that the view shows,
             shape (G, D).
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
 
     Returns:
         Values at the samples, shape (S, D).
     """
     sample_to_seen_face = fragments.sample_to_seen_face
-    # Selecting columns of the transposed matrix takes half the time of selecting
-    # rows of D values.
+    # Selecting columns of the transposed matrix takes half the time of selecting rows.
     return face_values.T.contiguous().index_select(1, sample_to_seen_face).T

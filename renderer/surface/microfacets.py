@@ -23,14 +23,13 @@ from torch import Tensor
 
 from renderer.vectors import unit
 
-# Refractive index of dielectrics in `fresnel`. 1.5 is typical of varnish, and the
-# default of glTF.
+# Refractive index of dielectric (non-metallic) surfaces. 1.5 is typical of varnish, and
+# the default of glTF.
 REFRACTIVE_INDEX = 1.5
 
-# Indices of the three Fresnel terms along the first axis of the results of
-# `fresnel` and `reflectance`. SCHLICK and EDGE are the two parts of Schlick's
-# approximation F0 + (F90 - F0) (1 - cosine)⁵: SCHLICK has F0 = 1 and F90 = 0, and
-# EDGE has F0 = 0 and F90 = 1. DIELECTRIC is exact for REFRACTIVE_INDEX.
+# Indices of the three Fresnel terms in the results of `fresnel` and `reflectance`. For
+# metals, Schlick's approximation is F0 + (F90 - F0) (1 - cosine)⁵ = F0 · SCHLICK + F90 ·
+# EDGE. For other surfaces, DIELECTRIC is exact.
 SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
@@ -38,8 +37,9 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
     """Compute π times the specular reflectance (BRDF) for light from single directions.
 
     In the units of this project, a diffuse surface reflects the radiance
-    albedo · irradiance. π times the BRDF takes the place of the albedo. The
-    result is differentiable with respect to all arguments.
+    albedo · irradiance, without the usual division by π. A specular surface
+    therefore reflects π · BRDF · irradiance. The result is differentiable with
+    respect to all arguments.
 
     Args:
         normals: Unit surface normals n, shape (..., 3). If a normal faces away
@@ -52,12 +52,12 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
         π times the BRDF for each of the three Fresnel terms SCHLICK, EDGE and
         DIELECTRIC, shape (3, ...).
     """
-    # Half vector h between v and l. `unit` takes the three components of the
-    # vectors along the first axis.
+    # Unit half vectors h. `unit` takes vectors with their components along the first axis.
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
-    # α = r² (module docstring).
+    # The width parameter of the distribution is α = roughness².
     alpha_squared = roughness**4
-    # π D G / (4 (n·l) (n·v)), in which the cosines cancel.
+    # The next lines compute π D G / (4 (n·l) (n·v)) with the distribution D and the masking
+    # term G. The denominator cancels with a factor of G.
     without_fresnel = _distribution((half * normals).sum(-1), alpha_squared)
     for direction in (toward, directions):
         cosine = (direction * normals).sum(-1)
@@ -67,7 +67,9 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
 
 
 def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Compute π D, which is π times the GGX distribution of microfacet normals.
+    """Compute π times the GGX distribution D of the normals of microfacets.
+
+    D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33.
 
     Args:
         cosine: Cosine n·h between surface normal and half vector, shape (...).
@@ -80,11 +82,11 @@ def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
 
 
 def _masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Compute c + √(α² + (1 - α²) c²), the denominator of Smith's masking term G₁(c).
+    """Compute the denominator of Smith's masking term G₁(c).
 
-    The numerator of G₁(c) is 2 c. The numerators for the light and for the
-    camera cancel with the denominator 4 (n·l) (n·v) of the BRDF, so they are not
-    needed. Without them, the BRDF stays finite at grazing angles.
+    G₁(c) is 2 c / (c + √(α² + (1 - α²) c²)). The BRDF contains
+    G₁(n·l) G₁(n·v) / (4 (n·l) (n·v)), in which the numerators 2 c cancel. So only
+    the denominators are needed, and the BRDF stays finite at grazing angles.
 
     Args:
         cosine: Cosine c between the normal and the direction to the light or to
@@ -114,8 +116,8 @@ def fresnel(cosine: Tensor) -> Tensor:
     """
     # By Snell's law, this is REFRACTIVE_INDEX times the cosine of the refracted ray.
     refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()
-    # Reflected fractions of the amplitude, for light that is polarized
-    # perpendicular to the plane of incidence, and parallel to this plane.
+    # Reflected fraction of the amplitude of light that is polarized perpendicular to the
+    # plane of incidence.
     perpendicular = (refracted - cosine) / (refracted + cosine)
     numerator = cosine * (refracted + cosine) - 1
     denominator = cosine * (refracted - cosine) + 1

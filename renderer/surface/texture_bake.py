@@ -33,14 +33,13 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
 from renderer.surface.albedo import changed_albedo
 
-# Approximate limit for the number of texels of a new texture. If the charts would
-# need more texels, `_Charts` reduces their resolution.
+# Approximate limit for the number of texels of a new texture. If it would have more texels,
+# its resolution is reduced.
 MAX_TEXELS = 2**26
-# Number of texels that `_TextureSheet.paint` computes at once. It limits the
-# memory.
+# Number of texels of a new texture that are computed at once. It limits the memory.
 BLOCK = 2**20
-# `_pack` chooses the width of the sheet so that a square sheet has this many
-# times the area of the charts, because packing leaves gaps.
+# Rectangles on a new texture leave gaps. A square with this many times their total area is
+# expected to hold them.
 SHEET_MARGIN = 1.05
 # Number of values of a channel with eight bits.
 CHANNEL_VALUES = 256
@@ -53,10 +52,11 @@ def with_added_albedo(
     albedo_scale: float = 1.0,
     hue: np.ndarray | None = None,
 ) -> tuple[Mesh, float]:
-    """Return a copy of a mesh whose colors and textures hold a changed albedo.
+    """Return a copy of a mesh whose colors and textures hold the albedo after an attack.
 
-    New textures have 8 bits per channel. They hold the texture times the corner
-    colors, and faces with a texture get white corners.
+    An attack rotates the hue of each face and adds a color to it. New textures
+    have 8 bits per channel. They hold the product of the old texture and the
+    corner colors, so faces with a texture get white corners.
 
     Args:
         mesh: Mesh with F faces.
@@ -75,7 +75,7 @@ def with_added_albedo(
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     eight_bit_values = torch.arange(CHANNEL_VALUES, dtype=torch.float32) / (CHANNEL_VALUES - 1)
-    # Linear value of each of the 256 values of an 8-bit texel.
+    # Table of the linear values that belong to the 256 values of an 8-bit texel.
     linear_values = decode(eight_bit_values, encoding)
     painter = _Painter(
         encoding=encoding,
@@ -85,10 +85,10 @@ def with_added_albedo(
         hue=None if hue is None else torch.from_numpy(hue).float(),
     )
 
-    # Faces with a texture keep these white corners.
+    # White corners for faces with a texture. Those of other faces are replaced below.
     colors = np.ones_like(mesh.corner_colors)
     untextured_faces = np.flatnonzero(mesh.texture_ids < 0)
-    # All corners of these faces, shape (3 · number of faces, 3).
+    # One row for each of the three corners of each face, one column for each channel.
     untextured_albedo = corner_albedo[untextured_faces].flatten(0, 1)
     painted = painter.paint(untextured_albedo, untextured_faces.repeat(3))
     colors[untextured_faces] = painted.view(-1, 3, 3).numpy()
@@ -124,12 +124,11 @@ def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) ->
             shape (256,).
 
     Returns:
-        The largest channel of a corner, times the largest channel of a texel if
-        all faces have a texture.
+        The largest value in the corner colors. If all faces have a texture, it is
+        multiplied by the largest value in the textures.
     """
     largest_corner = float(corner_albedo.max())
     if not (mesh.texture_ids >= 0).all():
-        # A face without a texture has the full corner color.
         return largest_corner
     largest_texel = max(
         (float(linear_values[texture.max()]) for texture in mesh.textures), default=1.0
@@ -139,7 +138,7 @@ def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) ->
 
 @dataclass(frozen=True)
 class _Painter:
-    """Change of the albedo of F faces: rotation of the hue, and an added color.
+    """Change of the albedo of F faces by an attack: a rotation of the hue and an added color.
 
     Attributes:
         encoding: Encoding of the changed albedo, "linear" or "srgb".
@@ -157,7 +156,9 @@ class _Painter:
     hue: Tensor | None
 
     def paint(self, albedo: Tensor, faces: np.ndarray) -> Tensor:
-        """Change the albedo at N points, divide it by `new_scale` and encode it.
+        """Rotate the hue of the albedo at N points, add the color of the face, and encode it.
+
+        The changed albedo is divided by `new_scale` before it is encoded.
 
         Args:
             albedo: Linear albedo at the points, shape (N, 3).
@@ -172,10 +173,10 @@ class _Painter:
 
 
 class _TextureSheet:
-    """New texture that replaces one texture of a mesh, with a chart for each face.
+    """New texture that replaces one texture of a mesh, with its own texels for each face.
 
-    A chart is the rectangle of the new texture that belongs to one face. N faces
-    of the mesh have the old texture. The new texture has H rows and W columns.
+    N faces of the mesh have the old texture. A chart is the rectangle of the new
+    texture that belongs to one face. The new texture has H rows and W columns.
 
     Attributes:
         charts: Charts of the N faces.
@@ -211,17 +212,17 @@ class _TextureSheet:
         """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss.
 
         Args:
-            painter: Change of the albedo.
+            painter: Rotation of the hue and added color of each face of the mesh.
             corner_albedo: Linear color of the three corners of each of the N
-                faces, shape (N, 3, 3).
-            linear_values: Linear value of each 8-bit value of the old texture,
-                shape (256,).
+                faces, by which the texels are multiplied, shape (N, 3, 3).
+            linear_values: Table of the linear values that belong to the 256 values
+                of an 8-bit texel of the old texture, shape (256,).
         """
         block_count = 1 + self.charts.texel_count // BLOCK
         for charts in np.array_split(np.arange(len(self._faces)), block_count):
             texels = self.charts.texels(charts)
             old_position = texels.position / self.charts.scale
-            # The modulo is needed because the old texture repeats.
+            # Column and row in the old texture. The modulo is there because it repeats.
             old_texel = np.floor(old_position).astype(np.int64) % self._old_size
             old_column, old_row = old_texel.T
             albedo = linear_values[torch.from_numpy(self._old_texture[old_row, old_column]).int()]
@@ -230,9 +231,9 @@ class _TextureSheet:
             painted = painter.paint(albedo, face_of_texel)
             column, row = texels.sheet_position.T
             self.texture[row, column] = to_bytes(painted).numpy()
-            # The old gloss texture may have another size than the old texture, so
-            # find the gloss texel in which the position lies.
             gloss_height, gloss_width, _ = self._old_gloss_texture.shape
+            # The old gloss texture may have another size than the old texture, so scale the
+            # position.
             gloss_position = old_position / self._old_size % 1 * (gloss_width, gloss_height)
             gloss_column, gloss_row = gloss_position.astype(np.int64).T
             self.gloss_texture[row, column] = self._old_gloss_texture[gloss_row, gloss_column]
@@ -247,20 +248,22 @@ class _TextureSheet:
                 faces, shape (N, 3, 3).
         """
         if not self._mesh.one_color_per_face:
-            # Sum over the three corners k, for texels n and channels c.
             weights = torch.from_numpy(self.charts.weights(texels)).float()
+            # Weighted sum over the three corners k, for each texel n and channel c.
             albedo *= torch.einsum("nk,nkc->nc", weights, corner_albedo[texels.chart])
         elif not (self._mesh.corner_colors[self._faces] == 1).all():
-            # The corners of a face have the same color, so take the first corner.
+            # All corners of a face have the same color, so take the first corner.
             albedo *= corner_albedo[texels.chart, 0]
 
 
 class _Texels(NamedTuple):
-    """T texels of a new texture, and the faces to whose charts they belong.
+    """T texels of a new texture, and where they lie in the old texture.
+
+    The new texture has a rectangle (chart) for each face with the old texture.
 
     Attributes:
         chart: Index of the chart of each texel, shape (T,). Chart i belongs to
-            face i of the faces with the texture.
+            face i of the faces with the old texture.
         sheet_position: Column and row of each texel in the new texture,
             shape (T, 2).
         position: Position of the center of each texel in the old texture,
@@ -274,7 +277,7 @@ class _Texels(NamedTuple):
 
 
 class _Charts:
-    """Rectangles (charts) for N faces on a new texture (the sheet).
+    """Rectangles (charts) on a new texture (the sheet), one for each of N faces.
 
     Attributes:
         scale: Number of new texels per old texel along each axis, at most 1.
@@ -292,24 +295,25 @@ class _Charts:
                 each face, shape (N, 3, 2).
             old_size: Number of columns and rows of the old texture.
         """
-        # v points up, and rows are counted from the top.
+        # Positions of the corners as pairs of column and row, counted from the top. The
+        # texture coordinate v points up.
         old_positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * old_size
-        # Sum of the areas of the charts, in old texels. Each chart is up to two
-        # texels wider and higher than its face.
+        # Total area of the charts, in old texels. A chart is up to two texels wider and
+        # higher than its face.
         area = (np.ptp(old_positions, axis=1) + 2).prod(axis=1).sum()
         self.scale = min(1.0, np.sqrt(MAX_TEXELS / max(area, 1)))
-        # Positions of the corners in units of new texels, shape (N, 3, 2).
+        # The same positions in units of new texels. Axes: face, corner, column or row.
         self._positions = old_positions * self.scale
-        # First and last column and row of each chart, shape (N, 2). Bilinear
-        # interpolation at a position reads the texels whose centers surround it.
+        # First column and row of each chart: bilinear interpolation also reads the texel
+        # whose center is to the left of, or above, the position.
         self._first_texel = np.floor(self._positions.min(axis=1) - 0.5).astype(np.int64)
         last_texel = np.floor(self._positions.max(axis=1) - 0.5).astype(np.int64) + 1
-        # Number of columns and rows of each chart, shape (N, 2).
+        # Number of columns and rows of each chart, one row for each chart.
         self._size = last_texel + 1 - self._first_texel
-        # Column and row of the top left texel of each chart on the sheet.
+        # Column and row on the sheet of the top left texel of each chart.
         self._sheet_corner, self.sheet_size = _pack(self._size)
         self.texel_count = int(self._size.prod(axis=1).sum())
-        # Each face moves with its chart.
+        # Positions of the corners on the sheet: each face moves with its chart.
         sheet_positions = self._positions + (self._sheet_corner - self._first_texel)[:, None]
         self.uvs = sheet_positions / self.sheet_size * [1, -1] + [0, 1]
 
@@ -326,8 +330,8 @@ class _Charts:
         texels_per_chart = self._size[charts].prod(axis=1)
         chart_of_texel = np.repeat(charts, texels_per_chart)
         texels_before_chart = texels_per_chart.cumsum() - texels_per_chart
-        # Row-major number of each texel in its chart.
         all_numbers = np.arange(len(chart_of_texel))
+        # Row-major index of each texel within its chart.
         number_in_chart = all_numbers - np.repeat(texels_before_chart, texels_per_chart)
         columns_of_chart = self._size[chart_of_texel, 0]
         row, column = np.divmod(number_in_chart, columns_of_chart)
@@ -335,14 +339,15 @@ class _Charts:
         return _Texels(
             chart=chart_of_texel,
             sheet_position=self._sheet_corner[chart_of_texel] + position_in_chart,
-            # The center of a texel is half a texel from its corner.
+            # The center of a texel is half a texel from its top left corner.
             position=self._first_texel[chart_of_texel] + position_in_chart + 0.5,
         )
 
     def weights(self, texels: _Texels) -> np.ndarray:
-        """Compute the barycentric weights of T texels in the faces of their charts.
+        """Compute the barycentric weights of T texels in the faces to which they belong.
 
-        A texel beside its face gets weights of the border of the face.
+        A texel outside of its face has a negative weight, which is set to 0. The
+        other weights are then scaled to the sum 1.
 
         Args:
             texels: The T texels.
@@ -351,13 +356,13 @@ class _Charts:
             Weights of the three corners of the face, at least 0, with the sum 1,
             shape (T, 3).
         """
-        # Vectors from the first corner to the second and the third corner,
-        # shape (N, 2, 2).
+        # Vectors from the first corner to the second and the third corner. Axes: face,
+        # vector, column or row.
         edges = self._positions[:, 1:] - self._positions[:, :1]
-        # The pseudoinverse also exists if a face has no area in the texture.
+        # A face without area in the texture has no inverse matrix, but a pseudoinverse.
         inverse_edges = np.linalg.pinv(edges)
         from_first_corner = texels.position - self._positions[texels.chart, 0]
-        # Weights of the second and the third corner, shape (T, 2).
+        # Weights of the second and the third corner, one row for each texel.
         last_weights = np.einsum("ni,nij->nj", from_first_corner, inverse_edges[texels.chart])
         first_weight = 1 - last_weights.sum(axis=1, keepdims=True)
         weights = np.concatenate([first_weight, last_weights], axis=1).clip(min=0)
@@ -383,10 +388,9 @@ def _pack(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     widest = int(sizes[:, 0].max(initial=1))
     sheet_width = max(int(np.sqrt(area * SHEET_MARGIN)), widest)
     corners = np.empty_like(sizes)
-    # Position of the next rectangle.
     column = 0
     row = 0
-    # First row below all rectangles that have been placed.
+    # First row of the sheet below all rectangles that have been placed.
     free_row = 0
     by_falling_height = np.argsort(-sizes[:, 1], kind="stable")
     for index in by_falling_height:

@@ -24,19 +24,19 @@ from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import Rasterizer
 
-# Number of samples that `_blocks` and `interpolate_texture` process at once. The
-# values of so many samples stay in the cache of the processor.
+# Number of samples that are interpolated at once. Their values fit into the cache of the
+# processor.
 BLOCK = 2**14
 
-# Key under which `cached_property` stores `Fragments.barycentric` in the
-# attributes of an object.
+# Name under which `cached_property` stores the barycentric weights in the dictionary
+# `vars(fragments)` once they are computed.
 _WEIGHTS = "barycentric"
 
 
 class Runs(NamedTuple):
-    """R runs of neighboring samples that show the same face in the same pixel.
+    """Groups (runs) of successive samples that show the same face in the same pixel.
 
-    The runs are in the order of their samples.
+    There are R runs, in the order of their samples.
 
     Attributes:
         run_to_pixel: Index into `Fragments.pixels` of each run, ascending, int64,
@@ -55,7 +55,8 @@ class Runs(NamedTuple):
 class Fragments:
     """The S samples of an image that show a mesh, with their pixels and faces.
 
-    The samples of a pixel are neighbors in all tensors of shape (S,).
+    These samples are called covered. The samples of a pixel follow each other in
+    all tensors of shape (S,). The faces that samples show are called seen.
 
     Attributes:
         size: Width and height of the image in pixels.
@@ -123,27 +124,26 @@ class Fragments:
         Moreton 1991). The weights are therefore divided by the depths of the
         corners and normalized.
         """
-        # Shape (2, 3, G), for x and y, three corners and G seen faces.
+        # Axes: coordinates x and y, corner, seen face.
         outlines = self.outlines.permute(2, 1, 0)
-        # The edges b and c lead from the first corner to the second and the third
-        # corner, shape (2, 2, G).
+        # Vectors from the first corner to the second (b) and to the third corner (c), with
+        # the axes: coordinate, vector, seen face.
         edges = outlines[:, 1:] - outlines[:, :1]
         (bx, cx), (by, cy) = edges
         doubled_area = bx * cy - cx * by
-        # The divisor 1 avoids a division by 0. A face without area covers samples
-        # only because the rasterizer rounds, so its weights do not matter.
+        # Faces without area are divided by 1 instead of 0. They cover samples only because
+        # the rasterizer rounds, so their weights do not matter.
         edges_by_area = edges / doubled_area.masked_fill(doubled_area == 0, 1)
-        # The six rows x₀, y₀, bx / area, cx / area, by / area and cy / area. The
-        # first corner is (x₀, y₀). Shape (6, G).
+        # Six rows: x and y of the first corner, then bx, cx, by and cy, each divided by the
+        # doubled area. One column for each seen face.
         face_values = torch.cat([outlines[:, 0], edges_by_area.flatten(0, 1)])
         reciprocal_depths = None if self.depths is None else self.depths.T.reciprocal()
         weights = face_values.new_empty(3, len(self.sample_to_seen_face))
-        # `weight` is a view of up to BLOCK columns of `weights`. Writing to `weight` fills
-        # these columns.
+        # `weight` is a view of some columns of `weights`. Writing to it fills `weights`.
         for weight, sample_to_seen_face, position in _blocks(
             weights, self.sample_to_seen_face, self.positions().T
         ):
-            # gather takes a third of the time of index_select.
+            # `gather` takes a third of the time of `index_select`.
             values_at_samples = face_values.gather(
                 1, sample_to_seen_face.expand(len(face_values), -1)
             )
@@ -167,16 +167,16 @@ class Fragments:
             Positions (x, y), float64, shape (S, 2). x points to the right and y
             up, and the image is [-1, 1] in x and y.
         """
-        # Integers are divided as floating-point numbers, which takes a tenth of the
-        # time.
+        # Dividing floating-point numbers takes a tenth of the time of dividing integers.
         pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
         pixel_row, pixel_column = _divide(pixel_index, self.size)
         row_in_pixel, column_in_pixel = _divide(number_in_pixel, self.samples)
-        # Row and column among all samples of the image.
         resolution = self.size * self.samples
+        # Row and column of each sample among all samples of the image.
         column = pixel_column * self.samples + column_in_pixel
         row = pixel_row * self.samples + row_in_pixel
-        # A sample is the center of a square cell of width 2 / resolution.
+        # The image [-1, 1] is divided into square cells of width 2 / resolution. A sample
+        # is the center of its cell.
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
     def by_sample(self) -> "Fragments":
@@ -187,16 +187,14 @@ class Fragments:
             pixels per side and one sample per pixel. s is `samples`.
         """
         resolution = self.size * self.samples
-        # Row-major index in the finer image of each cell. The axes are the row of a
-        # pixel, the row in the pixel, the column of a pixel and the column in the
-        # pixel, shape (size, s, size, s).
-        cells = torch.arange(resolution**2, device=self.sample_numbers.device)
-        cells = cells.view(self.size, self.samples, self.size, -1)
-        # `sample_numbers` counts the cells of the first pixel, then the cells of the
-        # second pixel, and so on. The transpose gives the axes (row of a pixel, column
-        # of a pixel, row in the pixel, column in the pixel), which count in this order.
-        cells_by_pixel = cells.transpose(1, 2).flatten()
-        finer_pixels = cells_by_pixel.index_select(0, self.sample_numbers)
+        # Row-major index of each pixel of the finer image.
+        finer_indices = torch.arange(resolution**2, device=self.sample_numbers.device)
+        # Axes: row of a pixel, row in the pixel, column of a pixel, column in the pixel.
+        finer_indices = finer_indices.view(self.size, self.samples, self.size, -1)
+        # `sample_numbers` counts all samples of the first pixel, then all samples of the
+        # second pixel, and so on. The transpose brings the indices into this order.
+        indices_by_pixel = finer_indices.transpose(1, 2).flatten()
+        finer_pixels = indices_by_pixel.index_select(0, self.sample_numbers)
         finer = replace(
             self,
             size=resolution,
@@ -228,14 +226,15 @@ class Fragments:
         return self._share_weights(selected, samples)
 
     def _share_weights(self, copied: "Fragments", samples: Tensor | slice) -> "Fragments":
-        """Copy the cached barycentric weights to a copy that has some of these samples.
+        """Give a copy with some of these samples the barycentric weights of its samples.
 
-        The copy then does not compute the weights again. Nothing is copied if
-        the weights have not been computed yet.
+        The copy then does not compute the weights again. Nothing happens if the
+        weights have not been computed yet.
 
         Args:
-            copied: Copy of these fragments. Its cache is changed in place.
-            samples: Samples that the copy has, as indices or as a slice.
+            copied: Copy of these fragments, changed in place.
+            samples: Samples of these fragments that the copy has, as indices or as
+                a slice.
 
         Returns:
             The argument `copied`.
@@ -258,8 +257,8 @@ class Fragments:
         """
         image = values.new_full((self.size**2 * self.samples**2,), empty)
         image.index_copy_(0, self.sample_numbers, values)
-        # The axes are the row and column of a pixel, and the row and column in the
-        # pixel. They become (row, row in pixel, column, column in pixel).
+        # Axes: row of a pixel, column of a pixel, row in the pixel, column in the pixel.
+        # The transpose exchanges the second and the third axis.
         by_pixel = image.view(self.size, self.size, self.samples, self.samples)
         return by_pixel.transpose(1, 2).reshape(self.size * self.samples, -1)
 
@@ -275,13 +274,13 @@ class Fragments:
         Returns:
             Values of the covered samples, shape (S,).
         """
-        # The axes (row, row in pixel, column, column in pixel) become the row and
-        # column of a pixel, and the row and column in the pixel.
+        # Axes: row of a pixel, row in the pixel, column of a pixel, column in the pixel.
+        # The transpose exchanges the second and the third axis.
         by_row = image.view(self.size, self.samples, self.size, self.samples)
         return by_row.transpose(1, 2).flatten().index_select(0, self.sample_numbers)
 
     def interpolate(self, corners: Tensor) -> Tensor:
-        """Interpolate values of face corners at the S samples.
+        """Interpolate values at the corners of faces to the S samples.
 
         The result is differentiable with respect to `corners`.
 
@@ -292,15 +291,16 @@ class Fragments:
         Returns:
             Values at the samples, shape (S, D).
         """
-        # Shape (3 · D, G), with the D values of the first corner first.
+        # One column for each seen face: the D values of its first corner, then those of
+        # its second and its third corner.
         corner_rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(corner_rows, self.sample_to_seen_face, self.barycentric.T).T
 
     def distribute(self, values: Tensor) -> Tensor:
-        """Add values at samples to the three corners of the faces that the samples show.
+        """Add up values at samples for each corner of the faces that the samples show.
 
-        Each value is multiplied by the barycentric weight of the corner. This
-        is the transpose of `interpolate`.
+        Each value is multiplied by the barycentric weight of the corner at the
+        sample. This is the transpose of `interpolate`, as in backpropagation.
 
         Args:
             values: D values for each of the S samples, shape (S, D).
@@ -313,14 +313,14 @@ class Fragments:
         corner_rows = _distribute(
             values.T, self.sample_to_seen_face, self.barycentric.T, corner_rows_shape
         )
-        # Shape (3 · D, G), then (3, D, G), then (G, 3, D).
+        # The axes corner, value, seen face become seen face, corner, value.
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Add up the albedo of neighboring samples that show the same face in the same pixel.
+        """Add up the albedo of the samples of a pixel that show the same face.
 
         Such a group of samples is called a run. With flat normals, the samples
-        of a run share a normal, so they can be shaded together.
+        of a run have the same normal, so they can be shaded together.
 
         Args:
             albedo: C channels of albedo at each of the S samples, shape (S, C).
@@ -334,11 +334,11 @@ class Fragments:
               with respect to `albedo`.
         """
         if self.samples == 1 or len(self.sample_to_pixel) == 0:
-            # Each sample is a run of its own.
+            # With one sample per pixel, each sample is a group of its own.
             return self.sample_to_pixel, self.sample_to_seen_face, albedo
         runs = self.runs
         samples_per_run = runs.sample_count.cpu().numpy()
-        # NumPy's repeat takes a quarter of the time of torch's.
+        # `np.repeat` takes a quarter of the time of the function of torch.
         sample_to_run = np.repeat(np.arange(len(samples_per_run)), samples_per_run)
         scaled_albedo = albedo.T / self.samples**2
         zeros = albedo.new_zeros(albedo.shape[1], len(samples_per_run))
@@ -349,15 +349,15 @@ class Fragments:
 
     @cached_property
     def runs(self) -> Runs:
-        """Runs of neighboring samples that show the same face in the same pixel."""
-        # A run starts at each sample whose pixel or face differs from the sample before
-        # it. The additional last entry marks the end of the last run.
+        """Groups of successive samples that show the same face in the same pixel."""
         pixel = self.sample_to_pixel
         seen_face = self.sample_to_seen_face
+        # True if the pixel or the face of a sample differs from the sample before. An
+        # additional last entry marks the end of the last group.
         is_start = torch.ones(len(pixel) + 1, dtype=torch.bool, device=pixel.device)
         torch.ne(pixel[1:], pixel[:-1], out=is_start[1:-1])
         is_start[1:-1] |= seen_face[1:] != seen_face[:-1]
-        # NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
+        # `np.flatnonzero` takes a quarter of the time of `torch.nonzero`.
         start_indices = np.flatnonzero(is_start.cpu().numpy())
         starts = torch.from_numpy(start_indices).to(pixel.device)
         return Runs(
@@ -384,18 +384,18 @@ class Fragments:
 
 
 class _Interpolation(torch.autograd.Function):
-    """Interpolation of the corner values of faces at samples, as a function of autograd.
+    """Differentiable interpolation of values at the corners of faces to samples.
 
-    The S samples are processed in blocks. G faces have D values at each of their
-    three corners. The 3 · D values of a face are a column of a matrix, with the D
-    values of the first corner first.
+    There are S samples, which are processed in blocks to save memory. G faces
+    have D values at each of their three corners. The 3 · D values of a face are a
+    column of a matrix, with the D values of the first corner first.
     """
 
     @staticmethod
     def forward(
         ctx: Any, corner_rows: Tensor, sample_to_seen_face: Tensor, weights: Tensor
     ) -> Tensor:
-        """Interpolate the D values of three corners at each of S samples.
+        """Interpolate D values from the three corners of a face to each of S samples.
 
         Args:
             ctx: Context of autograd.
@@ -412,11 +412,11 @@ class _Interpolation(torch.autograd.Function):
         ctx.save_for_backward(sample_to_seen_face, weights)
         ctx.corner_rows_shape = corner_rows.shape
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
-        # `value` is a view of one block of `values`. Writing to `value` fills this block.
+        # `value` is a view of some columns of `values`. Writing to it fills `values`.
         for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
-            # Values of the three corners of the face at each sample of the block. `unflatten`
-            # gives the shape (3, D, samples of the block).
+            # For each sample of the block, the column of the face that the sample shows.
             at_corners = corner_rows.gather(1, seen_face.expand(len(corner_rows), -1))
+            # Axes: corner, value, sample.
             at_corners = at_corners.unflatten(0, (3, -1))
             torch.sum(at_corners.mul_(weight[:, None]), 0, out=value)
         return values
@@ -424,16 +424,17 @@ class _Interpolation(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the gradient by the D values of the three corners of G faces.
+        """Compute the gradient with respect to the values at the corners of G faces.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the D values at each of S samples,
+            upstream: Gradient with respect to the D values at each of S samples,
                 shape (D, S).
 
         Returns:
-            Gradient by the corner values, D rows for each of the three corners,
-            shape (3 · D, G), and None for the other two arguments of `forward`.
+            Gradient with respect to the D values at the first corners, then at the
+            second and at the third corners, shape (3 · D, G), and None for the
+            other two arguments of `forward`.
         """
         sample_to_seen_face, weights = ctx.saved_tensors
         gradient = _distribute(upstream, sample_to_seen_face, weights, ctx.corner_rows_shape)
@@ -446,7 +447,9 @@ def _distribute(
     weights: Tensor,
     corner_rows_shape: Sequence[int],
 ) -> Tensor:
-    """Add the values of S samples to the three corners of the faces that the samples show.
+    """Add up values at S samples for each corner of the faces that the samples show.
+
+    Each value is multiplied by the barycentric weight of the corner at the sample.
 
     Args:
         values: D values for each sample, shape (D, S).
@@ -462,20 +465,21 @@ def _distribute(
     """
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
-        # Shape (3, D, samples of the block), then (3 · D, samples of the block).
+        # Values times weights. Rows are pairs of corner and value, columns are samples.
         weighted = (weight[:, None] * value).flatten(0, 1)
         corner_rows.index_add_(1, seen_face, weighted)
     return corner_rows
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Split tensors along their last axis, whose length S they share, into blocks.
+    """Split several tensors along their last axis into blocks of BLOCK entries.
 
     Args:
-        tensors: Tensors of shape (..., S).
+        tensors: Tensors of shape (..., S) with the same S.
 
     Yields:
-        Views of all tensors, shape (..., BLOCK). The last block may be shorter.
+        For each block, one view of every tensor, shape (..., BLOCK). The last
+        block may be shorter.
     """
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
@@ -524,11 +528,12 @@ def build_fragments(
             reaches a perspective camera.
     """
     require_finite(vertices=torch.from_numpy(vertices))
-    # Shape (N, 3, V), so that each coordinate is contiguous in memory.
+    # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
+    # memory.
     coordinates = np.stack([camera.project(vertices).T for camera in cameras])
-    # View of the same memory with shape (N, V, 3).
     projected = coordinates.swapaxes(1, 2)
-    # The third coordinate is the depth, which is -1 at the near plane.
+    # The third coordinate is the depth. It is less than -1 in front of the near plane,
+    # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
     face_ids = rasterizer.rasterize(
         projected, faces, settings.size * settings.samples, closed=closed and is_uncut
@@ -541,7 +546,7 @@ def build_fragments(
 
 
 class _CoveredSamples(NamedTuple):
-    """Pixels of the S covered samples of one view.
+    """Pixels that contain the S covered samples (those that show a mesh) of one view.
 
     Attributes:
         pixels: Row-major indices of the P pixels with covered samples,
@@ -565,7 +570,7 @@ def _fragments_of_view(
     faces: np.ndarray,
     settings: ImageSettings,
 ) -> Fragments:
-    """Gather the covered samples of one view that has been rasterized.
+    """Create the `Fragments` of one view from the face at each sample of its image.
 
     Args:
         camera: Camera of the view.
@@ -581,22 +586,22 @@ def _fragments_of_view(
     """
     size = settings.size
     samples = settings.samples
-    # Bring the ids from the order of image rows into the order of pixels. The s
-    # neighboring ids that lie in the same row and pixel are moved together, as one
-    # item of the byte type "V". The axes are the row of a pixel, the row in the
-    # pixel and the column of a pixel.
-    row_parts = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
-    ids_by_pixel = row_parts.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)
+    # View the ids of neighboring samples in the same row and pixel as one item of bytes,
+    # so that they move together below. Axes: row of a pixel, row in the pixel, column of a
+    # pixel.
+    pixel_rows = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
+    # Bring the ids into the order of pixels instead of image rows.
+    ids_by_pixel = pixel_rows.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)
     covered_samples = np.flatnonzero(ids_by_pixel >= 0)
     seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
     covered = _group_by_pixel(covered_samples, size, samples)
-    # Shape (3, G). All first corners are contiguous in memory, because later code
-    # reads them together.
+    # One row for each corner, one column for each seen face. Rows are contiguous in
+    # memory, because later code reads all first corners together.
     corners = np.ascontiguousarray(faces.take(seen_faces, axis=0).T)
-    # Shape (2, 3, G), for x and y, three corners and G seen faces.
+    # Axes: coordinates x and y, corner, seen face.
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
-    # In the image, the corners of a face that is seen from behind are clockwise.
+    # A face is seen from behind if its corners are clockwise in the image.
     is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         size=size,
@@ -628,7 +633,7 @@ def _group_by_pixel(covered_samples: np.ndarray, size: int, samples: int) -> _Co
         Pixels of the samples.
     """
     if samples == 1:
-        # Each sample is a pixel of its own.
+        # With one sample per pixel, sample numbers and pixel indices are the same.
         return _CoveredSamples(
             pixels=covered_samples,
             sample_count=np.ones(len(covered_samples), dtype=np.int64),
@@ -660,12 +665,12 @@ def _compact(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
         - the G distinct values, ascending, shape (G,);
         - the index of each value among the distinct values, shape (S,).
     """
-    # Two lookups below would convert the values, so they are converted once here.
+    # Convert the indices once here. Otherwise, each of the two lookups would convert them.
     values = values.astype(np.intp)
     is_present = np.zeros(limit, dtype=bool)
     is_present[values] = True
     distinct_values = np.flatnonzero(is_present)
-    # Entries of values that do not occur stay undefined and are never read.
+    # Index of each value among the distinct values. Other entries stay undefined.
     value_to_index = np.empty(limit, dtype=np.intp)
     value_to_index[distinct_values] = np.arange(len(distinct_values))
     return distinct_values, value_to_index.take(values)

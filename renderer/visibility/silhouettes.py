@@ -48,17 +48,15 @@ from renderer.visibility.rasterizers.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# A silhouette counts as visible if it is at most this fraction of the mesh's depth
-# range behind the surface beside it. For example, an object that stands on a table
-# touches the table. By rounding, or because of how the object was modeled, its edge
-# may then lie slightly below the table.
-NEAR = 1e-3
+# A silhouette counts as visible if it is behind the surface beside it by at most this
+# fraction of the depth range of the mesh. For example, the lower edge of an object that
+# stands on a table may lie slightly below the table.
+VISIBILITY_TOLERANCE = 1e-3
 
-# Index of a sample that shows no mesh, instead of an index of a covered sample.
+# Stands for the index of a covered sample if a sample shows no mesh.
 NOT_COVERED = -1
 
-# Axes of the image. Neighboring samples in a row differ along X, and neighbors in a
-# column along Y.
+# Axes of the image: X along rows of samples, and Y along columns.
 X = 0
 Y = 1
 
@@ -66,14 +64,14 @@ Y = 1
 class Crossings(NamedTuple):
     """K crossings: places where a visible silhouette edge passes between two neighboring samples.
 
-    If several silhouettes pass between the same two samples, only one is kept.
-    This is the silhouette next to the sample that shows the farther surface,
-    because it is the boundary of this surface's visible part.
+    If several silhouettes pass between the same two samples, only one is kept: the
+    one next to the sample that shows the farther surface. There, the farther
+    surface starts to be hidden.
 
     Attributes:
-        ends: Vertices at both ends of each edge, shape (2, K).
-        fraction: Position of the place between the ends, from 0 to 1,
-            shape (K,).
+        ends: Indices of the vertices at both ends of each edge, shape (2, K).
+        fraction: Position of the crossing on the edge, from 0 at the first end to
+            1 at the second end, shape (K,).
         normal: Unit normal of each edge in the image, x to the right and y up,
             shape (2, K).
         horizontal: True if the two samples are neighbors in a row, and False if
@@ -100,15 +98,15 @@ def moving_outlines(
     radiance: Float[Tensor, "3 S"],
     background: Float[Tensor, "3 pixels"],
 ) -> tuple[Int[Tensor, " E"], Float[Tensor, "3 P_E"]]:
-    """Create zeros whose gradient says how an image changes if surfaces move in it.
+    """Create zeros that give an image its gradient with respect to movements of surfaces.
 
-    Adding the zeros to an image adds the missing gradient, and does not change
-    the values. Besides the P covered pixels, E uncovered pixels beside silhouettes
-    have a gradient. The gradient reaches the vertices, and fields of the camera
-    that are tensors.
+    Rasterized images lack this gradient. Adding the zeros to an image adds the
+    gradient and does not change the values. Not only the P covered pixels have
+    such a gradient, but also E uncovered pixels beside silhouettes. The gradient
+    reaches the vertices, and the fields of the camera that are tensors.
 
     Args:
-        fragments: The S covered samples of the view.
+        fragments: The S samples of the view that show the mesh.
         camera: Camera of the view.
         vertices: Vertex positions in world axes, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
@@ -125,7 +123,7 @@ def moving_outlines(
     sample_indices = torch.arange(
         len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device
     )
-    # Index of the covered sample at each sample of the image.
+    # For each sample of the image, its index among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
     crossings_on_cpu = _find_crossings(
         fragments.to("cpu"),
@@ -135,7 +133,7 @@ def moving_outlines(
         sample_grid=_to_numpy(sample_grid),
     )
     crossings = Crossings(*(values.to(sample_grid.device) for values in crossings_on_cpu))
-    # Uncovered pixels with a sample beside a crossing.
+    # True for pixels that show no mesh, but have a sample beside a visible silhouette.
     is_uncovered = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
     is_uncovered.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
     is_uncovered.index_fill_(0, fragments.pixels, False)
@@ -152,16 +150,19 @@ def moving_outlines(
 
 
 def _to_numpy(tensor: Tensor) -> np.ndarray:
-    """Convert a tensor to a NumPy array, without its graph."""
+    """Convert a tensor on any device to a NumPy array, without gradients."""
     return tensor.detach().cpu().numpy()
 
 
 class _ZerosWithGradient(torch.autograd.Function):
-    """Zeros with a gradient by the homogeneous positions of the vertices, see `moving_outlines`."""
+    """Zeros with a gradient with respect to the positions of vertices in the image.
+
+    See `moving_outlines`.
+    """
 
     @staticmethod
     def forward(ctx: Any, positions: Tensor, view: _MovingView) -> Tensor:
-        """Create the zeros, and store the view and the positions for the gradient.
+        """Create the zeros, and store the view and the positions for `backward`.
 
         Args:
             ctx: Context of autograd.
@@ -181,31 +182,31 @@ class _ZerosWithGradient(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient by the homogeneous positions.
+        """Compute the gradient with respect to the homogeneous positions.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the linear values of the P covered and E
-                uncovered pixels, shape (3, P + E).
+            upstream: Gradient with respect to the linear values of the P covered
+                and E uncovered pixels, shape (3, P + E).
 
         Returns:
-            Gradient by the homogeneous positions, shape (V, 3), and None for the
-            view.
+            Gradient with respect to the homogeneous positions (x w, y w, w) of the
+            V vertices, shape (V, 3), and None for the view.
         """
         (positions,) = ctx.saved_tensors
         view: _MovingView = ctx.view
-        # Movements are in image coordinates, in which the image has the width 2. A
-        # movement by 1 is size · s / 2 samples, and a sample has the weight 1 / s² in
-        # its pixel. The factor 1/2 shares the difference of two samples between both.
+        # The factor size / (4 s) is a product of three: the image has the width 2, so a
+        # movement by 1 is size · s / 2 samples. A sample has the weight 1 / s² in its
+        # pixel. Half of the difference of two samples belongs to each of them.
         upstream = upstream * (view.fragments.size / 4 / view.fragments.samples)
-        gradient = view.gradient_by_surface(positions, upstream)
-        ends, gradient_by_ends = view.gradient_by_silhouettes(positions, upstream)
-        return gradient.index_add_(0, ends, gradient_by_ends), None
+        gradient = view.gradient_of_surfaces(positions, upstream)
+        ends, end_gradients = view.gradient_of_silhouettes(positions, upstream)
+        return gradient.index_add_(0, ends, end_gradients), None
 
 
 @dataclass(frozen=True)
 class _MovingView:
-    """View whose image is differentiated by the positions of surfaces in it.
+    """View whose image is differentiated with respect to the positions of surfaces in it.
 
     Attributes:
         fragments: The S covered samples in P pixels.
@@ -225,99 +226,104 @@ class _MovingView:
     radiance: Tensor
     background: Tensor
 
-    def gradient_by_surface(self, positions: Tensor, upstream: Tensor) -> Tensor:
-        """Compute the gradient by the movement of surfaces, without silhouettes.
-
-        In this class, the force at a sample is the gradient by the position of
-        the surface point at this sample in the image.
+    def gradient_of_surfaces(self, positions: Tensor, upstream: Tensor) -> Tensor:
+        """Compute the gradient with respect to movements of surfaces, without silhouettes.
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient by the linear values of the P covered and E
-                uncovered pixels, shape (3, P + E).
+            upstream: Gradient with respect to the linear values of the P covered
+                and E uncovered pixels, shape (3, P + E).
 
         Returns:
-            Gradient by the homogeneous positions, shape (V, 3).
+            Gradient with respect to the homogeneous positions, shape (V, 3).
         """
         fragments = self.fragments
         upstream_at_samples = upstream.index_select(1, fragments.sample_to_pixel)
-        # Radiance times upstream gradient, summed over the channels, shape (S,).
+        # Radiance times upstream gradient, summed over the color channels.
         weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
         weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
-        force_right = self._forces_along(X, weighted_image, upstream_at_samples)
-        force_down = self._forces_along(Y, weighted_image, upstream_at_samples)
-        # Most samples have neighbors of the same color, and therefore no force.
-        has_force = (force_right != 0) | (force_down != 0)
-        samples = torch.nonzero(has_force).squeeze(1)
-        part = fragments.select(samples)
-        # The y-axis of image positions points up.
-        forces = torch.stack(
-            [force_right.index_select(0, samples), -force_down.index_select(0, samples)]
+        gradient_right = self._gradient_along(X, weighted_image, upstream_at_samples)
+        gradient_down = self._gradient_along(Y, weighted_image, upstream_at_samples)
+        # Most samples have neighbors of the same color. Their gradient is 0.
+        has_gradient = (gradient_right != 0) | (gradient_down != 0)
+        samples = torch.nonzero(has_gradient).squeeze(1)
+        selected = fragments.select(samples)
+        # Gradient with respect to the image position (x, y) of each selected sample. The
+        # minus sign is there because y points up.
+        sample_gradients = torch.stack(
+            [gradient_right.index_select(0, samples), -gradient_down.index_select(0, samples)]
         ).T
         if fragments.depths is not None:
-            depth = part.interpolate(positions[:, 2:][part.corners])
-            forces = _by_homogeneous(forces, part.positions(), depth)
-        # Distribute the forces to the corners of the seen faces. Shape (2 or 3, 3 G),
-        # for the coordinates and the corners.
-        corner_gradients = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
+            depth = selected.interpolate(positions[:, 2:][selected.corners])
+            sample_gradients = _to_homogeneous(sample_gradients, selected.positions(), depth)
+        # Distribute the gradients to the corners of faces: one row for each coordinate, one
+        # column for each corner.
+        corner_gradients = (
+            selected.distribute(sample_gradients).permute(2, 1, 0).flatten(1).double()
+        )
         gradient = positions.new_zeros(positions.shape[::-1])
-        coordinate_count = forces.shape[1]
-        gradient[:coordinate_count].index_add_(1, part.corners.T.flatten(), corner_gradients)
+        coordinate_count = sample_gradients.shape[1]
+        gradient[:coordinate_count].index_add_(1, selected.corners.T.flatten(), corner_gradients)
         return gradient.T
 
-    def _forces_along(
+    def _gradient_along(
         self, axis: int, weighted_image: Tensor, upstream_at_samples: Tensor
     ) -> Tensor:
-        """Compute the gradient by movements of the surface at each sample, along one image axis.
+        """Compute the gradient with respect to movements of surfaces along one image axis.
 
         Args:
             axis: X for movements to the right, or Y for movements down.
-            weighted_image: Radiance times upstream gradient, summed over the
-                channels, for each sample of the image. NaN for samples that show
-                no mesh. Shape (size · s, size · s).
+            weighted_image: Radiance times upstream gradient, summed over the color
+                channels, for each sample of the image, shape (size · s, size · s).
+                NaN for samples that show no mesh.
             upstream_at_samples: Upstream gradient of the pixel of each covered
                 sample, shape (3, S).
 
         Returns:
-            Gradient for each covered sample, shape (S,).
+            Gradient with respect to the position of the surface at each covered
+            sample, shape (S,).
         """
-        # Columns are dimension 1 of the image, and rows dimension 0.
+        # Rows are dimension 0 of the image, so the axis X (0) is dimension 1.
         dim = 1 - axis
         steps = len(self.sample_grid) - 1
         # Value of each sample minus the value of the next sample along the axis.
-        jump = torch.zeros_like(weighted_image)
+        difference = torch.zeros_like(weighted_image)
         torch.sub(
             weighted_image.narrow(dim, 0, steps),
             weighted_image.narrow(dim, 1, steps),
-            out=jump.narrow(dim, 0, steps),
+            out=difference.narrow(dim, 0, steps),
         )
         # The difference is NaN if one of the two samples shows no mesh.
-        jump.nan_to_num_(0)
-        self._correct_pixel_borders(dim, jump, upstream_at_samples)
-        # `gradient_by_silhouettes` handles the jumps across silhouettes.
+        difference.nan_to_num_(0)
+        self._correct_pixel_borders(dim, difference, upstream_at_samples)
+        # Differences across silhouettes belong to `gradient_of_silhouettes`.
         is_along_axis = self.crossings.horizontal == (axis == X)
-        jump.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
-        # The force at a sample is the sum of the jumps before and after the sample.
-        force = jump.clone()
-        force.narrow(dim, 1, steps).add_(jump.narrow(dim, 0, steps))
-        return self.fragments.of_image(force)
+        difference.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
+        # The gradient of a sample is the sum of its differences to both neighbors.
+        gradient = difference.clone()
+        gradient.narrow(dim, 1, steps).add_(difference.narrow(dim, 0, steps))
+        return self.fragments.of_image(gradient)
 
-    def _correct_pixel_borders(self, dim: int, jump: Tensor, upstream_at_samples: Tensor) -> None:
-        """Replace the jumps between samples of two neighboring pixels, in place.
+    def _correct_pixel_borders(
+        self, dim: int, difference: Tensor, upstream_at_samples: Tensor
+    ) -> None:
+        """Replace the differences between samples of two neighboring pixels, in place.
 
-        The two pixels have different upstream gradients. The right jump is the
-        difference of the two radiances times the mean of the two upstream
+        The two pixels have different upstream gradients. The right difference is
+        the difference of the two radiances times the mean of the two upstream
         gradients.
 
         Args:
             dim: Dimension of the image along which the samples are neighbors.
-            jump: Weighted difference between each sample of the image and the
-                next one, changed in place, shape (size · s, size · s).
+            difference: Radiance times upstream gradient of each sample of the
+                image, minus that of the next sample, shape (size · s, size · s).
+                It is changed in place.
             upstream_at_samples: Upstream gradient of the pixel of each covered
                 sample, shape (3, S).
         """
         samples = self.fragments.samples
-        # Slices for the last sample of each pixel, and the first sample of the next.
+        # Slices of the image for the last samples of all pixels but the last one (before),
+        # and for the first samples of the next pixels (after).
         before: Any = (slice(None), slice(samples - 1, -1, samples))
         after: Any = (slice(None), slice(samples, None, samples))
         if dim == 0:
@@ -330,76 +336,85 @@ class _MovingView:
         upstream_before = upstream_at_samples.index_select(1, sample_before)
         upstream_sum = upstream_before + upstream_at_samples.index_select(1, sample_after)
         radiance_before = self.radiance.index_select(1, sample_before)
-        difference = radiance_before - self.radiance.index_select(1, sample_after)
-        corrected = (difference * upstream_sum).sum(0) / 2
-        jump[before].masked_scatter_(are_covered, corrected)
+        radiance_difference = radiance_before - self.radiance.index_select(1, sample_after)
+        corrected = (radiance_difference * upstream_sum).sum(0) / 2
+        difference[before].masked_scatter_(are_covered, corrected)
 
-    def gradient_by_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the gradient by the movement of silhouette edges at the K crossings.
+    def gradient_of_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the gradient with respect to movements of silhouette edges at K crossings.
+
+        A crossing is a place where a silhouette edge passes between two samples.
+        An edge with the unit normal n that moves by v moves along a row by
+        n · v / n_x. Its crossing with the row has the weight n_x², so that the
+        product is n_x (n · v).
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient by the linear values of the P covered and E
-                uncovered pixels, shape (3, P + E).
+            upstream: Gradient with respect to the linear values of the P covered
+                and E uncovered pixels, shape (3, P + E).
 
         Returns:
             A tuple of
             - the vertices at the first ends of the K edges, and then at the
               second ends, shape (2 K,);
-            - the gradient by the homogeneous positions of these vertices,
-              shape (2 K, 3).
+            - the gradient with respect to the homogeneous positions of these
+              vertices, shape (2 K, 3).
         """
         crossings = self.crossings
-        # Component of the edge normal along the row (to the right) or column (down) of
-        # the two samples. The weight n_x² of a crossing times its movement n · v / n_x
-        # is n_x (n · v).
+        # Component of the edge normal in the direction from the first to the second sample,
+        # which is to the right in a row, and down in a column.
         along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
-        # Gradient by the position of the crossing in the image, shape (K, 2).
-        forces = (self._silhouette_forces(upstream) * along * crossings.normal).T
-        # An end moves the crossing the more, the nearer it is.
+        # Gradient with respect to the position (x, y) of each crossing in the image.
+        crossing_gradients = (self._crossing_gradients(upstream) * along * crossings.normal).T
+        # How far a crossing moves if the first, or the second, end of its edge moves by 1.
         end_weights = (1 - crossings.fraction, crossings.fraction)
         gradients = []
         for end_vertices, end_weight in zip(crossings.ends, end_weights, strict=True):
             x, y, depth = positions[end_vertices].T
             end_position = torch.stack([x / depth, y / depth], dim=1)
-            end_forces = forces * end_weight[:, None]
-            gradients.append(_by_homogeneous(end_forces, end_position, depth[:, None]))
+            end_gradients = crossing_gradients * end_weight[:, None]
+            gradients.append(_to_homogeneous(end_gradients, end_position, depth[:, None]))
         return crossings.ends.flatten(), torch.cat(gradients)
 
-    def _silhouette_forces(self, upstream: Tensor) -> Tensor:
-        """Compute the gradient by the movement of K silhouettes toward the second sample.
+    def _crossing_gradients(self, upstream: Tensor) -> Tensor:
+        """Compute the gradient with respect to movements of silhouettes between two samples.
+
+        Each of the K crossings lies between a first and a second sample. The
+        movement is toward the second sample.
 
         Args:
-            upstream: Gradient by the linear values of the P covered and E
-                uncovered pixels, shape (3, P + E).
+            upstream: Gradient with respect to the linear values of the P covered
+                and E uncovered pixels, shape (3, P + E).
 
         Returns:
-            Gradient at each crossing, shape (K,).
+            Gradient of each crossing, shape (K,).
         """
-        # Pixels of the first and of the second sample at each crossing, shape (2, K).
+        # Two rows: pixels of the first samples, and pixels of the second samples.
         pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
         device = pixels_at_crossings.device
-        # Column of `upstream` for each pixel of the image, or -1.
+        # For each pixel of the image, its column in `upstream`, or -1.
         column_of_pixel = torch.full((self.fragments.size**2,), -1, device=device)
         upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
         column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
-        force = self.radiance.new_zeros(pixels_at_crossings.shape[1])
+        gradient = self.radiance.new_zeros(pixels_at_crossings.shape[1])
         first_samples, second_samples = self.crossings.samples
-        # The pixels of both samples gain half of the difference each.
+        # The pixels of both samples gain half of the difference each. The factor 1/2 is
+        # already in `upstream`.
         for pixels in pixels_at_crossings:
             first_radiance = self._seen_radiance(first_samples, pixels)
             second_radiance = self._seen_radiance(second_samples, pixels)
             pixel_gradient = upstream[:, column_of_pixel[pixels]]
-            force += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
-        return force
+            gradient += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
+        return gradient
 
     def _seen_radiance(self, samples: Tensor, pixels: Tensor) -> Tensor:
-        """Look up the radiance at samples, or the background of pixels if a sample shows no mesh.
+        """Look up the radiance at K samples, or the background if a sample shows no mesh.
 
         Args:
-            samples: Indices of K covered samples, or NOT_COVERED, shape (K,).
-            pixels: Row-major indices of K pixels, whose background is used for
-                NOT_COVERED, shape (K,).
+            samples: Index of each sample among the covered samples, or NOT_COVERED
+                if it shows no mesh, shape (K,).
+            pixels: Row-major index of the pixel whose background is used instead,
+                shape (K,).
 
         Returns:
             Radiance, shape (3, K).
@@ -407,19 +422,23 @@ class _MovingView:
         return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
-def _by_homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
-    """Convert gradients by image positions to gradients by homogeneous positions (chain rule).
+def _to_homogeneous(gradients: Tensor, places: Tensor, depth: Tensor) -> Tensor:
+    """Convert gradients of N points from image positions to homogeneous positions.
+
+    The image position (x, y) has the homogeneous coordinates (x w, y w, w). With
+    the gradient (a, b) with respect to (x, y), the chain rule gives
+    (a, b, -(a x + b y)) / w.
 
     Args:
-        forces: Gradients by the image positions (x, y) of N points,
-            shape (N, 2).
+        gradients: Gradients with respect to the image positions, shape (N, 2).
         places: Image positions (x, y), shape (N, 2).
         depth: Third homogeneous coordinate w, shape (N, 1).
 
     Returns:
-        Gradients by (x w, y w, w), shape (N, 3).
+        Gradients with respect to the homogeneous coordinates, shape (N, 3).
     """
-    return torch.cat([forces, -(forces * places).sum(1, keepdim=True)], dim=1) / depth
+    depth_gradient = -(gradients * places).sum(1, keepdim=True)
+    return torch.cat([gradients, depth_gradient], dim=1) / depth
 
 
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
@@ -447,14 +466,15 @@ def _find_crossings(
     faces: np.ndarray,
     sample_grid: np.ndarray,
 ) -> Crossings:
-    """Find where visible silhouettes pass between neighboring samples.
+    """Find where visible silhouette edges pass between neighboring samples.
 
     Args:
-        fragments: Covered samples of the view, with tensors on the CPU.
-        positions: Homogeneous positions of the vertices, shape (V, 3).
-        nearness: Nearness of the vertices to the camera, shape (V,). On a plane,
-            it is a linear function of the image position. It is larger for
-            nearer points.
+        fragments: Samples of the view that show the mesh, with tensors on the CPU.
+        positions: Homogeneous positions (x w, y w, w) of the vertices,
+            shape (V, 3).
+        nearness: Number for each vertex that is larger for nearer points, and
+            that is a linear function of the image position on each face (like
+            the reciprocal of the depth), shape (V,).
         faces: Vertex indices of all faces, shape (F, 3).
         sample_grid: Index of the covered sample at each sample of the image, or
             NOT_COVERED, shape (size · s, size · s).
@@ -464,18 +484,18 @@ def _find_crossings(
     """
     x, y, w = positions.T
     points = np.stack([x / w, y / w, nearness]).T
-    # Positions in units of samples, x to the right and y down, shape (2, V). They are
-    # rounded as in the rasterizers.
+    # Positions (x, y) of the vertices, with y down, in units of samples. They are rounded
+    # to subsamples as in the rasterizers.
     places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
     ends = _silhouette_edges(places, faces)
     if len(fragments.sample_to_seen_face) == 0:
-        # A mesh outside of the image has no visible silhouettes.
+        # If no sample shows the mesh, no silhouette is visible. Drop all edges.
         ends = ends[:, :0]
     start = places[:, ends[0]]
     end = places[:, ends[1]]
-    # Normal of each edge, with y up. The edge (a, b) with y down has the normal (b, a).
+    # An edge (a, b) in axes with y down has the normal (b, a) in axes with y up.
     normal = np.stack([end[1] - start[1], end[0] - start[0]])
-    # The minimum avoids a division by 0 for edges without length.
+    # For edges without length, divide by a small number instead of 0.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
     silhouettes = _Silhouettes(fragments, places, nearness, sample_grid, ends, normal)
     in_rows = silhouettes.crossings_along(X)
@@ -486,13 +506,14 @@ def _find_crossings(
 
 @dataclass(frozen=True)
 class _Silhouettes:
-    """N silhouette edges of a view.
+    """N silhouette edges of a view, and what is needed to find their visible parts.
 
     Attributes:
         fragments: Covered samples, with tensors on the CPU.
         places: Positions of the vertices in units of samples, x to the right
             and y down, shape (2, V).
-        nearness: Nearness of the vertices to the camera, shape (V,).
+        nearness: Number for each vertex that is larger for nearer points, and
+            that is linear in the image on each face, shape (V,).
         sample_grid: Index of the covered sample at each sample of the image, or
             NOT_COVERED, shape (size · s, size · s).
         ends: Vertices at both ends of each edge, shape (2, N).
@@ -507,7 +528,7 @@ class _Silhouettes:
     normal: np.ndarray
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
-        """Find visible crossings between samples that are neighbors along an axis.
+        """Find where visible silhouettes pass between samples that are neighbors along an axis.
 
         Args:
             axis: X for neighbors in a row, and Y for neighbors in a column.
@@ -518,7 +539,7 @@ class _Silhouettes:
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
-        # A line is a row for the axis X, and a column for the axis Y.
+        # Places where edges cut rows of samples (for the axis X) or columns (for Y).
         cuts = _cut_edges(
             start_across=start[1 - axis],
             end_across=end[1 - axis],
@@ -527,7 +548,8 @@ class _Silhouettes:
             resolution=resolution,
         )
         edge = cuts.edge
-        # Row-major indices of the samples after and before each of the K cuts.
+        # Find the row-major indices of the two samples around each cut: the first sample
+        # after the cut, and the sample before.
         if axis == X:
             after = cuts.line * resolution + cuts.next_sample
             before = after - 1
@@ -535,18 +557,19 @@ class _Silhouettes:
             after = cuts.next_sample * resolution + cuts.line
             before = after - resolution
         cells = np.stack([before, after])
-        # Indices of the covered samples, or NOT_COVERED, shape (2, K).
+        # Two rows, for the samples before and after the cuts: indices among the covered
+        # samples, or NOT_COVERED.
         samples = self.sample_grid.ravel()[cells].astype(np.int64)
         place = start[:, edge] + cuts.fraction * (end - start)[:, edge]
         surface_nearness = self._surface_nearness(samples, place)
         is_visible = self._is_visible(cuts, samples, surface_nearness)
-        # This coordinate grows with the distance of the cut from the sample that shows
-        # the farther surface.
+        # Number that is larger for cuts that are farther from the sample with the farther
+        # surface.
         from_farther = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         kept = np.flatnonzero(is_visible)
-        # Sort by the pair of samples, and then by the distance.
+        # Sort the cuts by the pair of samples around them, and then by this number.
         kept = kept[np.lexsort([from_farther[kept], after[kept]])]
-        # Keep the first cut between two samples.
+        # Keep only the first cut between each pair of samples.
         kept = kept[np.diff(after[kept], prepend=-1) != 0]
         return (
             self.ends[:, edge[kept]],
@@ -560,29 +583,32 @@ class _Silhouettes:
     def _is_visible(
         self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray
     ) -> np.ndarray:
-        """Tell which of K cuts of silhouette edges are visible.
+        """Tell at which of K places (cuts) a silhouette edge is visible.
 
-        A cut is hidden if the surfaces at both samples beside the cut are nearer
-        than the edge.
+        A cut is the place where an edge crosses a row or a column of samples. It is
+        hidden if the surfaces at both samples beside it are nearer than the edge.
 
         Args:
             cuts: The K cuts.
             samples: Indices of the covered samples before and after each cut, or
                 NOT_COVERED, shape (2, K).
-            surface_nearness: Nearness, at each cut, of the surfaces that the two
-                samples show, shape (2, K).
+            surface_nearness: Nearness (larger for nearer points), at each cut, of
+                the surfaces that the two samples show, shape (2, K).
 
         Returns:
             True for visible cuts, shape (K,).
         """
-        tolerance = NEAR * np.ptp(self.nearness)
+        tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
         start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
         edge_nearness = start_nearness + cuts.fraction * (end_nearness - start_nearness)
         is_in_front = edge_nearness >= surface_nearness.min(axis=0) - tolerance
         return (samples >= 0).any(axis=0) & is_in_front
 
     def _surface_nearness(self, samples: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Compute the nearness of the faces beside K cuts, extended to the position of the cut.
+        """Compute how near the faces beside K cuts are, if they are extended to the cuts.
+
+        A cut is the place where a silhouette edge crosses a row or a column of
+        samples. The faces are those that the samples before and after it show.
 
         Args:
             samples: Indices of the covered samples before and after each cut, or
@@ -591,18 +617,19 @@ class _Silhouettes:
                 shape (2, K).
 
         Returns:
-            Nearness of the face that each sample shows, shape (2, K). It is minus
-            infinity for NOT_COVERED.
+            Nearness (larger for nearer points) of the plane of the face that each
+            sample shows, at the cut, shape (2, K). It is minus infinity for
+            NOT_COVERED.
         """
         sample_to_seen_face = self.fragments.sample_to_seen_face.numpy()
-        # Vertices of the three corners, shape (2, K, 3). The index -1 (NOT_COVERED)
-        # selects an arbitrary face, whose result is replaced at the end.
+        # Axes: before or after the cut, cut, corner. The index -1 (NOT_COVERED) selects an
+        # arbitrary face, whose result is replaced at the end.
         corners = self.fragments.corners.numpy()[sample_to_seen_face[samples]]
         nearness_of_corners = self.nearness[corners]
-        # x and y of the corners a, b and c, shape (2, K) each.
+        # Positions (x, y) of the corners a, b and c of the faces before and after each cut.
         (ax, bx, cx), (ay, by, cy) = np.moveaxis(self.places[:, corners], 3, 1)
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        # Dividing by infinity gives a face without area the nearness of corner a.
+        # For a face without area, divide by infinity. The result is the nearness of corner a.
         area = np.where(area == 0, np.inf, area)
         # Barycentric weights of the corners b and c.
         weight_b = ((place[0] - ax) * (cy - ay) - (place[1] - ay) * (cx - ax)) / area
@@ -617,7 +644,7 @@ class _Silhouettes:
 class _Cuts(NamedTuple):
     """K cuts: places where edges cross rows of samples, or columns of samples.
 
-    A line is a row if rows are cut, and a column if columns are cut.
+    Rows and columns are both called lines.
 
     Attributes:
         edge: Index of the edge of each cut, shape (K,).
@@ -641,35 +668,40 @@ def _cut_edges(
     end_along: np.ndarray,
     resolution: int,
 ) -> _Cuts:
-    """Find where N edges cross the lines of samples, which are rows or columns.
+    """Find where N edges cross rows of samples, or columns of samples.
 
-    Cuts before the first sample or after the last sample of a line are left out.
-    All coordinates are in units of samples. Line i has the coordinate i.
+    Rows and columns are both called lines. For rows, y is the coordinate across
+    the lines, and x the coordinate along the lines. For columns, it is the other
+    way round. Coordinates are in units of samples. Line i has the coordinate i.
+    Crossings before the first sample or after the last sample of a line are left
+    out.
 
     Args:
         start_across: Coordinate of the start of each edge across the lines,
             shape (N,).
         end_across: Coordinate of the end of each edge across the lines,
             shape (N,).
-        start_along: Coordinate of the start along the lines, shape (N,).
-        end_along: Coordinate of the end along the lines, shape (N,).
+        start_along: Coordinate of the start of each edge along the lines,
+            shape (N,).
+        end_along: Coordinate of the end of each edge along the lines,
+            shape (N,).
         resolution: Number of lines, and of samples in a line.
 
     Returns:
         Cuts in ascending order of the edge and then of the line.
     """
-    # An edge crosses the lines from first_line to end_line - 1.
+    # An edge crosses the lines from `first_line` to `end_line` - 1.
     lower = np.minimum(start_across, end_across)
     upper = np.maximum(start_across, end_across)
     first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
     end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
     cuts_per_edge = end_line - first_line
-    # There is one entry for each pair of an edge and a line that the edge crosses. The lines
-    # of an edge follow each other, from its first line on.
+    # One entry for each pair of an edge and a line that the edge crosses. The index of an
+    # edge is repeated for all its lines.
     edge = np.repeat(np.arange(len(start_across)), cuts_per_edge)
     cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
     line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]
-    # Fraction of the edge from its start to the cut, and coordinate of the cut along the line.
+    # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start_across[edge]) / (end_across - start_across)[edge]
     position = start_along[edge] + fraction * (end_along - start_along)[edge]
     next_sample = np.ceil(position).astype(np.int64)
@@ -693,15 +725,15 @@ def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
         Vertices at both ends of the N silhouette edges, shape (2, N).
     """
     edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
-    # x and y of the corners a, b and c of each face, shape (F,) each.
+    # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
     orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    # 1 and -1 if the face lies on one or the other side of its edge. The direction of
-    # an edge is from the lower to the higher vertex index.
-    face_sides = (orientation * edges.direction).ravel()
-    side_sums = np.bincount(edges.edge_of_face_side, face_sides, len(edges.face_count))
-    # All faces lie on the same side if the sum is ± the number of faces. A face that is
-    # seen edge-on counts 0, so one face of an edge may be missing in the sum.
+    # For each face and each of its three edges: 1 if the face lies on one side of the edge,
+    # and -1 if it lies on the other side. An edge leads to its higher vertex index.
+    side_of_face = (orientation * edges.direction).ravel()
+    side_sums = np.bincount(edges.edge_of_face_side, side_of_face, len(edges.face_count))
+    # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
+    # 1 - n if one of them is seen edge-on, because this face counts 0.
     is_silhouette = np.abs(side_sums) > edges.face_count - 2
     return edges.ends.take(np.flatnonzero(is_silhouette), axis=1)
 
@@ -742,13 +774,13 @@ def _edges(face_bytes: bytes) -> _Edges:
     """
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
     corners = np.ascontiguousarray(faces.T)
-    # Vertices at the starts and at the ends of the three sides, shape (3, F) each.
+    # Vertices at both ends of the sides: one row for each side, one column for each face.
     start, end = corners.take(EDGES, axis=0).swapaxes(0, 1)
     low = np.minimum(start, end).ravel()
     high = np.maximum(start, end).ravel()
     vertex_count = int(high.max()) + 1
-    # Sides with the same key are the same edge. np.unique sorts one number per side
-    # faster than a pair of vertices.
+    # Sides with the same two vertices are the same edge. The two vertices are combined to
+    # one number, because `np.unique` sorts numbers faster than pairs.
     keys, edge_of_face_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )

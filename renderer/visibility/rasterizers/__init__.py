@@ -40,8 +40,9 @@ from renderer.errors import InputError, require_choice
 from renderer.settings import RASTERIZERS
 from renderer.visibility.rasterizers import opengl
 
-# `Rasterizer.rasterize` clips projected points to a square around the image center
-# with this side in samples. Products of fixed-point coordinates then fit in int64.
+# `Rasterizer.rasterize` clips projected points to a square around the image center. This
+# is the side of the square in samples. Products of fixed-point coordinates then fit into
+# int64.
 SPAN = 2**21
 
 
@@ -110,7 +111,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     if rasterizer == "numpy":
         return Rasterizer("numpy", "numpy")
     try:
-        # numba is imported here because the import takes half a second.
+        # This import stands here because it also imports numba, which takes 0.5 s.
         from renderer.visibility.rasterizers import numba
 
         return Rasterizer("numba", f"numba ({numba.VERSION})")

@@ -27,7 +27,7 @@ except ImportError as error:  # numba also raises this if it does not support th
     ) from error
 
 VERSION = numba.__version__
-# Types of the arguments and of the result of `_draw` for the compiler.
+# Types of the arguments and of the result of `_draw`, for which numba compiles it.
 TYPES = (
     "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
 )
@@ -53,8 +53,7 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     Raises:
         IndexError: If a face has a vertex that does not exist.
     """
-    # Unsigned indices are faster, because the compiled code need not handle negative
-    # indices.
+    # Unsigned indices are faster: compiled code checks signed indices for negative values.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
     if corners.max(initial=0) >= points.shape[1]:
         raise IndexError(
@@ -77,7 +76,7 @@ _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function for arguments of the types TYPES.
+    """Compile a function with numba for arguments of the types TYPES.
 
     The machine code is stored in a file, so that the next process need not
     compile the function again.
@@ -132,7 +131,8 @@ def _covered_range(
     """
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
-    # A shift by `bits` divides and rounds down. Both signs make it round up.
+    # The operator >> divides by 2^bits and rounds down. The two minus signs make it round
+    # up.
     return max(-(-least >> bits), 0), min(-(-greatest >> bits), resolution)
 
 
@@ -162,20 +162,22 @@ def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
 
 @_njit
 def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> int:
-    """Find the first column at or after the point at which a row crosses an edge.
+    """Find the first column of samples at or after the point at which a row crosses an edge.
+
+    All coordinates are in subsamples, which are 1 / 2^bits of a sample.
 
     Args:
-        x: x of the start of the edge in subsamples.
-        y: y of the start.
-        to_x: x of the end of the edge in subsamples.
-        to_y: y of the end, not equal to y.
-        row_y: y of the row in subsamples.
+        x: x of the start of the edge.
+        y: y of the start of the edge.
+        to_x: x of the end of the edge.
+        to_y: y of the end of the edge, not equal to y.
+        row_y: y of the row of samples.
         bits: Number of fractional bits of the coordinates.
 
     Returns:
-        Column.
+        Index of the column.
     """
-    # // rounds down, and the minus sign before it makes the result round up.
+    # The operator // rounds down. The minus sign before it makes the result round up.
     return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << bits))
 
 
@@ -212,18 +214,18 @@ def _draw(
         left, right = _covered_range(x, i, j, k, bits, resolution)
         if top >= bottom or left >= right:
             continue
-        # Two faces with the same vertices in another order must get exactly the same
-        # depth, so that the first face stays. The corners are therefore sorted.
+        # Sort the corners, so that two faces with the same corners in another order get
+        # exactly the same depth.
         a = min(i, j, k)
         c = max(i, j, k)
         b = i + j + k - a - c
-        # The depth is a linear function of column and row. Its slopes per sample:
         to_b = depths[b] - depths[a]
         to_c = depths[c] - depths[a]
         scale = subsamples / _doubled_area(x, y, a, b, c)
+        # Change of the depth of the face from one column, or row, to the next.
         slope_x = (to_b * (y[c] - y[a]) - to_c * (y[b] - y[a])) * scale
         slope_y = (to_c * (x[b] - x[a]) - to_b * (x[c] - x[a])) * scale
-        # Column and row of corner a, in samples.
+        # Position of the corner a in samples, which need not be a whole number.
         first_column = x[a] / subsamples
         first_row = y[a] / subsamples
         ax, ay, bx, by, cx, cy = _sort_downward(x[a], y[a], x[b], y[b], x[c], y[c])

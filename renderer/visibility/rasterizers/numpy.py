@@ -28,23 +28,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Positions are integers in units of a subsample, which is 1 / SUBSAMPLES of a sample.
+# Positions in the image are integers. Their unit, the subsample, is the distance of two
+# neighboring samples divided by SUBSAMPLES.
 SUBSAMPLE_BITS = 8
 SUBSAMPLES = 2**SUBSAMPLE_BITS
 # Depth of the far plane. Depths are integers with 24 bits. Surfaces at the far plane
 # are not drawn.
 FAR = 2**24 - 1
-# Number of low bits of a key that hold the index of the face. The depth is above them.
+# A key is an integer that holds the depth of a face at a sample, and in this number of low
+# bits the index of the face.
 FACE_BITS = 32
-# Key of samples without a face. It is less than any key at the far plane, and its low
-# bits are the face index -1.
-EMPTY = (FAR << FACE_BITS) - 1
-# Number of faces that `_keys` processes at once. The arrays of so many faces stay in
-# the cache of the processor.
-FACES = 2**14
-# Number of rows of triangles, or of samples of rows, that `_parts` returns at once.
-# Arrays of this length stay in the cache of the processor.
-PARTS = 2**13
+# Key of samples without a face: a depth just in front of the far plane, and the face index
+# -1 in the low bits.
+EMPTY_KEY = (FAR << FACE_BITS) - 1
+# Number of faces that are drawn at once. Their arrays fit into the cache of the processor.
+FACES_PER_BLOCK = 2**14
+# Approximate length of the arrays that `_expand` returns. They fit into the cache of the
+# processor.
+ENTRIES_PER_BLOCK = 2**13
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
@@ -66,7 +67,7 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
-        # The conversion to int32 keeps the lower half of each key, the face index.
+        # The conversion to int32 keeps the low 32 bits of each key, the face index.
         view_ids[:] = _keys(view, faces, resolution, closed).reshape(view_ids.shape)
     return ids
 
@@ -88,43 +89,44 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
         Keys in row-major order, int64, shape (R²,).
     """
     positions, depths = to_fixed_point(points, resolution)
-    keys = np.full(resolution * resolution, EMPTY)
-    for begin in range(0, len(faces), FACES):
-        block = np.ascontiguousarray(faces[begin : begin + FACES].T)
+    keys = np.full(resolution * resolution, EMPTY_KEY)
+    for begin in range(0, len(faces), FACES_PER_BLOCK):
+        block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
         drawn = _cull(positions.take(block, axis=1), resolution, closed)
-        # Two faces with the same vertices in another order must get exactly the same
-        # depth, so that the lower index wins. The corners are therefore sorted.
+        # Sort the corners of each face, so that two faces with the same corners in another
+        # order get exactly the same depth.
         corners = _sort(block.take(drawn.triangle_index, axis=1))
         triangles = positions.take(corners, axis=1)
         edges = _edges(triangles)
         planes = _planes(triangles, depths.take(corners))
         face_ids = drawn.triangle_index + begin
-        # First split triangles into rows, and then rows into samples.
-        for triangle, row in _parts(drawn.row_count):
+        # One entry for each pair of a triangle and a row of samples that it may cover.
+        for triangle, row in _expand(drawn.row_count):
             row += drawn.first_row.take(triangle)
             left, right = _crossings(edges, triangle, row, resolution)
-            # One entry for each span, which is a row of a triangle.
             x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
             depth_at_row = depth + (row - y) * slope_y
             first_offset = left - x
             first_sample = row * resolution + left
             face = face_ids.take(triangle)
-            # One entry for each covered sample, which is number `step` of its span.
-            for span, step in _parts(right - left):
-                offset = first_offset.take(span) + step
-                exact_depth = depth_at_row.take(span) + slope_x.take(span) * offset
+            # One entry for each covered sample: the index of its pair of triangle and row,
+            # and the number of steps from the first covered sample of the row.
+            for pair, step in _expand(right - left):
+                offset = first_offset.take(pair) + step
+                exact_depth = depth_at_row.take(pair) + slope_x.take(pair) * offset
                 rounded = np.rint(exact_depth).astype(np.int64)
-                # As unsigned numbers, negative depths are larger than FAR. They are in
-                # front of the near plane and not drawn.
+                # Depths in front of the near plane are negative. As unsigned integers, they
+                # are larger than FAR, so they become FAR and are not drawn.
                 clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
-                sample_keys = (clipped << FACE_BITS) | face.take(span)
-                np.minimum.at(keys, first_sample.take(span) + step, sample_keys)
+                sample_keys = (clipped << FACE_BITS) | face.take(pair)
+                np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
     return keys
 
 
 def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Convert projected points to fixed-point positions and to depths from 0 to FAR.
+    """Convert projected points to integer positions and to depths from 0 to FAR.
 
+    The unit of the positions is a subsample, 1/256 of the distance of two samples.
     As on GPUs, positions in samples are computed with one multiplication and one
     addition, rounded to float32, and then rounded to subsamples.
 
@@ -140,8 +142,8 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
         - depths, float64, shape (V,).
     """
     half = resolution / 2
-    # Positions in samples from the top left corner of the image. The product with a
-    # float64 array is float64, so the result is only rounded once, in the next step.
+    # Positions from the top left corner of the image, in samples. The product with a
+    # float64 array is float64, so that only the conversion to float32 below rounds.
     window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
     window += half
     snapped = window.astype(np.float32)
@@ -156,10 +158,11 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
 
 
 class _Drawn(NamedTuple):
-    """T triangles that may cover samples.
+    """Rows of the image in which T triangles may cover samples.
 
     Attributes:
-        triangle_index: Index of each triangle among all triangles, shape (T,).
+        triangle_index: Index of each triangle among all triangles of a block,
+            shape (T,).
         first_row: First row in which each triangle can cover samples,
             shape (T,).
         row_count: Number of rows in which each triangle can cover samples,
@@ -172,12 +175,12 @@ class _Drawn(NamedTuple):
 
 
 def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
-    """Find the triangles that can cover samples.
+    """Find the triangles that can cover samples, and their rows.
 
     By the top-left rule, a sample on an edge belongs to the triangle to the
     right of the edge or, if the edge is horizontal, to the triangle below it.
-    Rows and columns therefore begin at or after the least coordinate of a
-    triangle, and end before its greatest coordinate.
+    A triangle therefore covers only samples whose x and y are at least its
+    smallest x and y, and less than its largest x and y.
 
     Args:
         triangles: Positions (x, y) of the three corners of F triangles in
@@ -189,11 +192,12 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
         Triangles that may cover samples.
     """
     areas = _doubled_areas(triangles)
-    # First column and first row of the samples in the bounding box of each triangle,
-    # shape (2, F).
+    # First column and first row of samples in the bounding box of each triangle, as the
+    # two rows of this array.
     first = _next_sample(triangles.min(axis=1)).clip(0, None)
     counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
-    # y points down, so the areas of counter-clockwise triangles are negative.
+    # y points down, so triangles that are counter-clockwise in the image have negative
+    # areas.
     is_facing = areas < 0 if closed else areas != 0
     index = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
     return _Drawn(
@@ -219,19 +223,20 @@ def _doubled_areas(triangles: np.ndarray) -> np.ndarray:
 
 
 def _next_sample(positions: np.ndarray) -> np.ndarray:
-    """Find the first row, or the first column, at or after each position.
+    """Round positions in subsamples up to whole samples.
 
     Args:
-        positions: Positions in subsamples, any shape.
+        positions: Coordinates x or y in subsamples (1/256 of a sample), any shape.
 
     Returns:
-        Rows or columns, same shape.
+        First column (for x) or row (for y) of samples at or after each position,
+        same shape.
     """
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
 def _sort(corners: np.ndarray) -> np.ndarray:
-    """Sort the three values of each column, several times faster than np.sort.
+    """Sort the three values of each column of an array, several times faster than np.sort.
 
     Args:
         corners: Integers, shape (3, T).
@@ -248,15 +253,17 @@ def _sort(corners: np.ndarray) -> np.ndarray:
 class _EdgeLines(NamedTuple):
     """Lines through the three edges of T triangles.
 
-    The first edge leads from the top corner to the bottom corner, the second one
-    from the top corner to the middle corner, and the third one from the middle
-    corner to the bottom corner. A row crosses an edge at the column
+    The corners are called top, middle and bottom by their position in the image.
+    The first edge leads from the top to the bottom corner, the second one from the
+    top to the middle corner, and the third one from the middle to the bottom
+    corner. A row of samples crosses an edge at the column
     -(slope · row + constant) / height.
 
     Attributes:
-        coefficients: Slope, constant and height (axis 0) of the three edges
-            (axis 1), shape (3, 3, T).
-        middle_row: First row at or after the middle corner, shape (T,).
+        coefficients: Slope, constant and height of the edges, with the axes:
+            coefficient, edge, triangle. The shape is (3, 3, T).
+        middle_row: First row of samples at or below the middle corner,
+            shape (T,).
     """
 
     coefficients: np.ndarray
@@ -267,20 +274,20 @@ def _edges(triangles: np.ndarray) -> _EdgeLines:
     """Compute the lines through the edges of T triangles.
 
     Args:
-        triangles: Positions (x, y) of the three corners in subsamples,
-            shape (2, 3, T).
+        triangles: Positions (x, y) of the three corners in subsamples (1/256 of a
+            sample), shape (2, 3, T).
 
     Returns:
         Lines of the edges.
     """
     x, y = triangles
-    # Sort the corners from the top to the bottom. One number per corner holds y in its
-    # upper 32 bits and x in its lower 32 bits. In `_sort`, the sum of three such
-    # numbers may overflow, but the differences are right again.
+    # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
+    # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
+    # right again.
     downward = _sort((y << 32) + x)
     x = ((downward + 2**31) & (2**32 - 1)) - 2**31
     y = (downward - x) >> 32
-    # Sorted corners at the starts and ends of the three edges.
+    # Indices of the sorted corners (0 top, 1 middle, 2 bottom) at both ends of the edges.
     start = [0, 0, 1]
     end = [2, 1, 2]
     dx = x[end] - x[start]
@@ -307,13 +314,13 @@ def _crossings(
         shape (N,) each.
     """
     is_below_middle = row >= edges.middle_row.take(triangle)
-    # A row crosses the first edge, and the second or the third edge. In the flattened
-    # coefficients, the second edges of all T triangles follow the first edges.
     triangle_count = len(edges.middle_row)
+    # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
+    # edge 2 below the middle corner. Edge e of triangle t has the number e · T + t.
     short_edge = triangle + (1 + is_below_middle) * triangle_count
     crossed_edges = np.stack([triangle, short_edge])
     slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed_edges, axis=1)
-    # // rounds down, and the minus sign before it makes the result round up.
+    # The operator // rounds down. The minus sign before it makes the result round up.
     columns = (-((slope * row + constant) // height)).clip(0, resolution)
     return np.minimum(*columns), np.maximum(*columns)
 
@@ -340,28 +347,28 @@ def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
 
 
-def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """List the parts of items, in blocks of about PARTS parts.
+def _expand(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Repeat the index of each item as often as its count, and number the repetitions.
 
-    For example, items with 2 and 3 parts give the item indices 0, 0, 1, 1, 1 and
-    the part numbers 0, 1, 0, 1, 2. All parts of an item are in the same block.
+    For example, the counts 2 and 3 give the indices 0, 0, 1, 1, 1 and the numbers
+    0, 1, 0, 1, 2. The result comes in blocks of about ENTRIES_PER_BLOCK entries.
+    All entries of an item are in the same block.
 
     Args:
-        counts: Number of parts of each item, shape (N,).
+        counts: Count of each item, shape (N,).
 
     Yields:
-        For a block of B parts, the index of the item of each part, and the number
-        of the part in its item, shape (B,) each.
+        For a block of B entries, the indices and the numbers, shape (B,) each.
     """
     ends = np.cumsum(counts)
     starts = ends - counts
     begin = 0
-    parts_before = 0
+    entries_before = 0
     while begin < len(counts):
-        end = int(np.searchsorted(ends, parts_before + PARTS, side="right"))
+        end = int(np.searchsorted(ends, entries_before + ENTRIES_PER_BLOCK, side="right"))
         end = max(begin + 1, end)
         item = np.repeat(np.arange(begin, end), counts[begin:end])
-        number = np.arange(parts_before, parts_before + len(item))
-        yield item, number - starts.take(item)
+        position = np.arange(entries_before, entries_before + len(item))
+        yield item, position - starts.take(item)
         begin = end
-        parts_before = int(ends[end - 1])
+        entries_before = int(ends[end - 1])

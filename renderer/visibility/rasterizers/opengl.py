@@ -76,9 +76,9 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
         InputError: If there is no EGL device, or if the driver fails or renders
             wrong ids.
     """
-    # Two faces with the same vertices must get exactly the same depth, so that the first
-    # face stays. This needs vertices in the same order. If the orientation matters, only
-    # cyclic permutations are allowed.
+    # Sort the corners, so that two faces with the same corners in another order get exactly
+    # the same depth. If the orientation of faces matters, the corners are only rotated, so
+    # that the lowest one comes first.
     if closed:
         lowest = faces.argmin(axis=1)[:, None]
         ordered = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
@@ -120,7 +120,7 @@ def _context() -> Iterator[moderngl.Context]:
     import moderngl
 
     try:
-        # The type annotation of `backend` is wrong.
+        # The argument `backend` has a wrong type annotation in moderngl.
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
     except Exception as error:  # moderngl raises no narrower class.
         raise InputError(
@@ -151,7 +151,7 @@ def _check(context: moderngl.Context) -> None:
     small_triangle = [[-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]
     points = np.array([large_triangle + small_triangle])
     faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
-    # Face at each of 4 × 4 samples. Face 0 is left out, because it is seen from behind.
+    # Expected face at each of 4 × 4 samples. Face 0 is seen from behind and is left out.
     expected = [
         [2, 2, 1, 1],
         [2, 1, 1, 1],
@@ -193,11 +193,11 @@ def _draw(
     framebuffer.use()
     culling = moderngl.CULL_FACE if closed else moderngl.NOTHING
     context.enable_only(moderngl.DEPTH_TEST | culling)
-    # The vertex shader turns the image upside down, because OpenGL stores the lowest row
-    # first. This makes counter-clockwise faces clockwise.
+    # The vertex shader turns the image upside down. Front faces, which are
+    # counter-clockwise, then become clockwise.
     context.front_face = "cw"
-    # With "<", the face that was drawn first stays if depths are equal. Faces are drawn
-    # in ascending order of their indices.
+    # Faces are drawn in ascending order of their indices. With "<", the face with the
+    # lower index stays if depths are equal.
     context.depth_func = "<"
 
     ids_from_one = np.empty((len(points), *size), dtype=np.int32)
