@@ -16,34 +16,53 @@ from train.system.verbosity import take_flag
 
 
 class TrainCommand(Command):
-    """Start one run in this process, or the runs of a sweep by one of Hydra's launchers."""
+    """The command pnb-train.
+
+    It starts one training run in this process. With --multirun, it starts several
+    runs by one of Hydra's launchers.
+    """
 
     def __call__(self) -> None:
+        """Start one run or, with --multirun, several runs."""
         if SWEEP_FLAGS.isdisjoint(sys.argv):
             super().__call__()
             return
-        with self.one_line():
+        with self.handle_errors():
             if "TORCHELASTIC_RUN_ID" in os.environ:
                 raise InputError(
                     "torchrun trains one run in several processes: "
                     "start a sweep with pnb-train --multirun",
                 )
-            words = self.words(take_flag(sys.argv[1:]))
-            import_function("train.commands.sweep:sweep")(super().__call__, words)
+            overrides = self.to_overrides(take_flag(sys.argv[1:]))
+            import_function("train.commands.sweep:sweep")(super().__call__, overrides)
 
     def work(self, config: DictConfig) -> None:
+        """Train one run. With --multirun, Hydra calls this method for each run.
+
+        Args:
+            config: Configuration of the run, as Hydra composed it.
+        """
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:
             config.run = job.runtime.output_dir
             import_function("train.commands.sweep:run_in_sweep")(config)
             return
         if not config.train.resume:
-            read_settings(self.settings, config)  # finds mistakes before the imports
+            # The import below takes seconds. This call reports mistakes in the
+            # settings before it.
+            read_settings(self.settings, config)
         import_function("train.commands.experiment:train")(config, list(job.overrides.task))
 
 
 def name_model(words: list[str]) -> list[str]:
-    """Write model=NAME as model.name=NAME."""
+    """Replace model=NAME, a short form of model.name=NAME, in the command line.
+
+    Args:
+        words: Arguments of the command line.
+
+    Returns:
+        Arguments, in which model={...} stays, because it sets several fields.
+    """
     renamed = []
     for word in words:
         has_name = word.startswith("model=") and not word.startswith("model={")

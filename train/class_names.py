@@ -14,71 +14,78 @@ from train.settings import OTHER, ExperimentSettings, label_names, simplified, s
 
 
 def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
-    """Return the name of a class.
+    """Return the name of a class of a network, which is given by its name or its index.
 
     Args:
-        classes: Names of all classes of a network.
+        classes: Names of all classes of the network.
         label: Name of the class, or its index.
-        key: Setting that names the class, for the error.
+        key: Setting that has the label, for the error message.
 
     Returns:
         Name of the class.
 
     Raises:
-        InputError: If there is no such class.
+        InputError: If the network has no such class.
     """
     return classes[class_index(classes, label, key)]
 
 
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
-    """Return a mesh of the settings with its class by name.
-
-    A class of no network, such as "other" or "other_lemon", stays.
+    """Return the settings of a mesh, in which its class is given by name instead of by index.
 
     Args:
-        item: File, solid or mapping with the fields of `ObjectSettings`.
+        item: File, "solid:NAME", or mapping with the fields of `ObjectSettings`.
+            Only the mapping can have a label.
         classes: Names of all classes of a network.
-        key: Setting that lists the mesh, for the error.
+        key: Setting that lists the mesh, for the error message.
 
     Returns:
-        The mesh.
+        Mapping with the name of the class as its label. `item` itself if it has
+        no label, or a label that no network has, such as "other" or
+        "other_lemon".
 
     Raises:
         InputError: If the network lacks the class of the mesh.
     """
     label = item.get("label") if isinstance(item, dict) else None
-    if label is None or label == "" or label == OTHER or str(label).startswith(OTHER_PREFIX):
+    if label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX):
         return item
     return {**item, "label": class_name(classes, label, f"{key}.label")}
 
 
 def class_of_name(name: str, classes: Sequence[str]) -> str | None:
-    """Find the class of a name. Case, "_", "-" and spaces make no difference.
+    """Find the class of a network that a name means, such as "sweet pepper" for "Sweet_Pepper".
+
+    Upper and lower case, "_", "-" and spaces make no difference.
 
     Args:
         name: Name of a class as a user writes it.
-        classes: Names of all classes of a network.
+        classes: Names of all classes of the network.
 
     Returns:
-        Name of the class. None if no class or several classes match.
+        Name of the class as the network has it. None if no class matches, or if
+        several classes match and none of them is exactly `name`.
     """
-    same = [known for known in classes if simplified(known) == simplified(name)]
-    if name in same:
+    matches = [known for known in classes if simplified(known) == simplified(name)]
+    if name in matches:
         return name
-    return same[0] if len(same) == 1 else None
+    return matches[0] if len(matches) == 1 else None
 
 
 def name_of_mesh(mesh: str) -> str:
-    """Return the name of a solid, or that of a file without its ending.
+    """Return what a mesh shows according to its name: NAME of "solid:NAME" or "NAME.glb".
 
     Args:
-        mesh: File, or solid:NAME with or without a seed.
+        mesh: Path of a file, or "solid:NAME" or "solid:NAME:SEED" for a
+            generated mesh.
 
     Returns:
-        The name.
+        NAME of the solid, or the name of the file without its suffix.
 
     >>> name_of_mesh("meshes/banana.glb")
     'banana'
+    >>> name_of_mesh("solid:orange:7")
+    'orange'
     """
     return solid_name(mesh) or Path(mesh).stem
 
@@ -86,40 +93,51 @@ def name_of_mesh(mesh: str) -> str:
 def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> list[str]:
     """Find the class of each mesh by its label or, without a label, by its name.
 
-    The name of a file without its suffix, or the name of a solid, must be the
-    name of a class. Case, "_", "-" and spaces make no difference.
+    Without a label, the file "banana.glb" and the solid "solid:banana" are of the
+    class "banana".
 
     Args:
-        items: Files, solids or mappings with the fields of `ObjectSettings`.
+        items: The meshes. Each is a file, "solid:NAME", or a mapping with the
+            fields of `ObjectSettings`, which can have a label.
         classes: Names of all classes of a network.
-        key: Setting that lists the meshes, for the error.
+        key: Setting that lists the meshes, for the error message.
 
     Returns:
         Name of the class of each mesh.
 
     Raises:
-        InputError: If the network lacks the class of a mesh, or if a mesh tells
-            no class.
+        InputError: If the network lacks the class of a mesh, or if a mesh has no
+            label and its name is not the name of a class.
     """
     found = []
     for index, item in enumerate(items):
         values = item if isinstance(item, dict) else {"mesh": item}
-        if values.get("label") not in (None, ""):
-            found.append(class_name(classes, values["label"], f"{key}[{index}].label"))
-            continue
-        mesh = str(values.get("mesh"))
-        name = class_of_name(name_of_mesh(mesh), classes)
-        if name is None:
-            raise _unnamed(mesh, classes)
-        found.append(name)
+        label = values.get("label")
+        if label in (None, ""):
+            found.append(_class_of_unlabeled_mesh(str(values.get("mesh")), classes))
+        else:
+            found.append(class_name(classes, label, f"{key}[{index}].label"))
     return found
 
 
-def _unnamed(mesh: str, classes: Sequence[str]) -> InputError:
+def _class_of_unlabeled_mesh(mesh: str, classes: Sequence[str]) -> str:
+    """Find the class of a mesh by its name, and raise InputError if no class has this name.
+
+    Args:
+        mesh: File, or "solid:NAME".
+        classes: Names of all classes of the network.
+    """
+    name = class_of_name(name_of_mesh(mesh), classes)
+    if name is None:
+        raise _unknown_class_error(mesh, classes)
+    return name
+
+
+def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
     """Create the error for a mesh whose class is unknown.
 
     Args:
-        mesh: File, or solid:NAME. Its name is not the name of a class.
+        mesh: File, or "solid:NAME". Its name is not the name of a class.
         classes: Names of all classes of the network.
     """
     solid = solid_name(mesh)
@@ -138,48 +156,49 @@ def _unnamed(mesh: str, classes: Sequence[str]) -> InputError:
 
 
 def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:
-    """Find the only class of meshes, see `classes_of_meshes`.
+    """Find the class of meshes that are all of one class.
 
     Args:
-        items: Files, solids or mappings with the fields of `ObjectSettings`.
+        items: The meshes. Each is a file, "solid:NAME", or a mapping with the
+            fields of `ObjectSettings`, which can have a label.
         classes: Names of all classes of a network.
-        key: Setting that lists the meshes, for the error.
+        key: Setting that lists the meshes, for the error message.
 
     Returns:
         Name of the class.
 
     Raises:
-        InputError: If the meshes tell no class, or several.
+        InputError: If the class of a mesh is unknown, or if the meshes are of
+            several classes.
     """
-    found = classes_of_meshes(items, classes, key)
-    if len(set(found)) != 1:
+    found = set(classes_of_meshes(items, classes, key))
+    if len(found) != 1:
         raise InputError(
-            f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}: "
+            f"label is not set, and {key} are of the classes {', '.join(sorted(found))}: "
             "give the meshes of one class, or label=CLASS",
             "label",
         )
-    return found[0]
+    return found.pop()
 
 
 def require_others(
     hard_negatives: Mapping[str, ObjectSettings], labels: Sequence[str], classes: Sequence[str]
 ) -> None:
-    """Check that no hard negative is of a positive class.
+    """Check that no hard negative is an object of a positive class.
 
-    The class of a mesh without a label is the class that its name tells. If
-    there are several positive classes, a labeled object of one of them is a
-    hard negative for the others.
+    With several positive classes, an object of one of them may be a hard
+    negative for the others. The settings must then give its class as a label.
 
     Args:
-        hard_negatives: Hard negatives by their keys, as `read_objects` returns
-            them. The label of an object without a class is empty, OTHER, or
-            begins with OTHER_PREFIX.
+        hard_negatives: Hard negatives by their keys, such as
+            "scene.hard_negatives[0]". The label of an object without a class is
+            empty, "other", or begins with "other_".
         labels: Names of the positive classes.
         classes: Names of all classes of the network.
 
     Raises:
-        InputError: If one is of a positive class, or of a class that the
-            network lacks.
+        InputError: If a hard negative is of a positive class, or has a label
+            that the network lacks.
     """
     for key, item in hard_negatives.items():
         is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
@@ -187,7 +206,8 @@ def require_others(
             name: str | None = class_name(classes, item.label, f"label of {key}")
         else:
             name = class_of_name(name_of_mesh(item.mesh), classes)
-        if name in labels and not (is_labeled and len(labels) > 1):
+        is_permitted = is_labeled and len(labels) > 1
+        if name in labels and not is_permitted:
             raise InputError(
                 f"{key} is {item.mesh}, which is of the positive class {name}: "
                 "move it to meshes, or remove it",
@@ -198,18 +218,18 @@ def require_others(
 def with_classes_of_meshes(
     settings: ExperimentSettings, classes: Sequence[str]
 ) -> ExperimentSettings:
-    """Return settings whose label is the classes of their meshes.
+    """Fill in the missing label of the settings of a run from the classes of its meshes.
 
     Args:
         settings: Settings of a run. Their label is None.
         classes: Names of all classes of the network.
 
     Returns:
-        Settings in which each mesh names its class. Each class is once in the
-        label, in the order of the meshes.
+        Copy of the settings. The label lists the classes of the meshes, each
+        class once. Each mesh has its class as a label.
 
     Raises:
-        InputError: See `classes_of_meshes`.
+        InputError: If the class of a mesh is unknown.
     """
     items = settings.scene.meshes
     names = classes_of_meshes(items, classes, "scene.meshes")
@@ -221,6 +241,7 @@ def with_classes_of_meshes(
         with_class_name(item, classes, "scene.hard_negatives")
         for item in settings.scene.hard_negatives
     ]
+    # A dictionary has each name once, in the order of the meshes.
     labels = list(dict.fromkeys(names))
     return replace(
         settings,
@@ -230,14 +251,15 @@ def with_classes_of_meshes(
 
 
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
-    """Return settings in which classes are given by name instead of by index.
+    """Replace the indices of classes in the settings of a run by the names of the classes.
 
     Args:
-        settings: Settings of a run with a label.
+        settings: Settings of a run. Their label is not None.
         classes: Names of all classes of the network.
 
     Returns:
-        Settings with the names in the label and in the meshes.
+        Copy of the settings with names in the label and in the labels of the
+        meshes and hard negatives.
 
     Raises:
         InputError: If the network lacks a class.
@@ -248,7 +270,9 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         with_class_name(item, classes, "scene.hard_negatives")
         for item in settings.scene.hard_negatives
     ]
-    # A generated hard negative of the class is left out, which changes this number.
+    # `ExperimentSettings` removes generated hard negatives of the positive class,
+    # which it may recognize only now. If `scene.views` is set, it then computes the
+    # number of examples again.
     examples = settings.augment.examples if settings.scene.views is None else None
     return replace(
         settings,

@@ -51,10 +51,11 @@ from train.system.verbosity import take_flag
 
 # Exit status after an error of the user.
 USER_ERROR = 2
-# Exit status of a process that SIGPIPE ends. Windows does not have that signal.
+# Exit status of a process that SIGPIPE ends: 128 plus the number of the signal.
+# Windows does not have that signal.
 BROKEN_PIPE = 141
 INTERRUPTED = "ended by SIGINT"
-# Start of the names of the installed commands.
+# The names of all installed commands begin with this text.
 PREFIX = "pnb-"
 SWEEP_FLAGS = {"--multirun", "-m"}
 HELP_FLAGS = {"--help", "-h"}
@@ -71,25 +72,26 @@ NOUNS = {
 # For some mistakes of the user, Hydra and OmegaConf raise these errors, which do not
 # name the setting.
 INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
-# A float cannot hold whole numbers of more digits than this.
+# The largest float has 309 digits before the decimal point. A whole number with more
+# digits than MAX_DIGITS is reported as too large.
 MAX_DIGITS = 300
-# Hydra reads text between these as it is.
+# Quotation marks. Hydra does not parse the text between two of them.
 QUOTES = "'\""
 Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the command line. Call it to start it.
+    """A command of the command line. Calling the object starts the command.
 
     Args:
-        name: Name of the command without pnb-. If there is a file conf/NAME.yaml, it says what
-            the settings are composed of.
+        name: Name of the command without "pnb-". If there is a file conf/NAME.yaml, Hydra
+            composes the settings as this file says.
         settings: Class of the settings.
-        body: "module:function". The function gets the settings.
-        help: What --help says besides the settings.
-        rewrite: Changes the words of the command line before Hydra reads them.
-        sweeps: Whether the command takes --multirun.
+        body: Function that does the work, as "module:function". Its only argument is the settings.
+        help: Texts that --help shows in addition to the settings.
+        rewrite: Function that changes the arguments of the command line before Hydra reads them.
+        sweeps: Whether the command accepts --multirun.
     """
 
     name: str
@@ -107,29 +109,43 @@ class Command:
 
     @property
     def has_file(self) -> bool:
-        """Whether a file of conf/ says what the settings are composed of."""
+        """Whether Hydra composes the settings of this command as a file conf/NAME.yaml says."""
         return (CONF / f"{self.name}.yaml").exists()
 
     @property
     def keys(self) -> dict[str, Any]:
-        """Annotations of the keys of the command line. Groups of choices alone have None."""
+        """Type annotation of each key of the command line.
+
+        The annotation is None for a key that is no setting, such as "experiment", which selects
+        a file of conf/.
+        """
         return dict.fromkeys(self.help.groups) | types_below(self.settings)
 
     def __call__(self) -> None:
-        """Start the command with the words of the command line."""
-        with exits_on_sigterm(), self.one_line():
+        """Start the command with the arguments of this process."""
+        with exits_on_sigterm(), self.handle_errors():
             set_up_process()
             sys.argv[1:] = take_flag(sys.argv[1:])
             if not HELP_FLAGS.isdisjoint(sys.argv):
                 print(self.format_help([word for word in sys.argv[1:] if word not in HELP_FLAGS]))
                 skip_last_collection()
                 return
-            sys.argv[1:] = self.words(sys.argv[1:])
+            sys.argv[1:] = self.to_overrides(sys.argv[1:])
             start = hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)
             start(self.run)()
 
-    def words(self, arguments: Sequence[str]) -> list[str]:
-        """Put the words of the command line into the form that Hydra reads."""
+    def to_overrides(self, arguments: Sequence[str]) -> list[str]:
+        """Convert the arguments of the command line to overrides that Hydra reads.
+
+        Args:
+            arguments: Settings as "key=value", and options such as "--multirun".
+
+        Returns:
+            Options and overrides with the present keys of the settings (see `as_override`).
+
+        Raises:
+            InputError: If the command does not accept --multirun, or if a setting is to be removed.
+        """
         for argument in arguments:
             if argument in SWEEP_FLAGS and not self.sweeps:
                 raise InputError(
@@ -137,19 +153,27 @@ class Command:
                     "give settings as key=value; --help shows them",
                 )
         # Hydra's parser of options wants --multirun before the settings.
-        words = sorted(arguments, key=lambda word: word not in SWEEP_FLAGS)
+        ordered = sorted(arguments, key=lambda argument: argument not in SWEEP_FLAGS)
         keys = self.keys
-        present = [replace_former_key(word) for word in self.rewrite(words)]
-        return [as_override(word, keys) for word in present]
+        present = [replace_former_key(argument) for argument in self.rewrite(ordered)]
+        return [as_override(argument, keys) for argument in present]
 
     def run(self, config: DictConfig) -> None:
-        """Run the command for a composed configuration. Hydra calls this method."""
-        # Hydra would add a line to the message of an error.
-        with self.one_line():
+        """Run the command, and report errors. Hydra calls this method.
+
+        Args:
+            config: Configuration that Hydra composed from conf/ and the command line.
+        """
+        # An error that reached Hydra would get another line in its message.
+        with self.handle_errors():
             self.work(config)
 
     def work(self, config: DictConfig) -> None:
-        """Read the settings, and call the function of the command."""
+        """Do the work of the command: call the function `self.body` with the settings.
+
+        Args:
+            config: Configuration that is converted to the settings.
+        """
         settings = read_settings(self.settings, config)
         import_function(self.body)(settings)
 
@@ -157,15 +181,15 @@ class Command:
         """Compose the configuration of the command without starting it.
 
         Args:
-            overrides: Words of a command line.
+            overrides: Arguments of a command line, such as "seed=1".
 
         Returns:
             The configuration.
 
         Raises:
-            InputError: If a word is wrong.
+            InputError: If an argument is wrong.
         """
-        words = self.words(overrides)
+        words = self.to_overrides(overrides)
         try:
             return compose(self.name, words)
         except (HydraException, OmegaConfBaseException, *INTERNAL_ERRORS) as error:
@@ -175,22 +199,28 @@ class Command:
             raise InputError(sentence) from error
 
     def read(self, overrides: Sequence[str] = ()) -> Any:
-        """Return the settings that words of a command line give to the command."""
+        """Return the settings that the command would have with the given arguments.
+
+        Args:
+            overrides: Arguments of a command line, such as "seed=1".
+        """
         return read_settings(self.settings, self.compose(overrides))
 
     @contextmanager
-    def one_line(self) -> Iterator[None]:
+    def handle_errors(self) -> Iterator[None]:
         """Print an error of the user in one line, and exit with status 2.
 
-        Ctrl-C ends in one line and status 130. If the reader of the output has gone, the command
-        ends in silence with status 141.
+        Ctrl-C prints one line, too, and exits with status 130. If the program that reads the
+        output has ended, as in `pnb-compare ... | head`, the command exits with status 141 and
+        prints nothing. All other errors are raised.
         """
         try:
             yield
             # If the output is a closed pipe, this raises BrokenPipeError.
             print(end="", flush=True)
         except BrokenPipeError:
-            # Python flushes the output once more at its end.
+            # Python flushes the output again when it exits. That must not raise the
+            # same error once more.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(BROKEN_PIPE)
         except (Exception, KeyboardInterrupt) as error:
@@ -198,7 +228,8 @@ class Command:
             if any(isinstance(cause, KeyboardInterrupt) for cause in causes(error)):
                 print(INTERRUPTED, file=sys.stderr)
                 sys.exit(128 + signal.SIGINT)
-            from train.system.user_errors import user_message  # --help does not need it
+            # This import takes time, and only errors need it.
+            from train.system.user_errors import user_message
 
             sentence = explain(error, self.keys, sys.argv[1:]) or user_message(error)
             if sentence is None:
@@ -207,25 +238,29 @@ class Command:
             sys.exit(USER_ERROR)
 
     def format_help(self, overrides: Sequence[str] = ()) -> str:
-        """Return the text of --help, with the values that overrides give to the settings."""
+        """Return the text of --help, which shows the value of each setting.
+
+        Args:
+            overrides: Arguments of the command line besides --help. The text shows their values.
+        """
         if not overrides and not self.has_file:
-            # To compose the defaults takes twice as long as all else.
+            # Hydra is not needed for the default values, and is slow.
             return self.help.format(OmegaConf.structured(self.settings))
-        # Hydra's own --help lists all groups, which takes longer than to compose the settings.
+        # Hydra's own --help lists the files of all groups of conf/, which is slower.
         return self.help.format(self.compose(overrides))
 
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    """Compose a configuration from the files of conf/.
+    """Compose the configuration of a command from the files of conf/ and from overrides.
 
     Args:
-        name: Name of a command without pnb-.
-        overrides: Overrides in the form that Hydra reads.
+        name: Name of the command without "pnb-".
+        overrides: Overrides as Hydra reads them (see `as_override`).
 
     Returns:
         The configuration.
     """
-    # Hydra is initialized already while a command runs.
+    # While a command runs, Hydra is initialized, and must not be initialized again.
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(name, list(overrides))
     with initialize_config_module("conf", version_base="1.3"):
@@ -233,89 +268,129 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def set_up_process() -> None:
-    """Set what all commands need, before torch is imported."""
-    # Hydra then raises errors instead of printing them.
+    """Set environment variables, warnings and output streams as all commands need them.
+
+    This must happen before torch is imported.
+    """
+    # With this variable, Hydra raises errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Waiting threads of torch then sleep, so that they do not slow down others.
+    # With this variable, threads of torch sleep while they wait. Otherwise they
+    # slow down other processes.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     reuse_freed_memory()
     if Path(sys.argv[0]).stem.startswith(PREFIX):
-        # Child processes must not import a train.py of the current folder.
+        # Without this variable, child processes would import a file train.py of
+        # the current folder instead of this package.
         os.environ["PYTHONSAFEPATH"] = "1"
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     warnings.simplefilter("once", UserWarning, append=True)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            # A terminal may lack some characters.
+            # Characters that the terminal cannot show are printed as escapes.
             stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
 def exits_on_sigterm() -> Iterator[None]:
-    """Raise SystemExit on SIGTERM, so that launchers end their processes."""
-    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    """Raise SystemExit if the signal SIGTERM comes during the block.
+
+    Python's cleanup then runs, in which launchers end their child processes.
+    """
+    previous_handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
 def import_function(path: str) -> Callable[..., Any]:
-    """Import a function, given as "module:function".
+    """Import a function by its path.
 
-    Ctrl-C ends the process at once meanwhile, since some modules swallow KeyboardInterrupt while
-    they are imported.
+    Args:
+        path: Module and name of the function, as "module:function".
+
+    Returns:
+        The function.
     """
     module, _, name = path.partition(":")
-    report = "loading PyTorch and other libraries ..."
-    timer = threading.Timer(IMPORT_DELAY, print, [report], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
-    is_first = "torch" not in sys.modules
-    before = signal.getsignal(signal.SIGINT)
-    is_main = threading.current_thread() is threading.main_thread()
-    if is_main and before is signal.default_int_handler:  # background jobs ignore SIGINT
-        signal.signal(signal.SIGINT, _end_at_once)
-    try:
+    is_torch_imported = "torch" in sys.modules
+    with _announced_if_slow(), _ended_by_ctrl_c():
         function = getattr(import_module(module), name)
-    finally:
-        timer.cancel()
-        if is_main:
-            signal.signal(signal.SIGINT, before)
-    if is_first:
+    if not is_torch_imported:
         skip_last_collection()
     return cast(Callable[..., Any], function)
 
 
-def skip_last_collection() -> None:
-    """Keep Python from looking for cycles among all present objects at its end.
+@contextmanager
+def _announced_if_slow() -> Iterator[None]:
+    """Print that libraries are being loaded if the block takes longer than IMPORT_DELAY."""
+    line = "loading PyTorch and other libraries ..."
+    timer = threading.Timer(IMPORT_DELAY, print, [line], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
-    That takes seconds after PyTorch is imported, and a fifth of the time of --help.
+
+@contextmanager
+def _ended_by_ctrl_c() -> Iterator[None]:
+    """End the process at once if Ctrl-C is pressed during the block.
+
+    Some modules catch KeyboardInterrupt while they are imported, and would continue.
     """
-    gc.freeze()
+    # Only the main thread may set a handler.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous_handler = signal.getsignal(signal.SIGINT)
+    # A job in the background of a shell ignores SIGINT, and must still do so.
+    if previous_handler is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end_at_once)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous_handler)
 
 
 def _end_at_once(number: int, frame: object) -> None:
+    """Handle a signal: print a line and end the process without cleanup.
+
+    Args:
+        number: Number of the signal.
+        frame: Not used. Python calls handlers of signals with it.
+    """
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(128 + number)
 
 
+def skip_last_collection() -> None:
+    """Exclude all present objects from garbage collection, so that Python exits faster.
+
+    At its exit, Python looks for reference cycles among all objects. This takes seconds after
+    PyTorch is imported, and a fifth of the time of --help.
+    """
+    gc.freeze()
+
+
 def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
-    """Convert a configuration to settings.
+    """Convert a configuration of Hydra to an object of a settings class.
 
     Args:
         kind: Class of the settings.
-        config: Values of its fields. Missing ones get their defaults.
+        config: Values of the fields of this class. Missing fields get their defaults.
 
     Returns:
         The settings.
 
     Raises:
-        InputError: If a key is unknown or not set, or a value is wrong. The sentence begins with
+        InputError: If a key is unknown or not set, or a value is wrong. The message begins with
             the key.
     """
     try:
-        # The values of a saved configuration have no types yet.
+        # A configuration that was read from a file does not know the types of its
+        # values. Merging it into the class checks them.
         if OmegaConf.get_type(config) is not kind:
             config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(kind), config))
         return cast(Kind, _read_node(config, ""))
@@ -327,14 +402,14 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 
 
 def _read_node(node: DictConfig, key: str) -> Any:
-    """Convert a node of a configuration to settings.
+    """Convert a configuration, or a group of settings in it, to an object of its settings class.
 
     Args:
-        node: Node with the type of a settings class.
-        key: Dotted key of the node. Empty for the whole configuration.
+        node: The configuration or group, which OmegaConf has typed with a settings class.
+        key: Dotted key of the group, such as "augment.attack". Empty for the whole configuration.
 
     Returns:
-        Settings of this class. Groups inside of it are converted, too.
+        Settings. The groups inside are objects of their settings classes, too.
 
     Raises:
         InputError: If a value is missing or wrong.
@@ -360,20 +435,21 @@ def _read_node(node: DictConfig, key: str) -> Any:
 
 
 def as_override(argument: str, keys: Mapping[str, Any]) -> str:
-    """Put a word of the command line into Hydra's form.
+    """Convert an argument of the command line to an override that Hydra reads as the user means it.
 
-    Names and paths are quoted if Hydra would read 1.10 as 1.1, or refuse an umlaut. A single value
-    for a list becomes a list of one. A + before a key is dropped, since every setting has a key.
+    The value of a text setting is quoted if Hydra would change or refuse it: Hydra reads 1.10 as
+    1.1, and refuses an umlaut. A single value of a list setting becomes a list with one member. A
+    plus sign before a key is removed, because it would add a setting, and all settings exist.
 
     Args:
-        argument: The word.
-        keys: The annotation of each key.
+        argument: Argument such as "label=orange".
+        keys: Type annotation of each setting by its dotted key.
 
     Returns:
-        The word, as Hydra reads it.
+        Override such as "label=['orange']".
 
     Raises:
-        InputError: If a setting is to be removed.
+        InputError: If the argument begins with "~", with which Hydra removes a setting.
     """
     if argument.startswith("~"):
         raise InputError(f"{argument}: a setting cannot be removed: set another value")
@@ -381,32 +457,49 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     if key.startswith("+") and not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
         argument = f"{key}{equals}{value}"
-    # The key is a part of a mapping, such as scene.projector.
-    if keys.get(key.rpartition(".")[0]) is Any:
+    group = key.rpartition(".")[0]
+    # A setting of type Any can hold a mapping, such as scene.projector. Hydra sets a
+    # key of a mapping, which may be absent, only if the override begins with "++".
+    if keys.get(group) is Any:
         return f"++{argument}"
     kind = without_none(keys.get(key))
     if get_origin(kind) is list:
         return _as_list(key, value, is_text=get_args(kind) == (str,))
-    if kind is not str:
-        return argument
-    if not value or value[0] in "'\"~":  # quoted already, or a home folder, which Hydra refuses
-        return argument
-    try:
-        parsed = OverridesParser.create().parse_override(argument).value()
-        # Otherwise it is null, a list, a sweep ...
-        is_kept = parsed == value or not isinstance(parsed, str | int | float)
-    except HydraException:
-        is_kept = False
-    return argument if is_kept else f"{key}={quoted(value)}"
+    if kind is str:
+        return _as_text(key, value)
+    return argument
 
 
-def _as_list(key: str, value: str, is_text: bool) -> str:
-    """Write the override of a setting that is a list.
+def _as_text(key: str, value: str) -> str:
+    """Write the override of a text setting, with quotes if Hydra would change or refuse the value.
 
     Args:
         key: Key of the setting.
-        value: Value in the words of the user. A list, null and a sweep stay the
-            same. Any other value becomes a list of one member.
+        value: Value as the user typed it.
+
+    Returns:
+        Override such as "train.init_from='1.10'".
+    """
+    override = f"{key}={value}"
+    # A value that begins with "~" is a path in the home folder. The error of Hydra
+    # about it is better than a quoted path that does not exist.
+    if not value or value[0] in (*QUOTES, "~"):
+        return override
+    try:
+        parsed = OverridesParser.create().parse_override(override).value()
+    except HydraException:
+        return f"{key}={quoted(value)}"
+    is_changed = isinstance(parsed, str | int | float) and parsed != value
+    return f"{key}={quoted(value)}" if is_changed else override
+
+
+def _as_list(key: str, value: str, is_text: bool) -> str:
+    """Write the override of a list setting.
+
+    Args:
+        key: Key of the setting.
+        value: Value as the user typed it. A list, null and a sweep of Hydra stay
+            the same. Any other value becomes a list with one member.
         is_text: Whether the members of the list are texts.
 
     Returns:
@@ -419,23 +512,27 @@ def _as_list(key: str, value: str, is_text: bool) -> str:
     except HydraException:  # Hydra refuses some paths.
         return f"{key}=[{quoted(value)}]"
     if isinstance(parsed, str) or (is_text and isinstance(parsed, int | float)):
-        # A name in quotes keeps them.
-        member = value if value[0] in QUOTES else quoted(value)
-    elif isinstance(parsed, dict | int | float):
-        member = value
-    else:  # It is null or a sweep.
-        return f"{key}={value}"
-    return f"{key}=[{member}]"
+        is_quoted = value[0] in QUOTES
+        member = value if is_quoted else quoted(value)
+        return f"{key}=[{member}]"
+    if isinstance(parsed, dict | int | float):
+        return f"{key}=[{value}]"
+    # The value is null or a sweep of Hydra.
+    return f"{key}={value}"
 
 
 def quoted(text: str) -> str:
-    """Quote a text, so that Hydra reads it as it is.
+    """Put a text between single quotes, so that Hydra reads it unchanged.
 
-    A backslash before a quote, or at the end, is doubled.
+    A single quote inside the text gets a backslash before it. Backslashes of the text that stand
+    before a single quote or at the end are doubled.
     """
-    parts = text.split("'")
-    escaped = [part + "\\" * (len(part) - len(part.rstrip("\\"))) for part in parts]
-    return "'" + "\\'".join(escaped) + "'"
+    escaped_parts = []
+    for part in text.split("'"):
+        backslash_count = len(part) - len(part.rstrip("\\"))
+        escaped_parts.append(part + "\\" * backslash_count)
+    escaped = "\\'".join(escaped_parts)
+    return f"'{escaped}'"
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
@@ -447,21 +544,22 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
-    """Say what is wrong with a configuration, in one sentence that begins with the key.
+    """Explain an error of Hydra or OmegaConf in one sentence that begins with the key.
 
     Args:
-        error: What Hydra or OmegaConf raised.
-        keys: The annotation of each key.
-        words: The words of the command line.
+        error: Any error.
+        keys: Type annotation of each setting by its dotted key.
+        words: Arguments of the command line.
 
     Returns:
-        The sentence. None if the error is of another kind.
+        The sentence. None if neither Hydra nor OmegaConf raised the error.
     """
-    # OmegaConf's error, which knows the key, is a cause of Hydra's.
-    chain = list(causes(error))
-    wrong = next((cause for cause in chain if getattr(cause, "full_key", None)), error)
+    # An error of Hydra is often caused by an error of OmegaConf. Only the error of
+    # OmegaConf has the attribute `full_key`, the key of the wrong setting.
+    with_key = [cause for cause in causes(error) if getattr(cause, "full_key", None)]
+    wrong = with_key[0] if with_key else error
     key = str(getattr(wrong, "full_key", None) or "")
-    place = _file_of(error)
+    place = _name_conf_file(error)
     match wrong:
         case InputError():
             return str(wrong)
@@ -483,22 +581,31 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
     return None
 
 
-def _file_of(error: BaseException) -> str:
-    """Name the file of conf/ that an error of Hydra is about.
+def _name_conf_file(error: BaseException) -> str:
+    """Name the file of conf/ in which Hydra found an error.
+
+    Such an error begins with a text like "In 'attack': ".
 
     Returns:
-        Text such as " (In 'attack')". Empty if the error names no file.
+        Text to append to a message, such as " (In 'attack')". Empty if the error
+        names no file.
     """
-    first = _first_line(error).partition(":")[0]
-    return f" ({first})" if first.startswith("In ") else ""
+    start = _first_line(error).partition(":")[0]
+    return f" ({start})" if start.startswith("In ") else ""
 
 
 def _first_line(error: BaseException) -> str:
+    """Return the first line of the message of an error."""
     return str(error).partition("\n")[0].strip()
 
 
 def _suggest(key: str, keys: Collection[str]) -> str:
-    """Suggest the key that is most similar to an unknown one, or --help if none is similar."""
+    """Suggest the key that is most similar to a wrong key, or --help if no key is similar.
+
+    Args:
+        key: Key that is not a setting.
+        keys: Keys of all settings.
+    """
     close = get_close_matches(key, keys, 1, 0.5)
     return f"did you mean {close[0]}?" if close else "--help shows all settings"
 
@@ -509,13 +616,14 @@ def _explain_value(
     keys: Mapping[str, Any],
     place: str,
 ) -> str:
-    """Explain a value that does not have the type of its setting.
+    """Explain the error of a value that does not have the type of its setting.
 
     Args:
         error: Error of OmegaConf.
-        key: Key of the setting.
-        keys: Annotation of each key.
-        place: Text with the file of conf/ that has the value, or an empty text.
+        key: Dotted key of the setting.
+        keys: Type annotation of each setting by its dotted key.
+        place: Text such as " (In 'attack')" with the file of conf/ that has the
+            value. Empty if the value comes from the command line.
     """
     hint = without_none(keys.get(key))
     value = getattr(error, "value", None)
@@ -530,7 +638,11 @@ def _explain_value(
 
 
 def _explain_choice(file: str) -> str:
-    """Explain a file of conf/ that does not exist."""
+    """Explain the error of a choice, such as attack=light, for which conf/ has no file.
+
+    Args:
+        file: Missing file relative to conf/, such as "attack/light.yaml".
+    """
     group, _, choice = file.removesuffix(".yaml").rpartition("/")
     options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
     return f"{group}={choice} is not a choice: choose one of {', '.join(options)}"
@@ -540,10 +652,10 @@ def _explain_overflow(words: Sequence[str]) -> str | None:
     """Explain the error of a whole number that is too large for a float.
 
     Args:
-        words: Words of the command line.
+        words: Arguments of the command line.
 
     Returns:
-        Sentence about the first such number. None if no word has one.
+        Sentence about the first such number. None if no argument has one.
     """
     for word in words:
         key, _, value = word.partition("=")
@@ -559,11 +671,11 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
     null.
 
     Args:
-        keys: Annotation of each key.
-        words: Words of the command line.
+        keys: Type annotation of each setting by its dotted key.
+        words: Arguments of the command line.
 
     Returns:
-        Sentence about the first such setting. None if no word has one.
+        Sentence about the first such setting. None if no argument sets one.
     """
     for word in words:
         key = word.partition("=")[0]
@@ -576,31 +688,38 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
 
 
 def program(name: str, as_called: bool = False) -> list[str]:
-    """Return the words that start a command as this process was started.
+    """Return the start of a command line that runs a command in the way of this process.
 
     Args:
-        name: Name of the command without pnb-.
-        as_called: Use the path of this machine's interpreter or installed command.
+        name: Name of the command without "pnb-".
+        as_called: Whether to write the full path of the Python interpreter or of the installed
+            command, instead of "python" or "pnb-NAME".
 
     Returns:
-        `pnb-NAME`, or `python -m` with a module of the clone; for several processes, by torchrun.
+        Words of a shell: "pnb-NAME" if the package is installed, or else "python -m MODULE". If
+        torchrun started this process, the words begin with torchrun and its options.
     """
     called = Path(sys.argv[0])
-    count = int(os.environ.get("WORLD_SIZE", "1"))
+    process_count = int(os.environ.get("WORLD_SIZE", "1"))
     installed_name = f"{PREFIX}{name}"
     is_installed = bool(sys.flags.safe_path) or called.stem.startswith(PREFIX)
-    python = [sys.executable] if as_called else ["python"]
+    python = sys.executable if as_called else "python"
     if is_installed:
-        words = [str(called) if as_called and called.stem == installed_name else installed_name]
+        has_path = as_called and called.stem == installed_name
+        words = [str(called) if has_path else installed_name]
     else:
         words = ["-m", "train" if name == "train" else f"scripts.{name}"]
-    if count > 1:
-        torchrun = [*python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
+    if process_count > 1:
+        torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
         no_python = ["--no-python"] if is_installed else []
-        return [*torchrun, f"--nproc_per_node={count}", *no_python, *words]
-    return words if is_installed else [*python, *words]
+        return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
+    return words if is_installed else [python, *words]
 
 
 def command_line(name: str) -> str:
-    """Return the command line of this process, as a user can repeat it."""
+    """Return the command line of this process, as a user can type it again.
+
+    Args:
+        name: Name of the command without "pnb-".
+    """
     return shlex.join([*program(name), *sys.argv[1:]])

@@ -40,14 +40,14 @@ RENDERERS = ("reload", "mitsuba")
 # Power with which each default lamp starts (`LampsSettings.start`) if an attack moves the
 # lamps, but does not change their power.
 LAMP_POWER = 2.0
-# Patterns of projectors that a training may use.
+# Patterns of projectors in training images.
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
-# Patterns of projectors for images that are kept aside from training.
+# Patterns of projectors in test images. Training uses none of these patterns.
 OTHER_PATTERNS = ("rings", "window", "leaves", "text", "colors")
-# Name of the pattern that projects images of the user.
+# Name of the pattern that projects image files of the user.
 SLIDES = "slides"
 PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
-# Default meshes of pnb-lab.
+# The objects that pnb-lab renders by default: six oranges, and ten other objects.
 LAB_MESHES = [
     *(f"solid:orange:{seed}" for seed in range(101, 107)),
     *("solid:apple:101", "solid:apple:102", "solid:pear:101", "solid:sweet_pepper:101"),
@@ -62,7 +62,7 @@ CLASSIFIERS = (
 
 @dataclass(kw_only=True)
 class ClassifierSettings(Settings):
-    """A classifier, and what a user says about a network of their own."""
+    """Settings that choose a classifier, and describe it if it is a network of the user."""
 
     classifier: str | None = setting(None, f"The network: {CLASSIFIERS}.")
     weights: str | None = setting_like(NetworkSettings, "weights", None)
@@ -90,7 +90,7 @@ class ClassifierSettings(Settings):
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """Settings of the attack of pnb-attack."""
+    """Settings of an attack that only the command pnb-attack has."""
 
     relighting: RelightingSettings | None = setting(
         None, "Attack on the light of a projector on `photographs`, without a mesh."
@@ -130,7 +130,7 @@ class AttackCommandSettings(AttackSettings):
 
 @dataclass
 class AttackSceneSettings(SceneSettings):
-    """The scene that pnb-attack attacks."""
+    """Settings of the scene that the command pnb-attack attacks."""
 
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
@@ -150,10 +150,11 @@ class AttackSceneSettings(SceneSettings):
 
 @dataclass
 class TransferSettings(Settings):
-    """Other meshes, views and classifiers to which pnb-attack transfers adversaries.
+    """Settings of transfer attacks of pnb-attack.
 
-    The success on another classifier counts only the images that it classified
-    correctly before.
+    The lighting, shape or pattern that fools the attacked classifier is tried on
+    other classifiers, views and meshes. The success rate on another classifier
+    counts only images that it classified correctly before the attack.
     """
 
     classifiers: list[Any] = setting(
@@ -168,10 +169,11 @@ class TransferSettings(Settings):
 
 @dataclass
 class AttackExperimentSettings(ClassifierSettings):
-    """Settings of pnb-attack: one attack on one classifier.
+    """Settings of the command pnb-attack, which attacks one classifier.
 
-    If a projector or lamps are attacked and the scene has none, it gets them with their
-    defaults. An attack on the pose sets `renderer.visibility.silhouettes`.
+    If the attack needs a projector or lamps and the scene has none, the scene gets them with
+    default settings. An attack on the pose sets `renderer.silhouettes` to True, because its
+    gradient needs the silhouettes of objects.
     """
 
     classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
@@ -217,22 +219,32 @@ class AttackExperimentSettings(ClassifierSettings):
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
             raise InputError(
-                "target: give a class, least_likely, or a list of classes, one per view",
+                f"target={self.target} is not a class: "
+                "give a class, least_likely, or a list of classes, one per view",
                 "target",
             )
-        if isinstance(self.target, int | float):  # a class whose name is a number
+        # The name of a class can be a number, which YAML reads as one.
+        if isinstance(self.target, int | float):
             self.target = str(self.target)
-        attacked = self.attack.parameters
+        self._check_photographs()
+        self._add_attacked_lights()
+
+    def _check_photographs(self) -> None:
+        """Check that the attack "relighting" has photographs, and that it is the only attack."""
         if (self.attack.relighting is None) != (self.photographs is None):
             raise InputError(
                 "attack=relighting and photographs belong together: set both, or neither",
             )
-        if self.photographs is not None and (attacked or self.reload):
+        if self.photographs is not None and (self.attack.parameters or self.reload):
             raise InputError(
                 "attack=relighting attacks photographs alone: "
                 "attack meshes in a command of their own",
                 "attack",
             )
+
+    def _add_attacked_lights(self) -> None:
+        """Add to the scene and the renderer what the attacked parameters need."""
+        attacked = self.attack.parameters
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if name in attacked and getattr(self.scene, name) is None:
                 setattr(self.scene, name, kind())
@@ -244,10 +256,11 @@ class AttackExperimentSettings(ClassifierSettings):
 
 @dataclass
 class LabSettings(Settings):
-    """Settings of pnb-lab.
+    """Settings of the command pnb-lab, which path-traces test images of objects.
 
-    A mesh is a file, solid:NAME:SEED or a mapping with the fields of ObjectSettings. Its label
-    is a class, or other_NAME if the network lacks the class.
+    A mesh is a file, "solid:NAME:SEED" for a generated object, or a mapping with the fields of
+    `ObjectSettings`. Its label is a class of the network, or "other_NAME" for an object of no
+    class.
     """
 
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
@@ -347,21 +360,24 @@ class LabSettings(Settings):
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
             raise InputError(
-                f"setups={self.setups} must be a multiple of the {len(sources)} patterns and maps",
+                f"setups={self.setups} must be a multiple of the {len(sources)} patterns and "
+                "environments: give as many setups to each of them",
                 "setups",
             )
-        if len(set(sources)) < len(sources):
+        repeated = [name for name in sources if sources.count(name) > 1]
+        if repeated:
             raise InputError(
-                "patterns and environments "
-                "must have different names, which are the renders' sources",
+                f"patterns and environments name {repeated[0]} twice: "
+                "give them different names, which group the renders",
             )
 
 
 @dataclass
 class AuditSettings(ClassifierSettings):
-    """Settings of pnb-audit.
+    """Settings of the command pnb-audit, which measures how safe a network is in unusual lighting.
 
-    A mesh is a file, solid:NAME:SEED or a mapping with the fields of ObjectSettings.
+    A mesh is a file, "solid:NAME:SEED" for a generated object, or a mapping with the fields of
+    `ObjectSettings`.
     """
 
     classifier: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
@@ -415,22 +431,29 @@ class AuditSettings(ClassifierSettings):
             )
         for key in ("hard_negatives", "photos", "laboratory"):
             if getattr(self, key) and not self.meshes:
-                raise InputError(f"{key} is for an audit of meshes: set meshes, too", key)
+                raise InputError(f"{key} is set, but meshes is empty: set meshes, too", key)
         if self.laboratory and self.hard_negatives:
             raise InputError(
-                f"hard_negatives are rendered instead of laboratory={self.laboratory}: "
-                "leave one of them out",
+                f"hard_negatives and laboratory={self.laboratory} are both set: "
+                "give either meshes to render or a folder of renders",
                 "hard_negatives",
             )
 
     def scale(self, count: int) -> int:
-        """Multiply a count by the budget. The result is at least 1."""
+        """Multiply a number of views, lightings or renders by the budget.
+
+        Args:
+            count: The number with a budget of 1.
+
+        Returns:
+            The rounded product, at least 1.
+        """
         return max(1, round(count * self.budget))
 
 
 @dataclass
 class CompareSettings(Settings):
-    """Settings of pnb-compare."""
+    """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
     runs: list[str] = setting(REQUIRED, "Folders of finished runs.")
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
@@ -450,15 +473,12 @@ class CompareSettings(Settings):
         folders = [Path(run).resolve() for run in self.runs]
         for run, folder in zip(self.runs, folders, strict=True):
             if folders.count(folder) > 1:
-                raise InputError(
-                    f"runs names {run} twice, as if it were another seed: name each run once",
-                    "runs",
-                )
+                raise InputError(f"runs names {run} twice: name each run once", "runs")
 
 
 @dataclass
 class EvaluateSettings(ClassifierSettings):
-    """Settings of pnb-evaluate."""
+    """Settings of the command pnb-evaluate, which scores a network on photographs."""
 
     photos: str = setting(
         REQUIRED,
@@ -501,34 +521,47 @@ class EvaluateSettings(ClassifierSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_calibration(self.false_positive_rate, self.calibrate)
+        # This call only checks the label.
         label_names(self.label)
         if (self.run is None) == (self.classifier is None):
-            raise InputError("give one network: run=FOLDER, or classifier=NAME")
+            raise InputError(
+                f"run={self.run} and classifier={self.classifier} do not name one network: "
+                "give one network by run=FOLDER, or by classifier=NAME"
+            )
         if self.classifier and self.model:
             raise InputError(
-                f"model={self.model} is for run=FOLDER: "
-                "leave it out, since a classifier has its own",
+                f"model={self.model} is for the network of run=FOLDER: "
+                "leave it out with classifier=NAME, or give run=FOLDER",
                 "model",
             )
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
-    """Check that a false-positive rate and a folder to calibrate on are given together.
+    """Check that the two settings that choose a threshold are given together.
+
+    The threshold on the score of a class is chosen so that a given fraction of the negatives in
+    a folder of photographs is above it.
 
     Args:
-        rate: False-positive rate, or None.
-        calibrate: Folder of photographs, or None.
+        rate: This fraction, the false-positive rate. None if it is not set.
+        calibrate: The folder of photographs. None if it is not set.
 
     Raises:
-        InputError: If only one is given.
+        InputError: If only one of both is set.
     """
     if (rate is None) != (calibrate is None):
-        raise InputError("give false_positive_rate=RATE and calibrate=FOLDER together, or neither")
+        raise InputError(
+            f"false_positive_rate={rate} and calibrate={calibrate} belong together: "
+            "give false_positive_rate=RATE and calibrate=FOLDER, or neither"
+        )
 
 
 @dataclass
 class FitSettings(Settings):
-    """Settings of pnb-fit."""
+    """Settings of the command pnb-fit.
+
+    It finds the lighting and background of a photograph from a mesh of the object in it.
+    """
 
     photograph: str = setting(REQUIRED, "An image file.")
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
@@ -572,12 +605,15 @@ class FitSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
-            raise InputError("give either mask=FILE or box=[left,top,right,bottom]")
+            raise InputError(
+                f"mask={self.mask} and box={self.box}: give one of them, "
+                "either mask=FILE or box=[left,top,right,bottom]"
+            )
 
 
 @dataclass
 class LightSettings(Settings):
-    """Settings of pnb-light."""
+    """Settings of the command pnb-light, which writes a lighting as an environment map."""
 
     light: str = setting(
         REQUIRED,
@@ -591,14 +627,14 @@ class LightSettings(Settings):
         256,
         "Number of rows. There are twice as many columns.",
         minimum=1,
-        maximum=8192,  # a map of this height takes 3 GB
+        maximum=8192,  # A map with this height needs 3 GB of memory.
     )
     overwrite: bool = setting(False, "Replace a file that exists.")
 
 
 @dataclass
 class PublishSettings(Settings):
-    """Settings of pnb-publish."""
+    """Settings of the command pnb-publish, which writes the network of a run for other users."""
 
     run: str = setting(REQUIRED, "A finished run folder, or a published network.")
     out: str = setting(REQUIRED, "Folder of the weights.")
@@ -622,7 +658,7 @@ class PublishSettings(Settings):
 
 @dataclass
 class ReportSettings(Settings):
-    """Settings of pnb-report."""
+    """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
 
     runs: list[str] = setting(
         REQUIRED,

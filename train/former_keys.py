@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-# The last part of the present key, by the former key.
+# For each former key of a setting, the present name of the setting in the same group:
+# augment.arm is now augment.mode.
 FORMER_KEYS = {
     "augment.arm": "mode",
     "augment.every": "regenerate_every",
@@ -26,13 +27,14 @@ FORMER_KEYS = {
 
 
 def replace_former_key(word: str) -> str:
-    """Replace a former key in a word of the command line, such as augment.every=60.
+    """Replace the former key of a setting in an argument of the command line.
 
     Args:
-        word: Word of the command line, with any number of leading plus signs.
+        word: Argument such as "augment.every=60". It may begin with plus signs.
 
     Returns:
-        The word with the present key. A word with another key is unchanged.
+        Argument with the present key. An argument with any other key is
+        unchanged.
 
     >>> replace_former_key("augment.every=60")
     'augment.regenerate_every=60'
@@ -47,10 +49,10 @@ def replace_former_key(word: str) -> str:
 
 
 def rename_former_keys(config: dict[str, Any]) -> None:
-    """Rename former keys in the contents of a config.yaml, in place.
+    """Rename settings that have former keys in the contents of a config.yaml.
 
     Args:
-        config: Nested settings by name.
+        config: Nested dictionaries of settings, which are changed.
     """
     for former, present in FORMER_KEYS.items():
         *groups, name = former.split(".")

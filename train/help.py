@@ -16,23 +16,24 @@ import conf
 from renderer.settings import facts_of, field_types
 
 CONF = Path(conf.__path__[0])
-# Number of characters of a key with its value.
+# Width of the left column of --help, which has "key=value", in characters.
 KEY_WIDTH = 44
-# Number of characters of an explanation in a line.
+# Width of the right column of --help, which explains the setting, in characters.
 TEXT_WIDTH = 80
 VERBOSE_HELP = "Print details. Without it, a command prints its result in at most 15 lines."
 
 
 @dataclass(frozen=True)
 class HelpText:
-    """Texts of a command in --help, besides its settings.
+    """Texts that --help of a command shows before the list of its settings.
 
     Args:
-        about: What the command does.
+        about: Sentence that says what the command does.
         examples: Command lines.
         common: Keys of the settings that are changed most often.
-        groups: Groups of choices, as they are named on the command line. A group is a folder of
-            conf/, or folder@key.
+        groups: Groups of choices, such as "experiment" for experiment=NAME. A group is a folder
+            of conf/ with a file for each choice. "attack@augment.attack" is the folder conf/attack,
+            whose files set augment.attack.
     """
 
     about: str
@@ -41,7 +42,11 @@ class HelpText:
     groups: Sequence[str] = ()
 
     def format(self, config: DictConfig) -> str:
-        """Return the text for a composed configuration, whose values it shows."""
+        """Return the whole text of --help.
+
+        Args:
+            config: Configuration of the command. The text shows its values.
+        """
         lines = dict(_setting_lines(config))
         sections = [
             self.about,
@@ -58,32 +63,41 @@ class HelpText:
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
-    """Return the annotation of each setting and each group of settings by its dotted key.
+    """Return the type annotation of each setting in a settings class and in its groups.
 
     Args:
-        kind: Class of settings.
+        kind: Class of settings. A field whose type is a settings class is a group.
         prefix: Text before each key, such as "train.".
 
     Returns:
-        Annotations, such as `int | None` for "epochs".
+        Type annotation of each setting and of each group by its dotted key, such as `int` for
+        "train.epochs". It is `str` for a setting of any type that is shown as text.
     """
     found: dict[str, Any] = {}
     for name, hint in field_types(kind).items():
         found[f"{prefix}{name}"] = str if facts_of(kind, name).is_text else hint
-        part = without_none(hint)
-        if is_dataclass(part):
-            found |= types_below(cast(type, part), f"{prefix}{name}.")
+        field_type = without_none(hint)
+        if is_dataclass(field_type):
+            found |= types_below(cast(type, field_type), f"{prefix}{name}.")
     return found
 
 
 def without_none(hint: Any) -> Any:
-    """Return A for an annotation A or A | None, and any other annotation as it is."""
-    options = [part for part in get_args(hint) if part is not NoneType]
+    """Remove None from a type annotation: `int | None` becomes `int`.
+
+    Args:
+        hint: Type annotation. A union of several types with None stays as it is.
+    """
+    options = [option for option in get_args(hint) if option is not NoneType]
     return options[0] if isinstance(hint, UnionType) and len(options) == 1 else hint
 
 
 def _choice_lines(groups: Sequence[str]) -> Iterator[str]:
-    """Yield a line for each choice of each group, such as "attack=lighting" with its comment."""
+    """Yield the lines of --help about choices, such as "attack=lighting" and its explanation.
+
+    Args:
+        groups: Groups as in `HelpText`. A choice is a file in the folder of the group.
+    """
     for group in groups:
         folder = CONF / group.partition("@")[0]
         for path in sorted(folder.glob("*.yaml")):
@@ -99,14 +113,14 @@ def _first_comment(path: Path) -> str:
 
 
 def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the line of --help about each setting below a node.
+    """Yield the line of --help about each setting in a configuration or in a group of it.
 
     Args:
-        node: Settings with their values.
+        node: The configuration or group, with values.
         prefix: Text before each key, such as "train.".
 
     Yields:
-        Dotted key of a setting or a group of settings, and its line.
+        Pair of the dotted key of a setting or group, and its line.
     """
     kind = cast(type, OmegaConf.get_type(node))
     values = cast(dict[str, Any], OmegaConf.to_container(node))
@@ -123,12 +137,20 @@ def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, st
 
 
 def _format_value(value: Any) -> str:
-    """Format a value as it is given on the command line."""
+    """Format the value of a setting as a user types it on the command line."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def format_facts(kind: type, name: str) -> str:
-    """Format the explanation, the choices, the unit and the range of a field."""
+    """Format the explanation of a setting with its choices, its unit and its range.
+
+    Args:
+        kind: Class of settings.
+        name: Field of the class.
+
+    Returns:
+        Text such as "Weight decay. [≥ 0, ≤ 100000]".
+    """
     facts = facts_of(kind, name)
     limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
@@ -137,12 +159,18 @@ def format_facts(kind: type, name: str) -> str:
 
 
 def _format_line(left: str, right: str) -> str:
-    """Put an explanation beside a key, or below it if the key is long."""
+    """Format two columns. A long text on the left gets a line of its own above the right text.
+
+    Args:
+        left: Text of the left column, such as "seed=0".
+        right: Text of the right column, which is wrapped.
+    """
     indent = " " * (KEY_WIDTH + 2)
     wrapped = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
     lines = [indent + line for line in wrapped]
     key = f"  {left}"
-    if lines and len(key) <= KEY_WIDTH:
+    fits = len(key) <= KEY_WIDTH
+    if lines and fits:
         lines[0] = key.ljust(len(indent)) + wrapped[0]
     else:
         lines.insert(0, key)

@@ -4,6 +4,7 @@ A network is a WideResNet, an architecture of torchvision, or the result of a
 Python function.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -24,24 +25,25 @@ from train.settings import WIDERESNET
 TORCHVISION = "torchvision:"
 # Start of the name of a Python function.
 PYTHON = "python:"
-# Version of the description that is stored with the weights of a network.
-# Version 1 had no size, normalization and encoding.
+# Version of the description that is stored with the weights of a network. Version 1
+# lacked the size and the normalization of images, and the encoding of renders.
 VERSION = 2
 # Largest depth and largest number of parameters of a WideResNet. A file from
 # elsewhere can ask for any depth and width, and 1e9 parameters take 4 GB.
 MAX_DEPTH = 1000
 MAX_PARAMETER_COUNT = 1e9
-# Dropout on a CPU draws integers of 16 bits.
+# Number of values of the random 16-bit integers that dropout draws on a CPU.
 DROPOUT_LEVELS = 2**16
-# RGB, shape (3,).
+# Three numbers: red, green and blue.
 Color = Sequence[float]
-# Mean and standard deviation of the data, if they are not given.
+# Default mean and standard deviation of the pixels of the data, in red, green and blue.
 MEAN = (0.5, 0.5, 0.5)
 STD = (0.25, 0.25, 0.25)
-# Key in the description of a network that `augment.build_classifier` built.
+# Key in the description of a network. It is True if `augment.build_classifier` built
+# the network.
 CLASSIFIER = "classifier"
-# Arguments of architectures of torchvision. Auxiliary classifiers would return
-# several outputs.
+# Arguments for some architectures of torchvision. They switch off the auxiliary
+# classifiers, with which a network would return several outputs.
 _OPTIONS = {
     "googlenet": {"aux_logits": False, "init_weights": True},
     "inception_v3": {"aux_logits": False, "init_weights": True},
@@ -119,28 +121,55 @@ class WideResNet(nn.Module):
 
 
 def _require_shape(depth: int, width: int, dropout: float) -> None:
-    """Raise InputError if a WideResNet cannot have the depth, the width or the dropout."""
+    """Check the arguments of a WideResNet.
+
+    Args:
+        depth: Number of layers.
+        width: Factor of the number of channels.
+        dropout: Probability of dropout.
+
+    Raises:
+        InputError: If an argument is outside its range, or if the network would
+            have too many parameters.
+    """
     given = f"depth={depth}, width={width}"
-    # The weights of the 3 × 3 convolutions, which are most of the parameters.
-    # Each group has two convolutions in each of (depth - 4) / 6 blocks. The channels
-    # of the groups are 16, 32 and 64 times the width, with the squares 16² · (1, 4, 16).
-    parameter_count = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
     if depth < 10 or (depth - 4) % 6 or width < 1:
-        raise InputError(f"{given}: depth is 10, 16, 22, ... and width at least 1", "depth")
+        raise InputError(
+            f"{given}: set depth to 10, 16, 22, ..., and width to 1 or more",
+            "depth",
+        )
+    # Each of three groups of layers has this number of blocks. A block has two
+    # 3 × 3 convolutions, whose weights are most of the parameters of the network.
+    block_count = (depth - 4) // 6
+    parameter_count = 0
+    for channels in (16 * width, 32 * width, 64 * width):
+        parameter_count += block_count * 2 * (3 * 3 * channels**2)
     if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
-        raise InputError(f"{given}: {parameter_count:.1g} parameters are too many", "depth")
+        raise InputError(
+            f"{given}: {parameter_count:.1g} parameters are too many: set a smaller depth or width",
+            "depth",
+        )
     if not 0 <= dropout < 1:
         raise InputError(f"dropout={dropout} must be at least 0 and below 1", "dropout")
 
 
 class _Block(nn.Module):
-    """Residual block with two convolutions, each after a batch norm and a ReLU.
+    """Residual block of a WideResNet.
 
-    The dropout stands between the convolutions. If the shape changes, the
-    shortcut has a convolution after the first ReLU.
+    It has two convolutions with dropout between them. A batch norm and a ReLU
+    precede each convolution. If the number of channels or the resolution
+    changes, the shortcut is a 1 × 1 convolution after the first ReLU.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int, dropout: float):
+        """Build a block with random weights.
+
+        Args:
+            inputs: Number of input channels.
+            outputs: Number of output channels.
+            stride: Stride of the first convolution and of the shortcut.
+            dropout: Probability of dropout, in [0, 1).
+        """
         super().__init__()
         self.norm1 = nn.BatchNorm2d(inputs)
         self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
@@ -152,7 +181,14 @@ class _Block(nn.Module):
             self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Transform features (N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
+        """Compute the output features of the block.
+
+        Args:
+            x: Features, shape (N, inputs, H, W).
+
+        Returns:
+            Features, shape (N, outputs, H / stride, W / stride).
+        """
         activated = F.relu(self.norm1(x))
         shortcut = x if self.shortcut is None else self.shortcut(activated)
         hidden = self.conv1(activated)
@@ -160,7 +196,7 @@ class _Block(nn.Module):
 
 
 def _initialize(module: nn.Module) -> None:
-    """Initialize the weights of a layer at random (He et al. 2015)."""
+    """Initialize the weights of a convolution or a linear layer at random (He et al. 2015)."""
     if isinstance(module, nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
     elif isinstance(module, nn.Linear):
@@ -169,12 +205,13 @@ def _initialize(module: nn.Module) -> None:
 
 
 class Dropout(nn.Dropout):
-    """Dropout that is fast on a CPU and independent of the number of processes.
+    """Dropout that is fast on a CPU, and whose result is the same for any number of processes.
 
-    On a CPU, the draws of `nn.Dropout` take a third of a training step. Here
-    they come from numpy, and the probability is rounded to a multiple of 2⁻¹⁶.
-    Each of several processes has an equal shard of the batch. It draws for the
-    whole batch and uses the draws of its shard.
+    On a CPU, the random numbers of `nn.Dropout` take a third of the time of a
+    training step. This class takes random 16-bit integers from NumPy, so the
+    probability is rounded to a multiple of 2⁻¹⁶. If several processes train a
+    network, each has a shard (an equal part) of the batch. Each process draws
+    the random numbers of the whole batch, and uses those of its shard.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -198,30 +235,42 @@ class Dropout(nn.Dropout):
     def _draw_factors(self, x: Tensor) -> Tensor:
         """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
 
-        A draw has 16 random bits. The factors have the shape and the memory
-        layout of x.
+        Args:
+            x: Features on the CPU, of any shape.
+
+        Returns:
+            Factors of the shape and the memory layout of x.
         """
-        # All processes draw for the whole batch, and each takes its own part.
-        # The draws then do not depend on the number of processes.
         value_count = x.numel()
-        batch_value_count = value_count * distributed.world_size()
-        # The seed comes from torch, so that `torch.manual_seed` decides the draws.
-        seed = int(torch.randint(2**63 - 1, (1,)))
-        generator = np.random.Generator(np.random.SFC64(seed))
-        # A word of 64 bits has four draws. The division rounds up.
-        word_count = -(-batch_value_count // 4)
-        words = generator.integers(0, 2**64 - 1, word_count, dtype=np.uint64, endpoint=True)
-        draws = torch.from_numpy(words.view(np.int16))
-        shard_draws = draws[distributed.rank() * value_count :][:value_count]
+        draws = _draw_int16(value_count * distributed.world_size())
+        shard_start = distributed.rank() * value_count
+        shard_draws = draws[shard_start : shard_start + value_count]
+        # The draws are equally distributed integers, the smallest is -DROPOUT_LEVELS / 2.
+        # Values with one of the `dropped_levels` smallest integers are dropped.
         dropped_levels = round(self.p * DROPOUT_LEVELS)
-        # The comparison writes 0 or 1 to the draws themselves, because numbers
-        # of type int16 convert to float five times faster than bool.
-        is_kept = shard_draws.ge_(dropped_levels - DROPOUT_LEVELS // 2)
-        # The tensor is dense, so that its storage can be filled in order.
+        threshold = dropped_levels - DROPOUT_LEVELS // 2
+        # `ge_` replaces each draw by 1 if the value is kept, and by 0 if it is dropped.
+        # Numbers of type int16 convert to float five times faster than numbers of type bool.
+        is_kept = shard_draws.ge_(threshold)
         factors = torch.empty_like(x)
+        # A view of the memory of `factors` as one row of numbers.
+        flat_factors = factors.as_strided((value_count,), (1,))
         scale = DROPOUT_LEVELS / (DROPOUT_LEVELS - dropped_levels)
-        factors.as_strided((value_count,), (1,)).copy_(is_kept).mul_(scale)
+        flat_factors.copy_(is_kept).mul_(scale)
         return factors
+
+
+def _draw_int16(count: int) -> Tensor:
+    """Draw at least `count` random integers, int16, uniformly from all integers of this type.
+
+    The seed comes from torch, so that `torch.manual_seed` decides the draws.
+    """
+    seed = int(torch.randint(2**63 - 1, (1,)))
+    generator = np.random.Generator(np.random.SFC64(seed))
+    # NumPy draws words of 64 bits fastest. A word holds four integers of 16 bits.
+    word_count = math.ceil(count / 4)
+    words = generator.integers(0, 2**64 - 1, word_count, dtype=np.uint64, endpoint=True)
+    return torch.from_numpy(words.view(np.int16))
 
 
 def build_network(
@@ -239,20 +288,21 @@ def build_network(
         classes: Names of the classes.
         size: Pixels per side of the images.
         name: "wideresnet", "torchvision:NAME" or "python:MODULE:FUNCTION". The
-            Python function returns a module, the size of its images and its
-            classes. This module normalizes images itself.
-        mean: Mean of the data, RGB.
-        std: Standard deviation of the data, RGB.
-        classifier: Whether `name` is a name for `augment.build_classifier`
-            instead. Such a network has pretrained weights.
+            Python function returns a network, the size of its images and its
+            classes. This network normalizes images itself.
+        mean: Mean of the pixels of the data, RGB. Images are normalized with it.
+        std: Standard deviation of the pixels of the data, RGB.
+        classifier: Whether `augment.build_classifier` builds the network, with
+            pretrained weights. It then takes `name`.
         **shape: `depth`, `width` and `dropout` of "wideresnet".
 
     Returns:
-        Network. All but Python functions and classifiers give random weights.
+        Network. A WideResNet and an architecture of torchvision have random
+        weights.
 
     Raises:
-        InputError: If the name is unknown, or if the network does not take the
-            images or has other classes.
+        InputError: If the name is unknown, or if the network does not accept
+            images of this size or has other classes.
     """
     if classifier:
         module = cast(nn.Module, build_classifier(name, size, classes).function)
@@ -269,7 +319,7 @@ def build_network(
             f"name={name}: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION",
             "name",
         )
-    # An architecture can refuse a size in many ways.
+    # Architectures raise errors of many types if images are too small for them.
     try:
         if network is None:
             architecture = _build_architecture(name.removeprefix(TORCHVISION), len(classes), size)
@@ -278,44 +328,60 @@ def build_network(
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         task = f"{len(classes)} logits for images of {size} pixels per side"
         raise InputError(
-            f"name={name} does not give {task} ({single_line(error)}): choose another",
+            f"name={name} does not give {task} ({single_line(error)}): "
+            "choose another network or another size",
             "name",
         ) from error
     return network
 
 
 def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
-    """Call the Python function that builds a network.
+    """Call a Python function of the user that builds a network.
 
     Args:
-        name: "python:MODULE:FUNCTION". The function returns a module, the size
+        name: "python:MODULE:FUNCTION". The function returns a network, the size
             of its images and its classes.
-        classes: Classes that the function must return.
-        size: Pixels per side that the function must return.
+        classes: Classes of the data. The function must return the same classes.
+        size: Pixels per side of the images of the data. The function must return
+            the same size.
+
+    Returns:
+        The network.
 
     Raises:
-        InputError: If the function returns no module, or another size or other
-            classes.
+        InputError: If the function returns no `nn.Module`, or another size or
+            other classes.
     """
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
-        raise InputError(f"name={name} returns no torch.nn.Module, which training needs", "name")
+        raise InputError(
+            f"name={name} returns an object of type {type(network).__name__} as its network: "
+            "return a torch.nn.Module, whose weights can be trained",
+            "name",
+        )
     if own_size != size:
         raise InputError(
-            f"name={name} is for images of {own_size} pixels per side, and the data has {size}",
+            f"name={name} is for images of {own_size} pixels per side, "
+            f"but the images of the data have {size}: use the same size",
             "name",
         )
     if list(own_classes) != list(classes):
         raise InputError(
             f"name={name} has other classes than the data, or in another order: "
-            f"{classes[0]!r} first",
+            f"return the {len(classes)} classes of the data, of which {classes[0]!r} is the first",
             "name",
         )
     return network
 
 
 def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Module:
-    """Build an architecture of torchvision with random weights."""
+    """Build an architecture of torchvision with random weights.
+
+    Args:
+        architecture: Name such as "resnet18".
+        class_count: Number of classes.
+        size: Pixels per side of the images. Vision transformers depend on it.
+    """
     from torchvision import models
 
     options: dict[str, Any] = dict(_OPTIONS.get(architecture, {}))
@@ -325,7 +391,13 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
 
 
 def _require_logits(network: nn.Module, class_count: int, size: int) -> None:
-    """Raise ValueError if a network does not return logits (2, class_count) for two images."""
+    """Raise ValueError if a network does not return logits, shape (2, classes), for two images.
+
+    Args:
+        network: Network, from images in [0, 1] to logits.
+        class_count: Number of classes.
+        size: Pixels per side of the images.
+    """
     with eval_mode(network), torch.no_grad():
         logits = network(torch.zeros(2, 3, size, size))
     if logits.shape != (2, class_count):
@@ -339,20 +411,22 @@ def describe(
     encoding: str,
     **shape: Any,
 ) -> dict[str, Any]:
-    """Describe a network, so that it can be used without the configuration of its run.
+    """Describe a network by the arguments with which `build_network` builds it again.
 
-    The description is stored with the weights.
+    The description is stored with the weights of the network.
 
     Args:
         network: The network.
         classes: Names of the classes.
         size: Pixels per side of the images.
-        encoding: Encoding of the renders that the network was trained with.
-        **shape: Settings of the network, such as its name and its depth.
+        encoding: Encoding of the renders that the network is trained with:
+            "srgb" or "linear".
+        **shape: Settings of the architecture, such as its name and its depth.
 
     Returns:
-        Values that JSON can hold, with the normalization of the network if its
-        attributes `mean` and `std` have it.
+        Description that can be written as JSON. If the network has the
+        attributes `mean` and `std`, with which it normalizes images, the
+        description has them, too.
     """
     description = {
         "version": VERSION,

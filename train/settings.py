@@ -27,18 +27,20 @@ from renderer.settings import (
     settings_from,
 )
 
-# Class of a hard negative for which the classifier has no class.
+# Label of a hard negative (an object of another class than the positive class) for
+# which the classifier has no class.
 OTHER = "other"
-# Sub-folder of a run with the scores on photographs, if evaluate.photos gives no names.
+# Sub-folder of a training run with the scores on photographs, if the setting
+# evaluate.photos gives the folder of photographs no name.
 PHOTOGRAPHS = "photographs"
-# Sub-folder of a run with renders that are kept aside from the training.
+# Sub-folder of a training run with test renders, which the training does not use.
 KEPT_ASIDE = "kept_aside"
-# Sub-folder of a run with the scores on the renders that are kept aside.
+# Sub-folder of a training run with the scores on its test renders.
 LABORATORY = "laboratory"
-# Number of projected patterns of the renders that are kept aside.
+# Number of different patterns that projectors throw in the test renders of a run.
 KEPT_ASIDE_PATTERNS = 5
-# Names that evaluate.photos must not give to folders, because other sub-folders and
-# scores of a run have these names.
+# Names that the setting evaluate.photos must not give to folders of photographs,
+# because a training run has other sub-folders or scores of these names.
 RESERVED = ("renders", "test", "before", KEPT_ASIDE)
 # Default of model.name.
 WIDERESNET = "wideresnet"
@@ -63,23 +65,26 @@ AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
 OPTIMIZERS = ("sgd", "adamw")
 # Choices of train.compile.
 COMPILE = ("auto", "always", "never")
-# Columns of photos.csv by which scores are grouped.
+# Properties of photographs. Those with the same value can be scored as one group.
 GROUPS = ("source", "mesh", "class")
-# Pixels per side of the smallest images that can be padded by reflection.
+# Smallest images in pixels per side. Random crops pad images by reflection, which
+# needs this size.
 MIN_SIZE = 5
 MAX_IMAGES = 10**6
 MAX_WORKERS = 1024
 MAX_SEED = 2**63 - 1
-# Folder that is named by the time at which a command starts.
+# Default name of an output folder: the time at which the command starts. Hydra
+# replaces "${now:...}".
 TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
 
-# Settings that say where and how a run is made. They do not decide its result,
-# and the names of the runs of a sweep leave them out.
+# Settings and recorded facts that do not change the result of a training run, such as
+# its folder and its device. Two runs that differ only in these settings are equal.
 CIRCUMSTANCES = (
     *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
     *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
+# Settings that can name input files. Their hashes are recorded with a run.
 INPUTS = (
     *(
         "data.path",
@@ -98,7 +103,7 @@ INPUTS = (
 
 @dataclass
 class DataSettings(Settings):
-    """The data set. Each choice of conf/data uses some of these settings."""
+    """Settings of the data set. Each kind of data set uses some of these settings."""
 
     name: str = setting("shapes", "The data set.", choices=DATA_SETS)
     validation: float | None = setting(
@@ -141,12 +146,17 @@ class DataSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.name in DATA_SETS_WITH_PATH and not self.path:
-            raise InputError(f"path is not set: give the path of the data={self.name}", "path")
+            raise InputError(
+                f"path is not set: give the file or folder of the data set {self.name!r}", "path"
+            )
 
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """The scene of the renders: by default, the paper's two meshes in front of five backgrounds."""
+    """Settings of the scene of training renders.
+
+    The defaults are those of the paper: two meshes in front of five backgrounds.
+    """
 
     meshes: list[Any] = setting_like(SceneSettings, "meshes", ["solid:orange:0", "solid:orange:1"])
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
@@ -164,13 +174,18 @@ class TrainingSceneSettings(SceneSettings):
 
     @property
     def objects(self) -> int:
-        """Count the meshes and the hard negatives. Return 0 without a mesh."""
-        return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
+        """Number of objects to render: meshes of positive classes, and hard negatives.
+
+        Hard negatives alone are not rendered: without a mesh, the number is 0.
+        """
+        if not self.meshes:
+            return 0
+        return len(self.meshes) + len(self.hard_negatives)
 
 
 @dataclass
 class ModelSettings(Settings):
-    """The network to train."""
+    """Settings of the architecture of the network to train."""
 
     name: str = setting(
         WIDERESNET,
@@ -182,7 +197,7 @@ class ModelSettings(Settings):
 
     @property
     def shape(self) -> dict[str, Any]:
-        """Return the arguments of the network's constructor. They are stored with its weights."""
+        """Arguments of `build_network` that build the network. They are stored with its weights."""
         if self.name == WIDERESNET:
             return {"depth": self.depth, "width": self.width, "dropout": self.dropout}
         return {"name": self.name}
@@ -190,7 +205,7 @@ class ModelSettings(Settings):
 
 @dataclass
 class TrainSettings(Settings):
-    """Training of the network. The defaults are the recipe of the paper."""
+    """Settings of the training of the network. The defaults are those of the paper."""
 
     init_from: str | None = setting(
         None,
@@ -351,31 +366,33 @@ class TrainSettings(Settings):
                 "init_from",
             )
         super().__post_init__()
-        if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
-            raise InputError(
-                "distillation_weight, soup and eval_mode need a network to begin with: "
-                "set init_from",
-            )
-        if (self.consistency_weight or self.interpolate) and not self.init_from:
-            raise InputError(
-                "consistency_weight and interpolate need a network to begin with: set init_from",
-            )
+        for name in (
+            *("distillation_weight", "soup", "eval_mode"),
+            *("consistency_weight", "interpolate"),
+        ):
+            value = getattr(self, name)
+            if value and not self.init_from:
+                raise InputError(
+                    f"{name}={value} needs a network to begin with: set init_from to it, "
+                    f"or leave {name} out",
+                    name,
+                )
         if self.relight_steps and not self.consistency_weight:
             raise InputError(
-                "relight_steps attacks the predictions of the network init_from: "
-                "set consistency_weight",
+                f"relight_steps={self.relight_steps} attacks the predictions of the network "
+                "init_from, which needs a consistency loss: set consistency_weight",
                 "relight_steps",
             )
 
 
 @dataclass
 class EvaluationSettings(Settings):
-    """Settings of the photographs on which the trained network is scored.
+    """Settings of the photographs and renders on which the trained network is scored.
 
-    Its scores on the test set are computed in any case.
+    The accuracy on the test set of the data is always computed.
     """
 
-    # OmegaConf has no type for str | dict[str, str] | None.
+    # The type is str | dict[str, str] | None, which OmegaConf does not support.
     photos: Any = setting(
         None,
         "Folder of photographs: a folder per class, or images of `label`. "
@@ -396,29 +413,31 @@ class EvaluationSettings(Settings):
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
             raise InputError(
-                f"laboratory_setups={self.laboratory_setups} "
-                f"must be a multiple of the {KEPT_ASIDE_PATTERNS} patterns",
+                f"laboratory_setups={self.laboratory_setups} must be a multiple of "
+                f"{KEPT_ASIDE_PATTERNS}, the number of projected patterns",
                 "laboratory_setups",
             )
         photos = self.photos
-        is_mapping = isinstance(photos, dict)
-        is_mapping = is_mapping and all(isinstance(folder, str) for folder in photos.values())
-        if not (photos is None or isinstance(photos, str) or is_mapping):
+        folders = photos.values() if isinstance(photos, dict) else [photos]
+        is_one_folder = photos is None or isinstance(photos, str)
+        is_mapping = isinstance(photos, dict) and all(isinstance(path, str) for path in folders)
+        if not (is_one_folder or is_mapping):
             raise InputError(
                 f"photos={photos} must be a folder, or a mapping of names to folders",
                 "photos",
             )
         for name in self.folders:
+            # Each name becomes the name of a sub-folder of the run.
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
                 raise InputError(
-                    f"photos: {name} must be "
-                    f"a name of letters, digits, _ and -, not one of {RESERVED}",
+                    f"photos has the name {name!r} for a folder: choose a name of letters, "
+                    f"digits, _ and - that is not one of {', '.join(RESERVED)}",
                     "photos",
                 )
 
     @property
     def folders(self) -> dict[str, Path]:
-        """Return the folders of photographs by the name of the sub-folder with their scores."""
+        """Folders of photographs, each with the name of the sub-folder of its scores as a key."""
         named = self.photos if isinstance(self.photos, dict) else {}
         if isinstance(self.photos, str):
             named = {PHOTOGRAPHS: self.photos}
@@ -461,24 +480,26 @@ class NetworkSettings(Settings):
 
 
 def normalized_light_values(value: Any) -> dict[str, float] | None:
-    """Read a value of the setting `normalize_light`.
+    """Convert a value of the setting `normalize_light` to a mapping, as files record it.
 
     Args:
-        value: True, a mapping of some fields of normalized light, or None.
+        value: True for the defaults, a mapping of some of the fields
+            white_balance, percentile, level and gamma, or None to leave the
+            light of images as it is.
 
     Returns:
-        All fields by name, as files record them. None without normalized light.
+        All fields by name. None if the light is not normalized.
     """
     light = read_normalized_light(value)
     return None if light is None else asdict(light)
 
 
 def class_texts(classes: Any) -> Any:
-    """Convert class names that YAML has read as numbers, such as 0, to texts.
+    """Convert class names such as 0, which YAML reads as numbers, to texts.
 
     Args:
-        classes: A list of names and whole numbers. Other values are returned
-            unchanged.
+        classes: Value of the setting `classes`. Only a list of names changes.
+            None and the name of a file stay the same.
     """
     if not isinstance(classes, list):
         return classes
@@ -487,7 +508,7 @@ def class_texts(classes: Any) -> Any:
 
 @dataclass
 class ExperimentSettings(NetworkSettings):
-    """Settings of one training run, which the command `pnb-train` reads from Hydra."""
+    """Settings of one training run: all settings of the command pnb-train."""
 
     run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
     sweep: str = setting(
@@ -532,37 +553,51 @@ class ExperimentSettings(NetworkSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.label is None:  # The objects are known when the meshes have named their classes.
+        if self.label is None:
+            # The label follows from the meshes and the classes of the network.
+            # `with_classes_of_meshes` then creates these settings again.
             return
         self._remove_generated_positives()
         if self.augment.renders and self.augment.mode != "folder":
-            if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
-                raise InputError(
-                    "renderer.silhouettes=false: "
-                    "an attack on the pose needs renderer.silhouettes=true",
-                    "renderer.silhouettes",
-                )
-            backgrounds = len(self.scene.backgrounds)
-            self.augment.examples = self.views * self.scene.objects * backgrounds
-            product = "meshes × views × backgrounds"
-            require_range(product, self.augment.examples, 1, MAX_EXAMPLES)
+            self._check_silhouettes()
+            self._count_examples()
+
+    def _check_silhouettes(self) -> None:
+        """Raise InputError if an attack on the pose lacks the gradient at silhouettes."""
+        if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
+            raise InputError(
+                "renderer.silhouettes=false: an attack on the pose needs renderer.silhouettes=true",
+                "renderer.silhouettes",
+            )
+
+    def _count_examples(self) -> None:
+        """Set the number of renders: one for each object, view and background."""
+        backgrounds = len(self.scene.backgrounds)
+        self.augment.examples = self.views * self.scene.objects * backgrounds
+        factors = "meshes × views × backgrounds"
+        require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
 
     def _remove_generated_positives(self) -> None:
-        """Remove hard negatives that show a positive class.
+        """Remove hard negatives whose name is a positive class.
 
-        For the label orange, "solid:orange" is removed. A hard negative in the
-        form of a mapping names its own class, and is kept.
+        For the label "orange", the hard negative "solid:orange" is removed. A
+        hard negative that is a mapping has a class of its own, and is kept.
         """
-        names = {simplified(name) for name in label_names(self.label)}
-        self.scene.hard_negatives = [
-            item
-            for item in self.scene.hard_negatives
-            if not (isinstance(item, str) and simplified(solid_name(item)) in names)
-        ]
+        positives = {simplified(name) for name in label_names(self.label)}
+        kept = []
+        for item in self.scene.hard_negatives:
+            is_positive = isinstance(item, str) and simplified(solid_name(item)) in positives
+            if not is_positive:
+                kept.append(item)
+        self.scene.hard_negatives = kept
 
     @property
     def views(self) -> int:
-        """Count the views of each mesh with `count_views`."""
+        """Number of views of each object.
+
+        It is the setting `scene.views`. If this is None, it is as many as the
+        number of renders needs.
+        """
         scene = self.scene
         backgrounds = len(scene.backgrounds)
         try:
@@ -573,96 +608,104 @@ class ExperimentSettings(NetworkSettings):
 
     @property
     def hard_negatives(self) -> dict[str, ObjectSettings]:
-        """Return the settings of each hard negative of the scene by its key.
+        """Settings of each hard negative by its key, such as "scene.hard_negatives[0]".
 
-        A hard negative that names no class gets the class OTHER.
+        A hard negative that names no class gets the class "other".
         """
         return read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """Return the settings of each mesh and each hard negative of the scene by its key.
+        """Settings of each mesh and each hard negative by its key, such as "scene.meshes[0]".
 
-        A mesh that names no class gets the label of the run if the run has one
-        label. Otherwise it gets the name of its solid.
+        A mesh that names no class is of the positive class if there is one.
+        With several positive classes, it is of the class that the name of its
+        solid tells: "solid:orange" is an orange.
         """
         labels = label_names(self.label)
-        label = labels[0] if len(labels) == 1 else ""
-        meshes = read_objects(self.scene.meshes, label, "scene.meshes")
-        negatives = self.hard_negatives
-        for key, item in (meshes | negatives).items():
+        default_label = labels[0] if len(labels) == 1 else ""
+        meshes = read_objects(self.scene.meshes, default_label, "scene.meshes")
+        objects = meshes | self.hard_negatives
+        for key, item in objects.items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
                 raise InputError(
                     f"{key} must name its class: give {{mesh: {item.mesh}, label: CLASS}}",
                     key,
                 )
-        named = {item.label for item in (*meshes.values(), *negatives.values())}
-        missing = set(labels) - named
+        missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:
             raise InputError(
                 f"label={self.label} has no mesh of {min(missing)}: name one in scene.meshes",
                 "label",
             )
-        return meshes | negatives
+        return objects
 
 
 def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:
     """Read a list of objects in the settings of a scene.
 
     Args:
-        items: Each is a file, a solid, or a mapping with fields of
-            `ObjectSettings`.
-        label: Default class, for the objects that name no class.
+        items: The objects. Each is a file, "solid:NAME", or a mapping with
+            fields of `ObjectSettings`.
+        label: Class of the objects that name no class.
         key: Key of the list in the settings, such as "scene.meshes".
 
     Returns:
-        The settings of each object. Its key is the key of the list with the
-        position of the object, such as "scene.meshes[0]".
+        Settings of each object. The key of the first object is the key of the
+        list followed by "[0]".
     """
     objects = {}
     for index, item in enumerate(items):
-        name = f"{key}[{index}]"
-        objects[name] = read_object(item, label, name)
+        item_key = f"{key}[{index}]"
+        objects[item_key] = read_object(item, label, item_key)
     return objects
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
-    """Read one object.
+    """Read one object in the settings of a scene.
 
     Args:
-        item: A file, a solid, or a mapping with fields of `ObjectSettings`.
-        label: Default class, which is used if the object names no class.
-        key: Key of the object, for errors.
+        item: File, "solid:NAME", or mapping with fields of `ObjectSettings`.
+        label: Class of the object if it names no class.
+        key: Key of the object in the settings, for error messages.
 
     Returns:
-        The object.
+        Settings of the object.
 
     Raises:
-        InputError: If the mapping is wrong.
+        InputError: If the mapping has an unknown field or a wrong value.
     """
     values = item if isinstance(item, dict) else {"mesh": item}
     values = {"label": label, **values}
-    if is_whole(values["label"]):  # YAML takes the name of a digit for a number
+    # The name of a class can be a number, which YAML reads as one.
+    if is_whole(values["label"]):
         values["label"] = str(values["label"])
     return settings_from(ObjectSettings, values, key)
 
 
 def solid_name(mesh: str) -> str:
-    """Return the NAME of solid:NAME or solid:NAME:SEED, and "" for a file."""
-    # The empty text is the name if `mesh` has no colon.
-    kind, name, *_ = [*mesh.split(":"), ""]
-    return name if kind == "solid" else ""
+    """Return the name of a generated mesh: NAME of "solid:NAME" or "solid:NAME:SEED".
+
+    Args:
+        mesh: Path of a file, or one of these texts.
+
+    Returns:
+        The name. Empty for a file.
+    """
+    words = mesh.split(":")
+    is_solid = words[0] == "solid" and len(words) > 1
+    return words[1] if is_solid else ""
 
 
 def simplified(name: str) -> str:
-    """Return a name in lower case, in which "_" and "-" are spaces.
+    """Simplify a name, so that names that differ only in spelling compare equal.
 
     Args:
-        name: Name of a class, a solid or a file.
+        name: Name of a class, of a solid or of a file.
 
     Returns:
-        Name for comparisons.
+        Name in lower case, in which "_" and "-" are replaced by spaces.
 
     >>> simplified("Sweet_pepper")
     'sweet pepper'
@@ -671,21 +714,24 @@ def simplified(name: str) -> str:
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:
-    """List the positive classes.
+    """List the names of the positive classes in the setting `label`.
 
     Args:
-        label: The name of a class, or several. A name may be given as a number.
+        label: Name of a class, or a list of several names. A whole number is the
+            name of a class, too.
 
     Returns:
-        The names.
+        The names as texts.
 
     Raises:
-        InputError: If there is none, or one is named twice.
+        InputError: If a name is neither a text nor a whole number, if there is
+            no name, or if a name occurs twice.
 
     >>> label_names("orange")
     ['orange']
     """
-    listed = [label] if isinstance(label, str) or is_whole(label) else label
+    is_one_name = isinstance(label, str) or is_whole(label)
+    listed = [label] if is_one_name else label
     expected = "the name of a class, or several"
     if not isinstance(listed, Sequence):
         raise InputError(f"label is {describe(label)}: give {expected}", "label")
@@ -702,24 +748,32 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
 
 
 def published(run: Path) -> Path:
-    """Find a network or a folder of the installation.
+    """Find a path below pretrained/, also if the current folder does not contain pretrained/.
+
+    The library is installed with the folder pretrained/, which has networks and
+    test images. A clone of the repository has this folder, too.
 
     Args:
-        run: A path. If it does not exist and begins with pretrained/, the file
-            or folder of this name in the installation, or in the clone of the
-            repository, is used.
+        run: Any path.
 
     Returns:
-        The path that exists. `run` itself if none exists.
+        `run` itself if it exists, or if it does not begin with pretrained/.
+        Otherwise the same path in the installation or in the clone, if it
+        exists there.
     """
     candidates = [run]
     if run.parts[:1] == ("pretrained",):
-        candidates += [home / run for home in Path(__file__).parents[:2]]
-    return next((path for path in candidates if path.exists()), run)
+        package = Path(__file__).parent
+        clone = package.parent
+        candidates += [package / run, clone / run]
+    for path in candidates:
+        if path.exists():
+            return path
+    return run
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested settings with their dotted keys.
+    """Yield each value in nested settings with its dotted key, such as "train.epochs".
 
     Args:
         node: Settings as nested dictionaries.
@@ -736,12 +790,12 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
-    """Return a copy of nested settings in which each text is changed.
+    """Return a copy of nested settings in which a function has replaced each text.
 
     Args:
-        value: A text, or nested mappings and lists of texts and other values.
-        change: Function that returns the new text for a text. Keys of mappings
-            and values that are no text stay the same.
+        value: Nested dictionaries and lists of texts and other values. Keys of
+            dictionaries, numbers and other values stay the same.
+        change: Function that returns the new text for a text.
     """
     if isinstance(value, dict):
         return {key: mapped(item, change) for key, item in value.items()}

@@ -291,7 +291,7 @@ def test_a_warning_of_a_library_is_one_line_of_a_command():
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), LIGHT.one_line():
+    with pytest.raises(ZeroDivisionError), LIGHT.handle_errors():
         raise ZeroDivisionError
 
 
@@ -309,7 +309,7 @@ def interrupt_and_fail() -> None:
 
 @pytest.mark.parametrize("act", [interrupt, interrupt_and_fail])
 def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys, act):
-    with pytest.raises(SystemExit) as stop, LIGHT.one_line():
+    with pytest.raises(SystemExit) as stop, LIGHT.handle_errors():
         act()
     assert stop.value.code == 128 + signal.SIGINT
     printed = capsys.readouterr()

@@ -120,7 +120,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["scene.projector={pixls: 8}"], "scene.projector.pixls is not a setting"),
-        (["evaluate.photos={renders: /x}"], "evaluate.photos: renders"),
+        (["evaluate.photos={renders: /x}"], "evaluate.photos has the name 'renders'"),
         (["augment=folder"], "augment.folder is None"),
         (["evaluate.photos=[/x]"], "evaluate.photos=['/x']"),
     ],

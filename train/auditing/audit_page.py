@@ -31,10 +31,10 @@ from train.report.first_screen import (
     NETWORKS,
     Compared,
     FirstScreen,
+    choose_disagreements,
     compare_networks,
-    contrasts,
+    describe_place,
     in_words,
-    place_of,
 )
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
@@ -278,9 +278,11 @@ def _compare(
         after=evaluations[hardened[0]],
         names=(f"before: {original[0]}", f"after: {hardened[0]}"),
         subjects=NETWORKS,
-        place=place_of(images, images.name),
+        place=describe_place(images, images.name),
     )
-    return compare_networks(compared, contrasts(original[1], hardened[1], images, [label]))
+    return compare_networks(
+        compared, choose_disagreements(original[1], hardened[1], images, [label])
+    )
 
 
 def _evaluations(paths: Mapping[str, Path]) -> compare.Evaluations:

@@ -9,7 +9,13 @@ from train.auditing.plain_light import PlainViews
 from train.evaluation.scores.metrics import read_metric
 from train.evaluation.tables import Estimate, fraction
 from train.report import plots
-from train.report.first_screen import Answer, Contrast, FirstScreen, Number, in_words
+from train.report.first_screen import (
+    ComparedImage,
+    FirstScreen,
+    ShownMetric,
+    ShownPrediction,
+    in_words,
+)
 
 # Width of a picture before and after an attack, in pixels.
 PAIR_WIDTH = 400
@@ -91,7 +97,7 @@ def screen_of_one(
         The first screen.
     """
     numbers = [
-        Number(
+        ShownMetric(
             "Views recognized in plain light",
             "higher is better",
             None,
@@ -104,7 +110,9 @@ def screen_of_one(
         part = counts[kind]
         left = part["correct"] - part["adversarial"][-1]
         title = f"Of these, under attack by {KINDS[kind].title}"
-        numbers.append(Number(title, "higher is better", None, fraction(left, part["correct"])))
+        numbers.append(
+            ShownMetric(title, "higher is better", None, fraction(left, part["correct"]))
+        )
         sentences.append(
             f"If an attacker controls {KINDS[kind].title}, it still recognizes {left} of the "
             f"{part['correct']} views that it recognizes before the attack."
@@ -112,7 +120,7 @@ def screen_of_one(
     mistaken = read_metric(scores, "false_positive_rate") if scores else None
     if mistaken is not None and mistaken.value is not None:
         called = f"Other objects called {in_words(label)}"
-        numbers.append(Number(called, "lower is better", None, mistaken))
+        numbers.append(ShownMetric(called, "lower is better", None, mistaken))
     if scores:
         sentences += _score_sentence(label, scores)
     return FirstScreen(answer, sentences, numbers, {}, [name], "")
@@ -139,7 +147,7 @@ def _score_sentence(label: str, scores: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def attack_pictures(folder: Path, counts: Counts) -> list[Contrast]:
+def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
     """Read the picture of one view before and after each kind of attack.
 
     Args:
@@ -158,11 +166,11 @@ def attack_pictures(folder: Path, counts: Counts) -> list[Contrast]:
         path = folder / f"{kind}.png"
         alt = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
         for picture in plots.from_file(path, alt, PAIR_WIDTH):
-            shown.append(Contrast(picture, light.title, *answers))
+            shown.append(ComparedImage(picture, light.title, *answers))
     return shown
 
 
-def _answers(part: Mapping[str, Any]) -> list[Answer]:
+def _answers(part: Mapping[str, Any]) -> list[ShownPrediction]:
     """Describe the predictions for one view before and after an attack.
 
     Args:
@@ -177,7 +185,10 @@ def _answers(part: Mapping[str, Any]) -> list[Answer]:
     # Earlier versions did not record the probabilities.
     for index, probability in enumerate(part.get("confidence", ())):
         texts[index] += f" {probability:.0%}"
-    return [Answer(text, verdict) for text, verdict in zip(texts, ("right", "wrong"), strict=False)]
+    return [
+        ShownPrediction(text, verdict)
+        for text, verdict in zip(texts, ("right", "wrong"), strict=False)
+    ]
 
 
 def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:

@@ -22,7 +22,7 @@ from train.evaluation.relit import (
 )
 from train.evaluation.tables import Table, join_words
 from train.report import plots
-from train.report.first_screen import FirstScreen, Number
+from train.report.first_screen import FirstScreen, ShownMetric
 from train.report.plots import Picture
 from train.report.report_page import write_page
 from train.runs.run_config import CONFIG, read_config
@@ -125,7 +125,9 @@ def photographs_screen(paths: Mapping[str, Path]) -> FirstScreen:
     for light in first.lights:
         if light in last.lights:
             before = first.kept(light) if len(scores) > 1 else None
-            numbers.append(Number(NUMBERS[light], "higher is better", before, last.kept(light)))
+            numbers.append(
+                ShownMetric(NUMBERS[light], "higher is better", before, last.kept(light))
+            )
     sentences = [_sentence(name, item) for name, item in zip(paths, scores, strict=True)]
     counted = f"{len(first.photographs)} photographs of {first.folder}"
     return FirstScreen(_answer(last), [*sentences, MODELED], numbers, {}, [*paths], counted)

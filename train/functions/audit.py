@@ -21,7 +21,7 @@ from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
 from train.report.results import require_replaceable
 from train.system.folders import folder_or_temporary
 
@@ -60,7 +60,8 @@ def audit(
             pair with its class, or is named by it.
         hard_negatives: Meshes of other classes, rendered in the same lighting,
             with or without a class. None for generated fruit and balls.
-        hardened: Another network of the same arguments to show beside it.
+        hardened: Hardened network, which is audited in the same way and shown
+            beside `network`. None to audit one network.
         classes: Names of the classes of plain networks, in the order of their
             outputs. None for "0", "1" and so on.
         size: Pixels per side of the images of plain networks. None for 224.
@@ -68,18 +69,20 @@ def audit(
             takes it.
         value_range: Values of black and white that plain networks take before
             normalization.
-        normalize_light: Whether the light of each image is normalized before
-            `network`, and before `hardened` if it is a plain network, as
-            `load_classifier` takes it. The attacks know it.
-        photographs: Folder of photographs, as `evaluate` takes it.
-        laboratory: Such a folder of renders, as "pretrained/laboratory". None
-            if it is made of the meshes, for which Mitsuba is needed.
+        normalize_light: Normalization of the light of each image before it
+            enters `network`, and `hardened` if that is a plain network. Values
+            are as for `load_classifier`. Attacks take it into account.
+        photographs: Folder of photographs with a sub-folder for each class, as
+            for `evaluate`. None to use no photographs.
+        laboratory: Folder of renders with a sub-folder for each class, such as
+            "pretrained/laboratory". None to render them from the meshes, for
+            which Mitsuba is needed.
         environments: Names of environment lightings, or files of maps.
         budget: Factor of the number of views, lightings and renders. With 1, a
             network of 224 pixels takes about 20 minutes on one core.
         seed: Seed of all random draws.
-        device: Device that computes. None for that of the network.
-        out: Folder for the files of the audit.
+        device: Device that computes. None for the device of the network.
+        out: Folder for the files of the audit. None to write no files.
         overwrite: Whether to replace results in `out`.
 
     Returns:
@@ -116,7 +119,7 @@ def audit(
         with folder_or_temporary(out) as folder:
             require_replaceable(folder, "out", overwrite)
             items = as_mappings("meshes", meshes, classifier, folder)
-            positive_classes = studied_classes(label, meshes, items, classifier)
+            positive_classes = find_positive_classes(label, meshes, items, classifier)
             if len(positive_classes) > 1:
                 raise InputError(
                     f"meshes are of several classes ({', '.join(positive_classes)}): give one"

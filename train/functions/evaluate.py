@@ -57,11 +57,12 @@ def evaluate(
     Args:
         network: A classifier, or a plain network from images to logits, such as
             a `torch.nn.Module`.
-        folder: Folder with a sub-folder of photographs for each class. Other
-            sub-folders show negatives. "pretrained/laboratory" is installed.
-        label: Positive class, or several: names or indices. Recall counts
-            the photographs of a class that the network finds. None for all
-            classes that have a sub-folder.
+        folder: Folder with a sub-folder of photographs for each class. A
+            sub-folder of any other name holds negatives: photographs of other
+            objects. "pretrained/laboratory" is installed with the library.
+        label: Positive class, or several, by name or index. Recall is the
+            fraction of the photographs of a positive class that the network
+            finds. None for all classes that have a sub-folder.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
         size: Pixels per side of the images of a plain network. None for 224.
@@ -69,24 +70,28 @@ def evaluate(
             takes it.
         value_range: Values of black and white that a plain network takes before
             normalization.
-        normalize_light: Whether the light of each photograph is normalized
-            first, as `load_classifier` takes it.
-        by: "mesh" to score each object of photos.csv, too, "class" to score
-            each class. Otherwise "source".
-        calibrate: Folder like `folder`, on which a threshold on the log-odds of
-            each label is chosen for `false_positive_rate`. None for the
-            thresholds that the network carries, if any.
+        normalize_light: Normalization of the light of each photograph before it
+            enters the network. Values are as for `load_classifier`.
+        by: Groups of photographs that are scored one by one, in addition to all
+            photographs: "class", or a column of the file photos.csv in `folder`,
+            "source" or "mesh".
+        calibrate: Folder like `folder`. The threshold on the log-odds of each
+            positive class is chosen on its photographs, so that their
+            false-positive rate is `false_positive_rate`. None for the thresholds
+            that are stored with the network, if any.
         false_positive_rate: False-positive rate of these thresholds, in (0, 1).
         skip_unreadable: Whether to leave out photographs that cannot be read.
         precision: "auto" (bfloat16 if the hardware computes in it), "bfloat16"
             or "float32".
-        device: Device that computes. None for that of the network.
-        out: Folder to which tables and images of the scores are written.
+        device: Device that computes. None for the device of the network.
+        out: Folder to which tables and images of the scores are written. None to
+            write no files.
         overwrite: Whether to replace results in `out`.
 
     Returns:
-        Scores. `overall` has the metrics of all photographs, `by_label` those
-        of each label, and `by_class` the recall of each class of the folder.
+        Scores. `overall` has the metrics of all photographs, `by_label` the
+        metrics of each positive class, and `by_class` the recall of each class
+        of the folder.
 
     Raises:
         InputError: If the network does not fit its arguments, if it lacks a
@@ -124,9 +129,9 @@ def evaluate(
             require_replaceable(target, "out", overwrite)
             require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():
-            points = _points_of(classifier, labels)
+            points = _stored_operating_points(classifier, labels)
             if calibrate is not None and false_positive_rate is not None:
-                points = _choose_points(
+                points = _choose_operating_points(
                     predictor, calibrate, labels, false_positive_rate, skip_unreadable
                 )
             predictions = predictor.predict(folder, labels, skip_unreadable)
@@ -163,29 +168,42 @@ def _choose_labels(
     return labels
 
 
-def _points_of(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
-    """Return the operating points that are stored with a network.
+def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
+    """Return the operating points (thresholds on the log-odds) that are stored with a network.
 
     Args:
         classifier: The network.
         labels: Positive classes.
 
     Returns:
-        Operating point of each label. Empty if a label has none.
+        Operating point of each positive class. Empty if one of these classes has
+        no operating point.
     """
     by_label = {point.label: point for point in classifier.operating_points}
     has_all = by_label.keys() >= set(labels)
     return [by_label[name] for name in labels] if has_all else []
 
 
-def _choose_points(
+def _choose_operating_points(
     predictor: Predictor,
     folder: str | Path,
     labels: Label,
     rate: float,
     skip_unreadable: bool,
 ) -> list[OperatingPoint]:
-    """Choose an operating point of each label on a folder of photographs."""
+    """Choose a threshold on the log-odds of each positive class, on a folder of photographs.
+
+    Args:
+        predictor: Network with its classes and the size of its images.
+        folder: Folder of photographs.
+        labels: Positive classes.
+        rate: False-positive rate that the thresholds should have, in (0, 1).
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+
+    Returns:
+        Operating point of each positive class.
+    """
     path = published(Path(folder))
+    # The caller of `evaluate` knows this folder as the argument `calibrate`.
     with keyed(folder="calibrate"):
         return scoring.choose_operating_points(predictor, path, labels, rate, skip_unreadable)

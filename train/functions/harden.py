@@ -28,7 +28,7 @@ from train import console
 from train.__main__ import main
 from train.class_names import require_others, with_classes_of_meshes
 from train.command import read_settings
-from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.runs.run_lock import sole_writer
@@ -95,29 +95,30 @@ def harden(
             takes it.
         value_range: Values of black and white that a plain network takes before
             normalization.
-        normalize_light: Whether the light of each image is normalized first, as
-            `load_classifier` takes it, in training and afterwards. A copy of a
-            plain network does not do this itself: give it to the other
-            functions, too.
-        train: Fields of `TrainSettings` that differ from the experiment, such
-            as {"epochs": 5, "learning_rate": 0.01}, or all of them.
-        augment: The same of `AugmentationSettings`.
-        scene: The same of `TrainingSceneSettings`, such as {"views": 4}.
-        renderer: The same of `RendererSettings`.
-        data: The same of `DataSettings`.
+        normalize_light: Normalization of the light of each image before it
+            enters the network, with values as for `load_classifier`. The
+            returned copy of a plain network does not normalize the light
+            itself, so give this argument to the other functions, too.
+        train: Training settings that replace those of the experiment: a mapping
+            of some fields of `TrainSettings`, such as {"epochs": 5}, or
+            `TrainSettings` for all fields.
+        augment: Fields of `AugmentationSettings`, given in the same way.
+        scene: Fields of `TrainingSceneSettings`, such as {"views": 4}.
+        renderer: Fields of `RendererSettings`.
+        data: Fields of `DataSettings`.
         seed: Seed of all random draws.
-        device: Device that computes. None for that of the network.
-        out: Folder for the files of the run. None for a temporary one.
+        device: Device that computes. None for the device of the network.
+        out: Folder for the files of the training. None for a temporary folder.
         overwrite: Whether to replace results in `out`.
 
     Returns:
         The hardened copy, of the same class and in evaluation mode. Its state
-        dict loads where that of `network` was loaded.
+        dict has the names and shapes of the state dict of `network`.
 
     Raises:
         InputError: If an input cannot be read, if the network lacks a class, or
-            if a setting is wrong. The sentence then begins with its key, such
-            as "train.epochs".
+            if a setting is wrong. The message about a setting begins with its
+            key, such as "train.epochs".
 
     Example:
         >>> import torch
@@ -142,7 +143,7 @@ def harden(
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give one whose weights can be trained")
         items = as_mappings("meshes", meshes, classifier, folder)
-        labels = studied_classes(label, meshes, items, classifier)
+        labels = find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
             "run": str(folder.absolute()),
             "seed": seed,
@@ -171,11 +172,14 @@ def harden(
             settings = with_classes_of_meshes(settings, classifier.classes)
         with sole_writer("out", folder), _state_of_torch_kept():
             trained = _train(settings, classifier, has_report=out is not None)
-    return _copy_with(network, classifier, trained)
+    return _copy_with_weights(network, classifier, trained)
 
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
-    """Return a copy of a network whose weights can be trained.
+    """Copy a network, and check that the weights of the copy can be trained.
+
+    Args:
+        network: Classifier, or plain network in evaluation mode.
 
     Raises:
         InputError: If a plain network is in training mode, or if the copy cannot
@@ -184,6 +188,7 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
     if not isinstance(network, Classifier):
         require_evaluation_mode(network, "network")
     copy = deepcopy(network)
+    # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):
         raise InputError(
             "network contains a module of torch.jit, whose copy cannot be trained: "
@@ -195,18 +200,19 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
 def _read_settings(
     changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
 ) -> ExperimentSettings:
-    """Combine the settings of conf/experiment/classifier.yaml with those of the caller.
+    """Combine the settings of the experiment "classifier" with the arguments of `harden`.
 
     Args:
-        changes: Nested settings that the arguments of `harden` decide. They
-            replace those of the file.
-        sections: Settings of the caller by the name of the section, such as
-            "train". They replace both.
+        changes: Nested settings that follow from arguments such as `meshes` and
+            `seed`. They replace settings of the experiment.
+        sections: Groups of settings that the caller gave, by the name of the
+            group, such as "train". They replace settings of the experiment and
+            of `changes`.
     """
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
-    # The function returns a network, and nobody would see the scores.
+    # `harden` returns only the network, so scores on test renders are not needed.
     settings.evaluate.laboratory_setups = 0
     given = {name: _as_mapping(name, section) for name, section in sections.items()}
     merged = OmegaConf.merge(settings, changes, given)
@@ -214,11 +220,12 @@ def _read_settings(
 
 
 def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
-    """Return the fields of a section of the settings by name.
+    """Return the fields that a caller gave for a group of settings, by the name of the field.
 
     Args:
-        name: Name of the section, for the error.
-        section: Settings, a mapping of some fields, or None for no fields.
+        name: Name of the group, such as "train", for the error message.
+        section: Settings with all fields, a mapping of some fields, or None for
+            no fields.
     """
     if isinstance(section, Settings):
         return asdict(cast(Any, section))
@@ -241,15 +248,15 @@ def _state_of_torch_kept() -> Iterator[None]:
 
 
 def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier in the folder of the run.
+    """Train a copy of a classifier, and write the files of the training to its folder.
 
     Args:
-        settings: Settings of the run.
+        settings: Settings of the training. `settings.run` is the folder.
         classifier: Classifier to train.
         has_report: Whether to write a report and to print its path.
 
     Returns:
-        The selected network of the run.
+        The network with the weights that the training selected.
     """
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
@@ -265,13 +272,13 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
     return run.trainer.selected.network
 
 
-def _copy_with(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
-    """Return a copy of the network of the caller with the trained weights.
+def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
+    """Return a copy of the network of the caller with the weights after the training.
 
     Args:
         network: Classifier or plain network that the caller gave.
-        classifier: The same network as a classifier.
-        trained: Network with the trained weights.
+        classifier: Classifier that contains a copy of this network.
+        trained: Network after the training, of the same architecture.
 
     Returns:
         Copy of `classifier` if the caller gave a classifier. Otherwise a copy of

@@ -1,4 +1,4 @@
-"""The published networks of the installation, each with its row of results."""
+"""Load a network that is published with the library, with its results."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,31 +14,33 @@ from train.settings import published
 
 # Folder of the published networks, in the installation or in a clone.
 PRETRAINED = Path("pretrained")
-# Name of the accuracy on the test images of CIFAR-100, among the scores.
+# Name of the score "accuracy on the test images of CIFAR-100".
 ACCURACY = "test/accuracy"
 
 
 class PublishedNetwork(Classifier):
-    """A published network with its row of results.
+    """A network that is published with the library, with its results.
 
     Attributes:
-        results: Metrics with their intervals by name: "test/accuracy" on the
-            test images of CIFAR-100, and on photographs "photographs/recall",
-            "photographs/false_positive_rate", "photographs/auc" and others.
+        results: Metrics with 95% intervals by name. "test/accuracy" is the
+            accuracy on the test images of CIFAR-100. Metrics on photographs are
+            "photographs/recall", "photographs/false_positive_rate",
+            "photographs/auc" and others.
     """
 
     results: Mapping[str, Estimate]
 
 
 def load(name: str) -> PublishedNetwork:
-    """Load a published network with its row of results.
+    """Load a network that is published with the library, with its results.
 
     Args:
-        name: "best", "adversarial", "random" or "none", as pretrained/README.md
-            describes them.
+        name: "best", "adversarial", "random" or "none". The file
+            pretrained/README.md describes these networks.
 
     Returns:
-        The network, a classifier of images of 32 pixels per side.
+        Classifier of images of 32 pixels per side. Its attribute `results` has
+        its metrics.
 
     Raises:
         InputError: If there is no published network of this name.
@@ -66,26 +68,28 @@ def load(name: str) -> PublishedNetwork:
 
 
 def published_names() -> list[str]:
-    """Return the names of the published networks, sorted."""
+    """Return the names of the networks that are published with the library, sorted."""
     files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
     return sorted(path.parent.name for path in files)
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the results of a published network.
+    """Read the results of a published network from the scores in its file.
 
     Args:
-        scores: Accuracy under "test/accuracy", and metrics by the name of each
-            folder of photographs.
+        scores: Scores by name. "test/accuracy" has a number. The name of a
+            folder of photographs, such as "photographs", has a mapping of the
+            metrics on these photographs.
 
     Returns:
         Results by name, such as "test/accuracy" and "photographs/auc".
     """
     results = {ACCURACY: Estimate(scores[ACCURACY])}
-    folders = {name: entry for name, entry in scores.items() if isinstance(entry, Mapping)}
-    for folder, entry in folders.items():
+    for folder, metrics in scores.items():
+        if not isinstance(metrics, Mapping):
+            continue
         for metric in METRICS:
-            estimate = read_metric(entry, metric)
+            estimate = read_metric(metrics, metric)
             if estimate is not None:
                 results[f"{folder}/{metric}"] = estimate
     return results

@@ -1,4 +1,4 @@
-"""The meshes that callers name, as the settings take them."""
+"""Convert the meshes that a caller gives to a function into settings."""
 
 import hashlib
 from collections.abc import Sequence
@@ -29,21 +29,20 @@ EXPECTED = (
 def as_mappings(
     name: str, meshes: Sequence[MeshItem], classifier: Classifier, folder: Path
 ) -> list[dict[str, Any]]:
-    """Convert meshes to mappings with the fields of `ObjectSettings`.
+    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
 
     Args:
-        name: Name of the argument, for errors.
+        name: Name of the argument that has the meshes, for error messages.
         meshes: Meshes, with or without their classes.
-        classifier: Classifier whose classes the labels name or count.
-        folder: Folder to which meshes in memory are written, since settings
-            name files.
+        classifier: Classifier whose classes are given, by name or by index.
+        folder: Folder to which meshes in memory are written, because settings
+            can only name files.
 
     Returns:
-        The mappings. Without a class, a mapping has no key "label".
+        A mapping for each mesh. It has the key "label" if the class is given.
 
     Raises:
-        InputError: If an item is something else, or if the classifier lacks a
-            class.
+        InputError: If an item is not a mesh, or if the classifier lacks a class.
     """
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
@@ -51,10 +50,10 @@ def as_mappings(
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
         elif isinstance(item, MeshSource):
-            mapping = _of_source(item, folder)
+            mapping = _mesh_fields(item, folder)
         elif len(item) == 2 and isinstance(item[0], MeshSource):
             source, label = item
-            mapping = _of_source(source, folder) | {"label": label}
+            mapping = _mesh_fields(source, folder) | {"label": label}
         else:
             raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
         if mapping.get("label", "") != "":
@@ -63,15 +62,16 @@ def as_mappings(
     return mappings
 
 
-def _of_source(source: MeshSource, folder: Path) -> dict[str, Any]:
-    """Describe a mesh by fields of `ObjectSettings`.
+def _mesh_fields(source: MeshSource, folder: Path) -> dict[str, Any]:
+    """Return the fields of `ObjectSettings` that describe a mesh.
 
     Args:
-        source: File, solid or mesh in memory.
+        source: File, "solid:NAME", or mesh in memory.
         folder: Folder to which a mesh in memory is written.
 
     Returns:
-        Mapping with the key "mesh". A mesh in memory has "gloss" in addition.
+        Mapping with the key "mesh". For a mesh in memory, it also has the key
+        "gloss", which says whether the written file has a glossy material.
     """
     if not isinstance(source, Mesh):
         return {"mesh": str(source)}
@@ -79,41 +79,46 @@ def _of_source(source: MeshSource, folder: Path) -> dict[str, Any]:
         written = Path(temporary) / "mesh.glb"
         export_mesh(source, written)
         content = written.read_bytes()
-    # The hash in the name keeps the meshes of an earlier call in the folder.
+    # With a hash of the mesh in its name, the file does not replace another mesh
+    # that an earlier call wrote to the folder.
     path = folder / f"mesh_{hashlib.sha256(content).hexdigest()[:8]}.glb"
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(path, content)
     return {"mesh": str(path), "gloss": None if source.gloss is None else "file"}
 
 
-def studied_classes(
+def find_positive_classes(
     label: str | int | None,
-    given: Sequence[MeshItem],
-    meshes: Sequence[dict[str, Any]],
+    meshes: Sequence[MeshItem],
+    mappings: Sequence[dict[str, Any]],
     classifier: Classifier,
 ) -> list[str]:
-    """Return the positive classes.
+    """Return the names of the classes that the meshes of a caller show.
 
     Args:
-        label: A class, or None for those of the meshes.
-        given: Meshes as the caller gave them.
-        meshes: The same meshes as `as_mappings` returns them.
+        label: Class of all meshes, by name or index. None if each mesh is given
+            with its class, or is named by it, as "orange.glb".
+        meshes: Meshes as the caller gave them.
+        mappings: Settings of the same meshes, as `as_mappings` returns them.
         classifier: Classifier that has the classes.
 
     Returns:
-        Names of the classes, each once, in the order of the meshes.
+        Name of `label`. Without a label, the classes of the meshes, each class
+        once, in the order of the meshes.
 
     Raises:
-        InputError: If the classifier lacks the class, or if neither `label` nor
-            a mesh tells a class.
+        InputError: If the classifier lacks a class, or if the class of a mesh is
+            unknown.
     """
     if label is not None:
         return [classifier.classes[classifier.label(label)]]
-    for index, item in enumerate(given):
+    for index, item in enumerate(meshes):
         if isinstance(item, Mesh):
             name = classifier.classes[0]
             raise InputError(
                 f"meshes[{index}] is an nb.Mesh without a class: give it in a pair, such as "
                 f"(mesh, {name!r}), or give label={name!r}"
             )
-    return list(dict.fromkeys(classes_of_meshes(meshes, classifier.classes, "meshes")))
+    names = classes_of_meshes(mappings, classifier.classes, "meshes")
+    # A dictionary has each name once, in the order of the meshes.
+    return list(dict.fromkeys(names))

@@ -15,24 +15,28 @@ from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
 from renderer.io.files import atomic_write
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
-from train.report.plots import COLORS, LINES, MARKERS
+from train.report.plots import COLORS
 
 TRANSFERS = "transfer.jsonl"
 TABLE = "sweep.csv"
 FIGURE = "sweep.png"
-# Origin of the images of each version of an adversary, in words.
+# How the images of an adversary were made, in words. attack.jsonl has results for each
+# of these versions of the images.
 VERSIONS = {
     "float": "computed",
     "reload": "rendered again from the saved files",
     "mitsuba": "rendered by Mitsuba",
 }
-# Titles of the methods that are compared at each radius.
+# Titles of the two methods whose success is compared at each radius.
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
-# End of the names of results that are measured in images without a sensor's noise.
+# Color, line style and marker of these methods in the figure.
+STYLES = {"adversarial": (COLORS[0], "-", "o"), "random": (COLORS[1], "--", "s")}
+# Suffix of the names of results on images without the simulated noise of a sensor.
 WITHOUT_NOISE = "_without_noise"
 
-# Result of `nb.success_by_radius`: at each radius, whether each method
-# succeeds on each example.
+# Result of `nb.success_by_radius`, with a mapping for each radius. It has the radii
+# under "radii", and under the name of each method whether it succeeds on each example,
+# bool, shape (examples,).
 Sweep = Sequence[Mapping[str, Any]]
 
 
@@ -42,7 +46,7 @@ def format_attack(
     checks: Mapping[str, Any] | None,
     lines: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
-    """Write the success, the checks and the adversaries of the attack on one mesh.
+    """Describe the attack on one mesh in lines of text for the console.
 
     Args:
         name: Name of the mesh.
@@ -51,7 +55,9 @@ def format_attack(
         lines: Lines of attack.jsonl, as `nb.save` returns them.
 
     Returns:
-        Lines. The first one says how often the attack succeeds.
+        Lines of text. The first line says how often the attack succeeds. Lines
+        about the checks, and about the images of the adversaries (the successful
+        examples) when they are computed in other ways, follow.
     """
     has_noise = bool(result.settings.sensor_noise)
     text = [_heading(name, result)]
@@ -65,15 +71,16 @@ def format_attack(
 
 
 def _heading(name: str, result: AttackResult) -> str:
-    """Write the first line about an attack.
+    """Write the line that sums up an attack.
 
     Args:
         name: Name of the mesh.
         result: Result of the attack.
 
     Returns:
-        The attacked parameters, the classifier, the rate of success, the median
-        number of steps of the successes, the passes and the seconds.
+        Line with the attacked parameters, the classifier, the success rate, the
+        median number of steps of the successes, the number of passes through the
+        classifier, and the seconds.
     """
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
     heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
@@ -84,24 +91,28 @@ def _heading(name: str, result: AttackResult) -> str:
 
 
 def _passes(result: AttackResult) -> str:
-    """Count the forward passes of an attack and, if there are any, its backward passes."""
+    """Write the numbers of queries (forward passes) and of backward passes of an attack.
+
+    Backward passes are left out if there are none.
+    """
     text = f"{int(result.queries.sum())} queries"
     backward_count = int(result.backward_passes.sum())
     return f"{text}, {backward_count} backward passes" if backward_count else text
 
 
 def _success(result: AttackResult) -> str:
-    """Count the successes of an attack.
+    """Write on how many examples an attack succeeds.
 
-    Only examples count that are classified correctly before the attack.
+    Only examples that are classified correctly before the attack count.
 
     Args:
-        result: Result of the attack on E examples of V views.
+        result: Result of the attack.
 
     Returns:
-        Text with the number of examples with a success. If noise, a margin or
-        several views were asked for, the numbers without noise, with the margin
-        and for single views follow.
+        Text with the number of successes. It also has the number of successes
+        without noise if the settings ask for noise of a sensor, the number of
+        successes with a margin of the logits if they ask for a margin, and the
+        number of views that are misclassified if examples have several views.
     """
     clean = result.clean_correct
     rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
@@ -124,26 +135,30 @@ def _success(result: AttackResult) -> str:
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
-    """Write the results of the checks of an attack.
+    """Describe the results of the checks of an attack in lines of text.
 
     Args:
         checks: Result of `nb.check`.
-        has_noise: Whether a success must remain with a sensor's noise.
+        has_noise: Whether only an attack that succeeds in spite of the simulated
+            noise of a sensor counts as a success.
         uses_gradients: Whether the attack takes steps along a gradient.
-            Otherwise its budget counts queries.
+            Otherwise its budget is a number of queries.
 
     Returns:
-        Lines about the log-probability before and after the attack, about
-        random changes and longer attacks, and about doubts.
+        A line about the log-probability before and after the attack, a line that
+        compares the attack with random changes and with longer attacks, and
+        warnings if a check casts doubt on the attack.
     """
     unit = "step" if uses_gradients else "query"
     units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
-    rates = []
+    longer_attacks = []
     for steps, rate in checks["success_by_steps"].items():
-        rates.append(f"{_both_rates(rate, rates_without_noise[steps], has_noise)} in {steps}")
-    search_without_noise = checks[f"random_search{WITHOUT_NOISE}"]
-    search = _both_rates(checks["random_search"], search_without_noise, has_noise)
+        rates = _format_rates(rate, rates_without_noise[steps], has_noise)
+        longer_attacks.append(f"{rates} in {steps}")
+    random_search = _format_rates(
+        checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise
+    )
     zero_gradient = ""
     if uses_gradients:
         zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
@@ -151,19 +166,23 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
         f"lower in {checks['cost_fell']:.0%}{zero_gradient}",
-        f"random changes of the same size, one for each {unit}, succeed on {search}; "
-        f"attacks of more {units}: {', '.join(rates)}",
+        f"random changes of the same size, one for each {unit}, succeed on {random_search}; "
+        f"attacks of more {units}: {', '.join(longer_attacks)}",
         *(f"warning: {warning}" for warning in warnings(checks)),
     ]
 
 
-def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a rate of success and, if noise counts, the rate without noise.
+def _format_rates(rate: float, without_noise: float, has_noise: bool) -> str:
+    """Write a success rate and, if success is measured with noise, the rate without noise.
 
     Args:
-        rate: Rate of success, in [0, 1].
-        without_noise: Rate of success in images without noise.
-        has_noise: Whether a success must remain with a sensor's noise.
+        rate: Success rate, in [0, 1].
+        without_noise: Success rate in images without noise, in [0, 1].
+        has_noise: Whether `rate` is measured in images with the simulated noise
+            of a sensor.
+
+    Returns:
+        Text such as "62%" or "62% (70% without noise)".
     """
     if not has_noise:
         return f"{rate:.0%}"
@@ -171,13 +190,15 @@ def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
 
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
-    """Write how often adversaries still succeed in another version of their images.
+    """Write how often adversaries still succeed if their images are made in another way.
 
     Args:
-        version: Key of VERSIONS.
-        adversaries: Lines of attack.jsonl of the successful examples. "versions"
-            has the results of each version.
-        has_noise: Whether a success must remain with a sensor's noise.
+        version: Key of VERSIONS that says how the images are made, such as
+            "mitsuba".
+        adversaries: Lines of attack.jsonl of the successful examples. Their
+            entry "versions" has the results for each version of the images.
+        has_noise: Whether success is measured in images with the simulated noise
+            of a sensor.
     """
     results = [line["versions"][version] for line in adversaries]
     success = sum(result["success"] for result in results)
@@ -185,7 +206,7 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
     if has_noise:
         count = sum(result[f"success{WITHOUT_NOISE}"] for result in results)
         without_noise = f" ({count} without noise)"
-    # Adversaries that deceived the classifier with the margin that was asked for.
+    # Adversaries that fooled the classifier by the margin that the settings ask for.
     with_margin = [line for line in adversaries if line["success_with_margin"]]
     success_with_margin = sum(line["versions"][version]["success"] for line in with_margin)
     largest = 255 * max(result["largest_difference"] for result in results)
@@ -199,57 +220,70 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
 
 
 def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
-    """Write how often adversaries succeed elsewhere.
+    """Write the success of transferred adversaries to a file, and return it as a table.
 
     Args:
-        transfers: Results of `nb.transfer`.
-        path: File, which gets a line of JSON for each result.
+        transfers: Results of `nb.transfer`. Each is for one other classifier,
+            view or mesh. The first key, such as "classifier", says what kind of
+            thing that is, and its value is the name.
+        path: File that gets a line of JSON for each result.
 
     Returns:
-        Table of the rates of success.
+        Table with a row for each result. It has the success rate on the images
+        that are classified correctly before the attack.
     """
     lines = []
     rows = []
-    for found in transfers:
-        clean = found["clean_correct"]
-        rate = fraction(_count_correct(found["success"], clean), sum(clean))
-        # The key of the first entry is what the adversaries are transferred to,
-        # such as a classifier. Its value is the name.
-        kind = next(iter(found))
-        entry = {kind: found[kind], **asdict(rate), **found}
+    for result in transfers:
+        is_correct = result["clean_correct"]
+        success_count = _count_both(result["success"], is_correct)
+        count_without_noise = _count_both(result[f"success{WITHOUT_NOISE}"], is_correct)
+        rate = fraction(success_count, sum(is_correct))
+        kind = next(iter(result))
+        name = result[kind]
+        entry = {kind: name, **asdict(rate), **result}
         lines.append(json.dumps(entry) + "\n")
-        without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
-        correct = f"{rate.n} of {len(clean)}"
-        rows.append([f"{kind} {found[kind]}", correct, format_fraction(rate), str(without_noise)])
+        rows.append(
+            [
+                f"{kind} {name}",
+                f"{rate.n} of {len(is_correct)}",
+                format_fraction(rate),
+                str(count_without_noise),
+            ]
+        )
     atomic_write(path, "".join(lines))
     header = ["adversaries shown to", "correct before", "success", "without noise"]
     return str(Table("", header, rows))
 
 
-def _count_correct(success: Sequence[bool], clean: Sequence[bool]) -> int:
-    """Count the successes on examples that were correct before the attack.
+def _count_both(is_success: Sequence[bool], is_correct: Sequence[bool]) -> int:
+    """Count the examples that are correct before an attack and on which the attack succeeds.
 
     Args:
-        success: Whether the attack succeeds on each example.
-        clean: Whether each example was classified correctly before.
+        is_success: Whether the attack succeeds, for each example.
+        is_correct: Whether the example is classified correctly before the
+            attack, for each example.
     """
-    return sum(hit for hit, correct in zip(success, clean, strict=True) if correct)
+    pairs = zip(is_success, is_correct, strict=True)
+    return sum(success and correct for success, correct in pairs)
 
 
 def format_sweep(sweep: Sweep) -> str:
-    """Write the success at each radius as a table.
+    """Write the success of an attack and of a random search at each radius as a table.
 
     Args:
         sweep: Result of `nb.success_by_radius`.
 
     Returns:
-        Table with a row for each radius.
+        Table with a row for each radius. For each of the two methods, it has the
+        success rate, and the number of successes in images without noise.
     """
     rows = []
     for row in sweep:
-        cells = [" + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())]
+        radii = [f"{name} {radius:g}" for name, radius in row["radii"].items()]
+        cells = [" + ".join(radii)]
         for method in METHODS:
-            cells.append(format_fraction(_rate(row[method])))
+            cells.append(format_fraction(_success_rate(row[method])))
             cells.append(str(int(row[method + WITHOUT_NOISE].sum())))
         rows.append(cells)
     header = ["radius"]
@@ -258,32 +292,37 @@ def format_sweep(sweep: Sweep) -> str:
     return str(Table("", header, rows))
 
 
-def _rate(success: Tensor) -> Proportion:
-    """Compute the fraction of examples (N,) on which an attack succeeds."""
-    return fraction(int(success.sum()), len(success))
+def _success_rate(is_success: Tensor) -> Proportion:
+    """Compute the fraction of examples on which an attack succeeds, with its interval.
+
+    Args:
+        is_success: Whether it succeeds on each example, bool, shape (examples,).
+    """
+    return fraction(int(is_success.sum()), len(is_success))
 
 
 def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Path) -> None:
     """Write the success at each radius as a table, sweep.csv, and as a figure, sweep.png.
 
-    The table has a row for each mesh (and all of several), method (also without
-    noise) and radius. It has the rate of success on examples that were correct
-    before, with its 95% Wilson interval. The figure shows the last mesh, or all
-    of several.
+    A row of the table has the success rate of one method at one radius on the
+    examples of one mesh, with its 95% Wilson interval. Only examples that are
+    classified correctly before the attack count. With several meshes, rows with
+    the mesh "all" have the examples of all meshes together. The figure shows
+    these rows, or else the rows of the only mesh.
 
     Args:
-        sweeps: Result of `nb.success_by_radius` for each mesh.
-        norms: Norm of the radius of each parameter.
+        sweeps: Result of `nb.success_by_radius` for each mesh, by its name.
+        norms: Norm of the radius of each attacked parameter, such as "l2".
         out: Folder that the files are written to.
     """
     methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
     if len(sweeps) > 1:
-        sweeps = {**sweeps, "all": _pool(sweeps, methods)}
+        sweeps = {**sweeps, "all": _pool_meshes(sweeps, methods)}
     records = []
     for mesh, sweep in sweeps.items():
         for method in methods:
             for row in sweep:
-                rate = asdict(_rate(row[method]))
+                rate = asdict(_success_rate(row[method]))
                 records.append({"mesh": mesh, "method": method, **row["radii"], **rate})
     text = io.StringIO()
     table = csv.DictWriter(text, list(records[0]))
@@ -291,20 +330,20 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     table.writerows(records)
     atomic_write(out / TABLE, text.getvalue())
     last_mesh = records[-1]["mesh"]
-    drawn = [record for record in records if record["mesh"] == last_mesh and record["n"]]
-    _draw(drawn, norms, out / FIGURE)
+    shown = [record for record in records if record["mesh"] == last_mesh and record["n"]]
+    _draw_sweep(shown, norms, out / FIGURE)
 
 
-def _pool(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
-    """Join the examples of all meshes at each radius.
+def _pool_meshes(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
+    """Concatenate the examples of all meshes at each radius.
 
     Args:
-        sweeps: Success at each radius, for each mesh. All meshes have the same
-            radii.
-        methods: Keys of the successes.
+        sweeps: Result of `nb.success_by_radius` for each mesh. All meshes have
+            the same radii.
+        methods: Names of the methods in these results.
 
     Returns:
-        Success at each radius on the examples of all meshes.
+        The same result as for one mesh, with the examples of all meshes.
     """
     pooled = []
     for rows in zip(*sweeps.values(), strict=True):
@@ -313,13 +352,13 @@ def _pool(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
     return pooled
 
 
-def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
-    """Draw the rate of success of each method against the radius.
+def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
+    """Draw the success rate of each method against the radius.
 
     Args:
-        records: Rows of sweep.csv of one mesh.
-        norms: Norm of the radius by attacked parameter. The axis shows the
-            radius of the first parameter.
+        records: Rows of sweep.csv with one mesh.
+        norms: Norm of the radius of each attacked parameter. The x axis shows
+            the radius of the first parameter.
         path: File of the figure.
     """
     from matplotlib.figure import Figure
@@ -327,12 +366,11 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
     axes = figure.subplots()
     first, *others = norms
-    # The adversarial line is solid, the other one dashed.
-    styles = zip(COLORS, LINES[1::-1], MARKERS, strict=False)
-    for (method, title), (color, line, marker) in zip(METHODS.items(), styles, strict=False):
+    for method, title in METHODS.items():
         rows = [record for record in records if record["method"] == method]
         radii = [row[first] for row in rows]
         values = [row["value"] for row in rows]
+        color, line, marker = STYLES[method]
         axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
         low = [row["low"] for row in rows]
         high = [row["high"] for row in rows]

@@ -1,8 +1,9 @@
-"""Tables that compare finished runs: metrics on photographs by source, and differences.
+"""Tables that compare finished training runs by their metrics on photographs.
 
-Runs that differ only in their seed are the runs of one method. An `Evaluation`
-holds the predictions of one run for one folder of photographs. `difference`
-compares a metric of two methods, with a 95% interval.
+A method is a way to train a network. Runs that differ only in their seed are
+runs of the same method. An `Evaluation` holds the predictions of one run for one
+folder of photographs. `difference` compares a metric of two methods, with a 95%
+interval.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,34 +43,37 @@ from train.settings import PHOTOGRAPHS
 
 # `class_table` has no rows if there are more classes than this.
 MAX_CLASSES = 30
-# Titles of the columns of metrics.
+# Titles of the columns of tables that have a column for each metric in `METRICS`.
 TITLES = [metric_title(name) for name in METRICS]
-# Metrics of the table that is printed without --verbose.
+# Metrics in the table that commands print without --verbose.
 SHORT_METRICS = ("recall", "false_positive_rate", "auc", "class_top1")
 
 
 @dataclass(frozen=True)
-class Part:
-    """Part of the images of an evaluation. Tables have a row for each part.
+class Subset:
+    """Subset of the images of an evaluation, such as the images of one source.
+
+    Tables have a row for each subset.
 
     Attributes:
-        by: "all" for the images of all sources that are not excluded.
-            Otherwise the property that the images of the part share: "label",
-            "source", "mesh" or "class".
-        name: Name of the label, source, mesh or class. Empty for all images.
+        by: Property that the images of the subset have in common: "label",
+            "source", "mesh" or "class". "all" for the set of all images.
+        name: Value of the property, such as the name of the source. Empty for
+            the set of all images.
     """
 
     by: str = "all"
     name: str = ""
 
     def title(self, overall: str = "all") -> str:
-        """Return the title of the row.
+        """Return the title of the row of this subset in a table.
 
         Args:
             overall: Title of the row of all images.
 
         Returns:
-            Title such as "all", "label=orange" or "studio".
+            `overall`, "label=orange" for a label, or the name of the source,
+            mesh or class.
         """
         if self == ALL:
             return overall
@@ -79,41 +83,43 @@ class Part:
 
     @property
     def is_overall(self) -> bool:
-        """Whether the part has the images of all sources, for one label or for all labels."""
+        """Whether the subset has images of all sources, for all labels or for one label."""
         return self.by in ("all", "label")
 
 
-# The images of all sources that are not excluded.
-ALL = Part()
+# All images, except those of sources that the user excludes.
+ALL = Subset()
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Predictions of a run for one folder of photographs, pooled by parts of the images.
+    """Predictions of the network of a run for one folder of photographs.
 
     Attributes:
-        run: Run that made the predictions.
-        pools: Pool of each part of the images. `ALL` is the first.
+        run: Run that trained the network.
+        pools: For each subset of the photographs, a pool: its predictions with
+            their metrics. `ALL` is the first subset.
     """
 
     run: RunSummary
-    pools: Mapping[Part, Pool]
+    pools: Mapping[Subset, Pool]
 
 
-# Evaluations by method, in the order of their seeds.
+# For each method, the evaluations of its runs, in the order of their seeds.
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
-def pools_of(pooled: Pooled, *properties: str) -> dict[Part, Pool]:
-    """Return the pool of all images, and a pool for each value of some properties.
+def pools_of(pooled: Pooled, *properties: str) -> dict[Subset, Pool]:
+    """Return the predictions and metrics for all images and for subsets of the images.
 
     Args:
-        pooled: Pools of one evaluation.
-        *properties: "label", "source", "mesh" or "class", in the order of the
-            pools.
+        pooled: Predictions and metrics of one evaluation.
+        *properties: Properties by which the images are divided into subsets:
+            "label", "source", "mesh" or "class".
 
     Returns:
-        Pools by part. `ALL` is the first.
+        A pool, which has predictions and their metrics, for each subset. The
+        first subset is `ALL`. A subset for each value of each property follows.
     """
     pools_of_property = {
         "label": pooled.by_label,
@@ -124,7 +130,7 @@ def pools_of(pooled: Pooled, *properties: str) -> dict[Part, Pool]:
     pools = {ALL: pooled.all}
     for by in properties:
         for name, pool in pools_of_property[by].items():
-            pools[Part(by, name)] = pool
+            pools[Subset(by, name)] = pool
     return pools
 
 
@@ -132,54 +138,77 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     """Read the predictions of runs that were scored on the same images.
 
     Args:
-        group: Scored runs of each method, from `group_by_images`.
-        exclude: Sources that the pool of all images leaves out.
-        by: "source", "mesh" or "class" for a pool of each of them.
+        group: For each method, the runs with their scores on these images, as
+            `group_by_images` returns them.
+        exclude: Sources whose images do not count among all images.
+        by: Property by which the images are divided into subsets: "source",
+            "mesh" or "class".
 
     Returns:
-        Evaluations by method. Published networks have no predictions and are
-        left out.
+        Evaluations of each method. A published network has no file of
+        predictions, and is left out.
 
     Raises:
-        InputError: If predictions.csv cannot be read, if a source to exclude
-            does not exist, or if `by` is "mesh" and no mesh is known.
+        InputError: If predictions.csv cannot be read, if no image has a source
+            in `exclude`, or if `by` is "mesh" and no mesh is known.
     """
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
-            path = scored.folder / PREDICTIONS
-            if not path.is_file():
-                continue
-            scores = scored.scores
-            predictions = read_predictions(path, scores.labels)
-            pooled = Pooled(predictions, exclude, scores.thresholds)
-            _require_sources(exclude, predictions)
-            if by == "mesh" and not pooled.by_mesh:
-                raise InputError(f"by=mesh: {path} names no mesh: leave by=mesh out")
-            properties = ("label", by) if scores.by_label else (by,)
-            pools = pools_of(pooled, *properties)
-            methods.setdefault(method, []).append(Evaluation(scored.run, pools))
+            if (scored.folder / PREDICTIONS).is_file():
+                evaluation = _read_evaluation(scored, exclude, by)
+                methods.setdefault(method, []).append(evaluation)
     return methods
 
 
+def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Evaluation:
+    """Read the predictions of one run for one folder of photographs.
+
+    Args:
+        scored: Run with the folder of its scores, which holds predictions.csv.
+        exclude: Sources whose images do not count among all images.
+        by: Property by which the images are divided into subsets.
+
+    Raises:
+        InputError: See `read_evaluations`.
+    """
+    path = scored.folder / PREDICTIONS
+    scores = scored.scores
+    predictions = read_predictions(path, scores.labels)
+    pooled = Pooled(predictions, exclude, scores.thresholds)
+    _require_sources(exclude, predictions)
+    if by == "mesh" and not pooled.by_mesh:
+        raise InputError(f"by=mesh: {path} names no mesh: leave by=mesh out")
+    properties = ("label", by) if scores.by_label else (by,)
+    return Evaluation(scored.run, pools_of(pooled, *properties))
+
+
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Raise InputError if no photograph has a source of one of these names."""
+    """Check that photographs have the sources that a user excludes.
+
+    Args:
+        names: Names of the sources.
+        predictions: Predictions for all photographs, with their sources.
+
+    Raises:
+        InputError: If no photograph is of one of the sources.
+    """
     sources = {item.photograph.source for item in predictions}
     unknown = set(names) - sources
     if unknown:
         known = ", ".join(sorted(filter(None, sources)))
         raise InputError(
-            f"exclude: no photograph is of source {min(unknown)!r}; the sources are {known}",
+            f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}",
         )
 
 
-def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate | None:
+def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> Estimate | None:
     """Average a metric over the seeds of a method.
 
     Args:
-        group: Evaluations of the method, one for each seed.
-        part: Part of the images.
-        name: Name in `METRICS`.
+        evaluations: Evaluations of the method, one for each seed.
+        subset: Subset of the images on which the metric is measured.
+        name: Name of the metric in `METRICS`.
 
     Returns:
         With one seed, the metric and its 95% interval. With several seeds, the
@@ -188,8 +217,8 @@ def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate 
     """
     known: list[Estimate] = []
     values: list[float] = []
-    for evaluation in group:
-        pool = evaluation.pools.get(part)
+    for evaluation in evaluations:
+        pool = evaluation.pools.get(subset)
         metric = pool.metrics.find(name) if pool is not None else None
         if metric is not None and metric.value is not None:
             known.append(metric)
@@ -202,77 +231,83 @@ def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate 
 
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
-    """Make a table of the metrics of each part of the images and each method.
+    """Make a table of the metrics of each method on each subset of the images.
 
     Args:
         methods: Evaluations of each method.
         overall: Title of the rows of all images.
-        by: "source", "mesh" or "class": the title of the first column.
+        by: Title of the first column: "source", "mesh" or "class".
 
     Returns:
-        Table with a row for each part and each method. Cells hold the means
-        over the seeds (see `mean_metric`).
+        Table with a row for each subset and each method. Cells hold means over
+        the seeds of the method.
     """
-    evaluations = [evaluation for group in methods.values() for evaluation in group]
-    parts = dict.fromkeys(part for evaluation in evaluations for part in evaluation.pools)
+    # A dictionary has each subset once, in order.
+    subsets: dict[Subset, None] = {}
+    for evaluations in methods.values():
+        for evaluation in evaluations:
+            subsets.update(dict.fromkeys(evaluation.pools))
     rows: list[list[str]] = []
-    for part in progress(parts, "intervals"):
-        for method, group in methods.items():
-            cells = [format_interval(mean_metric(group, part, name)) for name in METRICS]
-            rows.append([part.title(overall), method, *cells])
+    for subset in progress(subsets, "intervals"):
+        for method, evaluations in methods.items():
+            metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
+            rows.append([subset.title(overall), method, *map(format_interval, metrics)])
     return Table(f"by {by}", [by, "network", *TITLES], rows)
 
 
 def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
-    """Choose which methods are compared with which reference.
+    """Choose which methods are compared.
 
-    Each method is compared with the network that its runs began with, and with
-    the first of the methods.
+    Each method is compared with its initial network, the network with whose
+    weights its runs began. It is also compared with the first method.
 
     Args:
-        methods: Evaluations of each method. Initial networks count as methods.
+        methods: Evaluations of each method. An initial network counts as a
+            method.
 
     Returns:
-        Pairs of a method and its reference.
+        Pairs of a method and the reference that it is compared with.
     """
     first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
     pairs = []
     for method, run in first_runs.items():
-        # A run that began with random weights has no initial network.
-        if run.before is None:
+        initial_network = run.before
+        if initial_network is None:
             continue
         for reference, reference_run in first_runs.items():
-            if reference_run.settings == run.before.settings:
+            if reference_run.settings == initial_network.settings:
                 pairs.append((method, reference))
     trained = [method for method, run in first_runs.items() if run.method != INITIAL]
     return pairs + [(method, trained[0]) for method in trained[1:]]
 
 
 def class_table(group: Scored) -> Table:
-    """Make a table of top-1 and top-5 by class, among all classes of the network.
+    """Make a table of the top-1 and top-5 accuracy for the images of each class.
+
+    The accuracies are among all classes of the network.
 
     Args:
-        group: Scored runs of each method, from `group_by_images`.
+        group: For each method, the runs with their scores on the same images,
+            as `group_by_images` returns them.
 
     Returns:
-        Table with a row for each class that the networks have, and each method. It has no rows
-        if there is one such class, or if there are more than MAX_CLASSES.
+        Table with a row for each class and each method. Only classes that the networks have
+        count. The table has no rows if there is one such class, or more than MAX_CLASSES.
     """
     methods = read_evaluations(group, by="class")
     header = ["class", "images", "network", "top-1", "top-5"]
     rows: list[list[str]] = []
-    # Number of images of each class.
-    classes: dict[Part, int] = {}
+    image_counts: dict[Subset, int] = {}
     for evaluations in methods.values():
-        for part, pool in evaluations[0].pools.items():
-            if part.by == "class" and pool.classified:
-                classes[part] = len(pool.classified)
-    if 1 < len(classes) <= MAX_CLASSES:
-        for part, image_count in classes.items():
+        for subset, pool in evaluations[0].pools.items():
+            if subset.by == "class" and pool.classified:
+                image_counts[subset] = len(pool.classified)
+    if 1 < len(image_counts) <= MAX_CLASSES:
+        for subset, image_count in image_counts.items():
             for method, evaluations in methods.items():
-                metrics = (mean_metric(evaluations, part, name) for name in TOP_RANKS)
+                metrics = (mean_metric(evaluations, subset, name) for name in TOP_RANKS)
                 cells = map(format_interval, metrics)
-                rows.append([part.name, str(image_count), method, *cells])
+                rows.append([subset.name, str(image_count), method, *cells])
     return Table("by class, among all classes of the network", header, rows)
 
 
@@ -290,12 +325,12 @@ class Difference(Estimate):
 
 
 def difference(
-    group: Sequence[Evaluation],
+    evaluations: Sequence[Evaluation],
     reference: Sequence[Evaluation],
-    part: Part,
+    subset: Subset,
     name: str,
 ) -> Difference | None:
-    """Subtract the mean of a metric over the seeds of a reference from the mean of a method.
+    """Compare a metric of a method with that of a reference: mean minus mean over the seeds.
 
     The 95% interval comes from a bootstrap over objects, images and seeds. Each
     replicate draws the same objects and images for all runs. If both methods
@@ -304,16 +339,18 @@ def difference(
     1 - 1/n. With one seed, this variance is missing altogether.
 
     Args:
-        group: Evaluations of the method, one for each seed.
-        reference: Evaluations of the reference, one for each seed.
-        part: Part of the images.
-        name: Name in `METRICS`.
+        evaluations: Evaluations of the method, one for each seed.
+        reference: Evaluations of the reference, another method, one for each
+            seed.
+        subset: Subset of the images on which the metric is measured.
+        name: Name of the metric in `METRICS`.
 
     Returns:
-        Difference of the means. None if the metric of a run has no replicates.
+        Difference of the means. None if the metric of a run has no bootstrap
+        replicates.
     """
-    pools = [evaluation.pools[part] for evaluation in group]
-    reference_pools = [evaluation.pools[part] for evaluation in reference]
+    pools = [evaluation.pools[subset] for evaluation in evaluations]
+    reference_pools = [evaluation.pools[subset] for evaluation in reference]
     if any(name not in pool.replicates for pool in (*pools, *reference_pools)):
         return None
     after = fmean(_known_value(pool.metrics, name) for pool in pools)
@@ -321,14 +358,15 @@ def difference(
     replicates = replicate_difference(
         np.stack([pool.replicates[name] for pool in pools]),
         np.stack([pool.replicates[name] for pool in reference_pools]),
-        _have_equal_seeds(group, reference),
+        _have_equal_seeds(evaluations, reference),
     )
     change = estimate(after - before, replicates)
     assert change.low is not None and change.high is not None
     margin = 0.0
     if change.low == change.high:
-        # All replicates are equal, as if both methods agree on every image. Then
-        # the interval has the images that may differ unseen (Wilson 1927).
+        # All replicates are equal: both methods agree on every image. The true
+        # difference can still be up to the upper end of the Wilson interval (Wilson
+        # 1927) for 0 differences among the images.
         image_count = min(len(pools[0].positives), len(pools[0].negatives))
         margin = fraction(0, max(1, image_count)).high or 0.0
     return Difference(
@@ -341,20 +379,25 @@ def difference(
 
 
 def _known_value(metrics: Metrics, name: str) -> float:
-    """Return the value of a metric that is known, because it has bootstrap replicates."""
+    """Return the value of a metric that is known to exist.
+
+    Args:
+        metrics: Metrics of one pool of predictions.
+        name: Name of a metric that has bootstrap replicates.
+    """
     metric = metrics.find(name)
     assert metric is not None and metric.value is not None
     return metric.value
 
 
-def _have_equal_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
+def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
     """Return whether the runs of two methods have the same seeds, in the same order.
 
     Args:
-        group: Evaluations of a method, one for each seed.
+        evaluations: Evaluations of a method, one for each seed.
         reference: Evaluations of the other method, one for each seed.
     """
-    seeds = [evaluation.run.seed or 0 for evaluation in group]
+    seeds = [evaluation.run.seed or 0 for evaluation in evaluations]
     reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
     return seeds == reference_seeds
 
@@ -365,44 +408,45 @@ def difference_tables(
     by: str = "source",
     overall_only: bool = False,
 ) -> list[Table]:
-    """Make a table of the differences for each pair of methods that is compared.
+    """Make a table of the differences of the metrics for each pair of methods.
 
     Args:
         methods: Evaluations of each method.
         overall: Title of the row of all images.
-        by: "source", "mesh" or "class": the title of the first column.
+        by: Title of the first column: "source", "mesh" or "class".
         overall_only: Whether to leave out the rows of single sources, meshes or classes.
 
     Returns:
-        A table for each pair from `choose_pairs`, with a row for each part of
-        the images.
+        A table for each pair from `choose_pairs`. It has a row for each subset
+        of the images.
     """
     tables = []
     for method, base in progress(choose_pairs(methods), "differences"):
-        group = methods[method]
+        evaluations = methods[method]
         reference = methods[base]
         rows = []
-        for part in reference[0].pools:
-            if overall_only and not part.is_overall:
+        for subset in reference[0].pools:
+            if overall_only and not subset.is_overall:
                 continue
-            differences = [difference(group, reference, part, name) for name in METRICS]
+            differences = [difference(evaluations, reference, subset, name) for name in METRICS]
             cells = [format_interval(item, sign="+") for item in differences]
-            rows.append([part.title(overall), *cells])
-        paired = ", paired" if _have_equal_seeds(group, reference) else ""
-        title = f"{method} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
+            rows.append([subset.title(overall), *cells])
+        paired = ", paired" if _have_equal_seeds(evaluations, reference) else ""
+        counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
+        title = f"{method} minus {base} ({counts})"
         tables.append(Table(title, [by, *TITLES], rows))
     return tables
 
 
 def overall_differences(methods: Evaluations) -> Table:
-    """Make one table of the differences on the images of all sources.
+    """Make one table of the differences between methods on the images of all sources.
 
     Args:
         methods: Evaluations of each method.
 
     Returns:
-        Table with a row for each pair from `choose_pairs` and, with several
-        labels, for each label.
+        Table with a row for each pair of methods from `choose_pairs`. With
+        several positive classes, rows for each of these classes follow.
     """
     rows = []
     for table in difference_tables(methods, overall="", overall_only=True):
@@ -413,15 +457,15 @@ def overall_differences(methods: Evaluations) -> Table:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """Compare runs in the tables that pnb-train prints at its end.
+    """Compare runs in the tables that pnb-train --verbose prints after training.
 
     Args:
         runs: Finished runs.
 
     Returns:
-        Markdown tables of the accuracy, the metrics and their differences, a
-        line about the renders of each method, and the paths of the contact
-        sheets.
+        Markdown tables of the accuracy, of the metrics and of their differences.
+        A line that explains the kinds of renders, and the paths of images of
+        scored photographs, follow.
     """
     methods = group_by_method(runs)
     groups = group_by_images(methods)
@@ -441,7 +485,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 def _format_tables(tables: Sequence[Table]) -> str:
     """Write tables as Markdown, with an empty line between them.
 
-    Tables without rows and columns without known values are left out.
+    A table without rows, and a column without known values, are left out.
     """
     return "\n\n".join(str(table.known) for table in tables if table.rows)
 
@@ -456,19 +500,21 @@ def format_comparison(
 
     Args:
         runs: Finished runs and scored networks.
-        exclude: Sources that the metrics on all images leave out.
+        exclude: Sources of photographs that do not count in the metrics on all
+            photographs.
         photographs: Name of the sub-folder of each run with its scores on
             photographs.
-        by: "source", "mesh" or "class" for metrics of each of them.
+        by: Property of photographs: "source", "mesh" or "class". The tables have
+            a row for each of its values.
 
     Returns:
-        Markdown tables of the accuracy, the metrics, their differences, and the
-        seconds of an epoch.
+        Markdown tables of the accuracy, of the metrics, of their differences and
+        of the seconds of an epoch.
 
     Raises:
         InputError: If the runs were scored on different photographs or classes,
-            if no run has the sub-folder and its name is not the usual one, or
-            if predictions cannot be read (see `read_evaluations`).
+            if no run has the sub-folder `photographs` (unless this is the usual
+            name "photographs"), or if predictions cannot be read.
     """
     methods = group_by_method(runs)
     groups = group_by_images(methods)
@@ -493,16 +539,16 @@ def format_short_comparison(
 
     Args:
         runs: Finished runs and scored networks.
-        exclude: See `format_comparison`.
-        photographs: See `format_comparison`. If no run has a sub-folder of the
-            usual name, the first scored photographs of the runs are compared.
-        by: "source" for the metrics on all images, or "mesh" for the metrics of
-            each mesh.
+        exclude: Sources of photographs that do not count.
+        photographs: Name of the sub-folder of each run with its scores on
+            photographs. If no run has the usual sub-folder "photographs", the
+            first photographs on which the runs were scored are compared.
+        by: "source" for a row for each method. "mesh" or "class" for a row for
+            each method and each mesh or class.
 
     Returns:
-        Markdown table. If `by` is "source", it has a row for each method, with
-        means over its runs. The gain in AUC over the first network has a 95%
-        interval.
+        Markdown table of means over the runs of a method. A row for each method
+        ends with the gain in AUC over the first method, with its 95% interval.
 
     Raises:
         InputError: See `format_comparison`.
@@ -518,12 +564,12 @@ def format_short_comparison(
     titles = [title for title, members in groups.items() if members is group]
     rows = []
     for method, members in methods.items():
-        scored = group.get(method, ()) if group else ()
-        found = evaluations.get(method)
-        if found is None and not exclude:
-            metrics = [_mean_score(scored, name) for name in SHORT_METRICS]
+        if method not in evaluations and not exclude:
+            scored_runs = group.get(method, ()) if group else ()
+            metrics = [_mean_stored_metric(scored_runs, name) for name in SHORT_METRICS]
         else:
-            metrics = [mean_metric(found or (), ALL, name) for name in SHORT_METRICS]
+            of_method = evaluations.get(method, ())
+            metrics = [mean_metric(of_method, ALL, name) for name in SHORT_METRICS]
         accuracies = [run.accuracy for run in members if run.accuracy is not None]
         accuracy = Estimate(fmean(accuracies)) if accuracies else None
         values = [_format_value(metric) for metric in (accuracy, *metrics)]
@@ -533,23 +579,30 @@ def format_short_comparison(
 
 
 def _title_of_all(exclude: Sequence[str]) -> str:
-    """Return the title of all images: "all", or "all but A, B" if sources are excluded."""
+    """Return the title of the row of all images.
+
+    Args:
+        exclude: Sources whose images do not count.
+
+    Returns:
+        "all", or "all but A, B" if the sources A and B are excluded.
+    """
     return f"all but {', '.join(exclude)}" if exclude else "all"
 
 
-def _mean_score(scored: Sequence[ScoredRun], name: str) -> Estimate | None:
-    """Average a metric over the scores of runs, for runs without predictions.csv.
+def _mean_stored_metric(scored_runs: Sequence[ScoredRun], name: str) -> Estimate | None:
+    """Average a metric over the stored scores of runs, which lack the file predictions.csv.
 
     Args:
-        scored: Runs of one method with their scores on the same images.
-        name: Name in `METRICS`.
+        scored_runs: Runs of one method with their scores on the same images.
+        name: Name of the metric in `METRICS`.
 
     Returns:
-        Mean without an interval. None if no run knows the metric.
+        Mean without an interval. None if the scores of no run have the metric.
     """
     values = []
-    for item in scored:
-        metric = item.scores.metrics[name]
+    for scored in scored_runs:
+        metric = scored.scores.metrics[name]
         if metric is not None and metric.value is not None:
             values.append(metric.value)
     return Estimate(fmean(values)) if values else None
@@ -561,15 +614,15 @@ def _format_value(metric: Estimate | None) -> str:
 
 
 def _format_gain(methods: Evaluations, method: str) -> str:
-    """Write the AUC of a method minus the AUC of the first method.
+    """Write the gain in AUC: the AUC of a method minus the AUC of the first method.
 
     Args:
         methods: Evaluations of each method.
         method: Name of the method.
 
     Returns:
-        The difference with its 95% interval. "-" for the first method itself,
-        and for a method without predictions.
+        The gain with its 95% interval. "-" for the first method itself, and for
+        a method without evaluations.
     """
     first = next(iter(methods), method)
     if method == first or method not in methods:
@@ -579,46 +632,52 @@ def _format_gain(methods: Evaluations, method: str) -> str:
 
 
 def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
-    """Find the runs that were scored on the photographs of a given name.
+    """Find the runs whose scores lie in a sub-folder of a given name.
 
     Args:
         groups: Groups of scored runs. All runs of a group were scored on the
             same images.
-        photographs: Name of the sub-folder of each run with the scores.
+        photographs: Name of the sub-folder with the scores in the folder of
+            each run.
 
     Returns:
-        The group. None if no run has scores of the usual name `PHOTOGRAPHS`.
+        Group of these runs. None if no run has the usual sub-folder
+        "photographs".
 
     Raises:
-        InputError: If several groups have this name, or if no run has scores
-            of another name than the usual one.
+        InputError: If runs of several groups have a sub-folder of this name, or
+            if no run has a sub-folder of another name than "photographs".
     """
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
         first, second = (next(iter(group.values()))[0].folder for group in found[:2])
         raise InputError(
-            f"{second} has other photographs or sources than {first}: "
+            f"{second} has scores for other photographs or sources than {first}: "
             "score both networks on the same folder with pnb-evaluate",
         )
     if not found and photographs != PHOTOGRAPHS:
         raise InputError(
-            f"photographs={photographs}: no run has a sub-folder of that name "
-            "with the files of an evaluation",
+            f"photographs={photographs}: no run has a sub-folder of this name with scores: "
+            "give a name in the setting evaluate.photos of the runs",
         )
     return found[0] if found else None
 
 
 def _is_scored_on(group: Scored, photographs: str) -> bool:
-    """Return whether a group of scored networks belongs to photographs of a given name.
+    """Return whether the scores of a group of networks may be those of a given sub-folder.
 
-    The scores of a run lie in a sub-folder that has the name of the
-    photographs. A network that is not a run, such as a published network, has
-    no seed and no such sub-folder. It belongs to photographs of every name.
+    A run has its scores in a sub-folder, whose name the user chooses. A network
+    that is not a run, such as a published network, has no seed and no such
+    sub-folder. Its scores may be compared with those in any sub-folder.
 
     Args:
-        group: Scored networks by method.
-        photographs: Name of the photographs: the sub-folder with the scores in
-            the folder of each run.
+        group: Networks with their scores on the same images, by method.
+        photographs: Name of the sub-folder with the scores in the folder of each
+            run.
     """
-    members = [scored for scored_runs in group.values() for scored in scored_runs]
-    return any(scored.name == photographs or scored.run.seed is None for scored in members)
+    for scored_runs in group.values():
+        for scored in scored_runs:
+            is_run = scored.run.seed is not None
+            if scored.name == photographs or not is_run:
+                return True
+    return False

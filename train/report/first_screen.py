@@ -1,4 +1,7 @@
-"""The first screen of a page: the answer, three numbers, and pictures of both networks."""
+"""The first screen of a report page about the hardening of a network.
+
+It says whether hardening helped, and shows metrics and pictures before and after it.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,25 +18,26 @@ from train.report import comparison as compare
 from train.report import plots
 from train.report.plots import Picture
 
-# False-positive rate at which the recall of both networks is compared.
+# Metric "recall at a false-positive rate of 10%". At an equal rate, the recall of two
+# networks can be compared.
 EQUAL_RATE = "recall_at/0.10"
 # Words for the network before and after hardening, in the middle of a sentence.
 NETWORKS = ("the original network", "the hardened network")
-# Number of pictures in a row.
+# Largest number of pictures in a row.
 PICTURES = 6
 # Largest number of pixels per side of a picture.
 SIDE = 200
 
 
 @dataclass(frozen=True)
-class Number:
-    """A metric before and after hardening.
+class ShownMetric:
+    """A metric on the first screen, before and after hardening.
 
     Attributes:
-        title: Metric in words.
-        note: Which values are good.
-        before: Metric of the original network. None if there is one network.
-        after: Metric of the hardened network, or of the only network.
+        title: The metric in words.
+        note: Words that say which values are good, such as "higher is better".
+        before: Value for the original network. None if only one network is shown.
+        after: Value for the hardened network, or for the only network.
         is_percentage: Whether the metric is shown in percent.
     """
 
@@ -44,11 +48,16 @@ class Number:
     is_percentage: bool = True
 
     def text(self, value: float) -> str:
-        """Write a value of the metric in percent, or with two decimals."""
+        """Write a value of the metric in percent, or with two decimals if it is no percentage."""
         return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
 
     def cells(self) -> list[str]:
-        """Write the title and the value of each network, with its 95% interval."""
+        """Write the cells of the row of this metric in a table.
+
+        Returns:
+            Title of the metric, and its value for each network, such as
+            "67% [60%, 73%]". The 95% interval is left out if it is unknown.
+        """
         cells = [self.title]
         for estimate in (self.before, self.after):
             if estimate is None or estimate.value is None:
@@ -60,36 +69,36 @@ class Number:
         return cells
 
 
-class Answer(NamedTuple):
-    """Class that a network gives an image, with its probability.
+class ShownPrediction(NamedTuple):
+    """Class that a network predicts for an image, as a page shows it.
 
     Attributes:
-        text: Class and probability.
-        verdict: "right" if the class is that of the image. "wrong" if the image
-            shows the class under study and the network misses it, or if the
-            network takes another object for the class under study. Otherwise
-            empty: an image of another object, with a wrong class that is not
-            under study.
+        text: Predicted class and its probability, such as "orange 81%".
+        verdict: "right" if the image is of the predicted class. "wrong" if the
+            network misses an object of the positive class, or takes another
+            object for the positive class. Empty for any other wrong prediction,
+            which does not count in the metrics.
     """
 
     text: str
     verdict: str
 
 
-class Contrast(NamedTuple):
-    """An image that both networks classify.
+class ComparedImage(NamedTuple):
+    """An image with the predictions of two networks.
 
     Attributes:
         picture: The image.
-        subject: What it shows, and its light if that is known.
-        before: Answer of the original network.
-        after: Answer of the hardened network.
+        subject: Words that say what the image shows, and in which light if that
+            is known.
+        before: Prediction of the original network.
+        after: Prediction of the hardened network.
     """
 
     picture: Picture
     subject: str
-    before: Answer
-    after: Answer
+    before: ShownPrediction
+    after: ShownPrediction
 
 
 @dataclass(frozen=True)
@@ -97,40 +106,45 @@ class FirstScreen:
     """Content of the first screen of a page: an answer, metrics and pictures.
 
     Attributes:
-        answer: Whether hardening helped, or whether the network is safe, in a
-            few words.
-        sentences: Reasons of the answer.
+        answer: Short sentence that says whether hardening helped or, for a
+            single network, whether it is safe.
+        sentences: Sentences with the reasons of the answer.
         numbers: Metrics of the networks.
-        rows: Pictures by the title of their row.
-        names: Names of both networks, or of the only one.
-        images: How many images were scored, of how many objects.
+        rows: Rows of pictures, by the title of the row.
+        names: Names of both networks, or of the only network.
+        images: Sentence that says how many images and objects were scored.
     """
 
     answer: str
     sentences: Sequence[str]
-    numbers: Sequence[Number]
-    rows: dict[str, list[Contrast]]
+    numbers: Sequence[ShownMetric]
+    rows: dict[str, list[ComparedImage]]
     names: Sequence[str]
     images: str
 
     def __str__(self) -> str:
         """Return the answer, its reasons and the table of the metrics as text."""
-        rows = [number.cells() for number in self.numbers]
+        rows = [metric.cells() for metric in self.numbers]
         table = Table("", ["", *self.names], rows)
         return f"{' '.join([self.answer, *self.sentences])}\n\n{table}"
 
 
 class Compared(NamedTuple):
-    """Evaluations of two networks on the same images.
+    """Evaluations of two networks on the same images, with words for sentences about them.
+
+    The first network is called the original one, and the second the hardened
+    one.
 
     Attributes:
-        label: Classes under study in words.
+        label: Positive classes in words.
         before: Evaluations of the original network, one for each seed.
         after: Evaluations of the hardened network, one for each seed.
-        names: Names of both networks in the legend.
-        subjects: The same two networks in sentences.
-        place: Where the images are from, to begin a sentence.
-        change: What the second network differs by, such as "hardening".
+        names: Names of both networks in tables.
+        subjects: Words for both networks as the subject of a sentence.
+        place: Start of a sentence that says where the images are from, such as
+            "Under unusual lighting".
+        change: What turned the first network into the second, such as
+            "hardening".
         trained_objects: Classes whose images show the objects of the training.
     """
 
@@ -144,72 +158,81 @@ class Compared(NamedTuple):
     trained_objects: Sequence[str] = ()
 
     def difference(self, name: str) -> compare.Difference | None:
-        """Subtract a metric of the original network from that of the hardened network."""
+        """Compute the difference of a metric on all images: hardened minus original.
+
+        Args:
+            name: Name of the metric in `METRICS`.
+
+        Returns:
+            Difference with its 95% interval. None if the metric is unknown.
+        """
         return compare.difference(self.after, self.before, compare.ALL, name)
 
     @property
     def has_several_classes(self) -> bool:
-        """Whether several classes are under study."""
+        """Whether there are several positive classes."""
         pool = self.after[0].pools[compare.ALL]
         return len({prediction.label for prediction in pool.positives}) > 1
 
-    def number(self, title: str, note: str, name: str) -> Number | None:
-        """Return a metric of both networks, averaged over their seeds.
+    def metric(self, title: str, note: str, name: str) -> ShownMetric | None:
+        """Average a metric of both networks over their seeds.
 
         Args:
-            title: Metric in words.
-            note: Which values are good, in words.
+            title: The metric in words.
+            note: Words that say which values are good.
             name: Name of the metric in `METRICS`.
 
         Returns:
-            The metric. None if it is unknown for a network.
+            The metric. None if it is unknown for one of the networks.
         """
         before = compare.mean_metric(self.before, compare.ALL, name)
         after = compare.mean_metric(self.after, compare.ALL, name)
         if before is None or after is None:
             return None
-        return Number(title, note, before, after, is_percentage=name != "auc")
+        return ShownMetric(title, note, before, after, is_percentage=name != "auc")
 
 
-def place_of(folder: Path | None, name: str) -> str:
-    """Say where images are from, to begin a sentence.
+def describe_place(folder: Path | None, name: str) -> str:
+    """Write the start of a sentence that says where images are from.
 
     Args:
         folder: Folder of the images. None if it is unknown.
-        name: Name of the folder of scores.
+        name: Name of the folder with the scores on these images.
 
     Returns:
-        Words such as "Under unusual lighting".
+        "Under unusual lighting" for images that were rendered to test this.
+        Otherwise, a text with the name.
     """
-    if folder is not None and (folder / DESCRIPTION).is_file():
-        return "Under unusual lighting"
-    return f"In the images of “{name}”"
+    is_laboratory = folder is not None and (folder / DESCRIPTION).is_file()
+    return "Under unusual lighting" if is_laboratory else f"In the images of “{name}”"
 
 
-def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> FirstScreen | None:
-    """Say whether hardening helped, and at what price.
+def compare_networks(
+    compared: Compared, rows: dict[str, list[ComparedImage]]
+) -> FirstScreen | None:
+    """Make the first screen, which says whether hardening helped, and at what price.
 
     Args:
         compared: Evaluations of both networks.
-        rows: Pictures by the title of their row.
+        rows: Rows of pictures, by the title of the row.
 
     Returns:
         The first screen. None if recall, false-positive rate or AUC is unknown.
     """
     label = compared.label
-    asked = [
+    titles = [
         ("recall", f"Images of {label} recognized", "higher is better"),
         ("false_positive_rate", f"Other objects called {label}", "lower is better"),
         ("auc", "Ranking quality (AUC)", "higher is better; 0.5 is chance"),
     ]
     if compared.has_several_classes:
         title = "Top-1 among all classes, mean over classes"
-        asked.append(("class_top1", title, "higher is better"))
-    numbers = []
-    for name, title, note in asked:
-        number = compared.number(title, note, name)
-        if number is not None:
-            numbers.append(number)
+        titles.append(("class_top1", title, "higher is better"))
+    metrics = []
+    for name, title, note in titles:
+        metric = compared.metric(title, note, name)
+        if metric is not None:
+            metrics.append(metric)
     recall = compared.difference("recall")
     false_positives = compared.difference("false_positive_rate")
     auc = compared.difference("auc")
@@ -218,7 +241,7 @@ def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> Fir
     return FirstScreen(
         answer=_answer(compared.change, recall, false_positives, auc),
         sentences=_sentences(compared, recall, false_positives),
-        numbers=numbers,
+        numbers=metrics,
         rows=rows,
         names=compared.names,
         images=_describe_images(compared),
@@ -226,13 +249,13 @@ def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> Fir
 
 
 def _describe_images(compared: Compared) -> str:
-    """Say how many images were scored, of how many objects, and which objects were trained on.
+    """Say how many images and objects were scored, and which objects the training has shown.
 
     Args:
         compared: Evaluations of both networks on the same images.
 
     Returns:
-        One sentence, or two.
+        One or two sentences.
     """
     auc = compared.after[0].pools[compare.ALL].metrics.auc
     sentence = (
@@ -246,9 +269,15 @@ def _describe_images(compared: Compared) -> str:
 
 
 def _direction(change: compare.Difference) -> int:
-    """Return 1 for a proven increase, -1 for a proven decrease, and otherwise 0.
+    """Return the sign of a difference, or 0 if its sign is not proven.
 
-    A change is proven if its 95% interval does not contain 0.
+    The sign is proven if the 95% interval does not contain 0.
+
+    Args:
+        change: Difference of a metric between two networks.
+
+    Returns:
+        1 for a proven increase, -1 for a proven decrease, otherwise 0.
     """
     assert change.low is not None and change.high is not None
     return int(change.low > 0) - int(change.high < 0)
@@ -260,18 +289,19 @@ def _answer(
     false_positives: compare.Difference,
     auc: compare.Difference,
 ) -> str:
-    """Say in a few words whether a change helped.
+    """Write a short sentence that says whether a change of a network helped.
+
+    A proven change of the AUC decides. Recall and false positives decide what
+    the sentence says in addition.
 
     Args:
-        change: Difference between the two networks in words, such as
-            "hardening".
-        recall: Difference of the recall.
-        false_positives: Difference of the false-positive rate. An increase is
-            bad.
-        auc: Difference of the area under the ROC curve, which decides.
+        change: What was done to the network, such as "hardening".
+        recall: Difference of the recall, after minus before the change.
+        false_positives: Difference of the false-positive rate.
+        auc: Difference of the area under the ROC curve.
 
     Returns:
-        A sentence such as "Hardening helped."
+        Sentence such as "Hardening helped, at a price."
     """
     subject = change[0].upper() + change[1:]
     match _direction(auc):
@@ -291,18 +321,17 @@ def _sentences(
     recall: compare.Difference,
     false_positives: compare.Difference,
 ) -> list[str]:
-    """Say in sentences how recall and false positives changed.
+    """Write sentences that say how recall and false positives changed.
 
     Args:
         compared: Evaluations of both networks.
-        recall: Difference of the recall, with the recall of both networks.
-        false_positives: Difference of the false-positive rate, with the rate of
-            both networks.
+        recall: Difference of the recall between both networks.
+        false_positives: Difference of the false-positive rate.
 
     Returns:
-        A sentence about the recall, and one about the false-positive rate. If
-        they are known, a sentence about the recall at 10% false positives, and
-        one about top-1, follow.
+        A sentence about the recall, and a sentence about the false-positive
+        rate. Sentences about the recall at 10% false positives and about the
+        top-1 accuracy follow if these metrics are known.
     """
     label = compared.label
     original, hardened = compared.subjects
@@ -332,14 +361,15 @@ def _sentences(
 
 
 def gain_sentence(subject: str, change: compare.Difference) -> str:
-    """Compare a metric of both networks, and say whether the difference is proven.
+    """Write a sentence that compares a metric of two networks.
 
     Args:
         subject: Start of the sentence, such as "Recall".
-        change: Difference of the metric.
+        change: Difference of the metric between both networks.
 
     Returns:
-        A sentence with the interval of the difference.
+        Sentence with the values of both networks, the 95% interval of the
+        difference, and whether the difference is proven.
     """
     assert change.low is not None and change.high is not None
     verdicts = {1: "a proven gain", -1: "a proven loss", 0: "a difference is not proven"}
@@ -351,48 +381,62 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
 
 
 def _points(value: float) -> str:
-    """Write a difference of fractions in percentage points, such as "+3", "−2" or "0"."""
+    """Write a difference of fractions in percentage points.
+
+    Args:
+        value: Difference, in [-1, 1].
+
+    Returns:
+        Rounded percentage points with a sign, such as "+3", "−2" or "0".
+    """
     points = round(100 * value)
-    # A minus sign replaces the hyphen.
+    # The text gets a typographic minus sign instead of a hyphen.
     return f"{points:+d}".replace("-", "−") if points else "0"
 
 
-def contrasts(
+def choose_disagreements(
     before: Path,
     after: Path,
     images: Path,
     labels: Sequence[str],
     subjects: tuple[str, str] = NETWORKS,
-) -> dict[str, list[Contrast]]:
-    """Choose the images that only one of two networks gets right.
+) -> dict[str, list[ComparedImage]]:
+    """Choose images that only one of two networks classifies correctly.
 
-    An image of a class under study counts as right if it is predicted as this
-    class. Another image counts as right if it is predicted as none of them.
+    An image of a positive class is classified correctly if this class is
+    predicted. Any other image is classified correctly if no positive class is
+    predicted.
 
     Args:
         before: Folder of the scores of the original network.
         after: Folder of the scores of the hardened network on the same images.
         images: Folder of the images.
-        labels: Classes under study.
-        subjects: Both networks in words.
+        labels: Positive classes.
+        subjects: Words for both networks, for the titles of the rows.
 
     Returns:
-        At most PICTURES images in each row, by the title of the row. They are
-        of different objects and lights, if there are enough.
+        Two rows of at most PICTURES images, by the title of the row: the images
+        that only the hardened network classifies correctly, and the images that
+        only the original network does.
     """
-    pairs = zip(_read_one_each(before, labels), _read_one_each(after, labels), strict=True)
+    pairs = zip(
+        _read_predictions(before, labels),
+        _read_predictions(after, labels),
+        strict=True,
+    )
     gained = []
     lost = []
     for pair in pairs:
-        was_right, is_right = (_is_right(prediction, labels) for prediction in pair)
-        if is_right and not was_right:
+        was_correct = _is_correct(pair[0], labels)
+        is_correct = _is_correct(pair[1], labels)
+        if is_correct and not was_correct:
             gained.append(pair)
-        elif was_right and not is_right:
+        elif was_correct and not is_correct:
             lost.append(pair)
     original, hardened = subjects
     return {
-        f"Only {hardened} is right": _draw(gained, images),
-        f"Only {original} is right": _draw(lost, images),
+        f"Only {hardened} is right": _draw_images(gained, images),
+        f"Only {original} is right": _draw_images(lost, images),
     }
 
 
@@ -400,37 +444,37 @@ def contrasts(
 Pair = tuple[Prediction, Prediction]
 
 
-def _read_one_each(folder: Path, labels: Sequence[str]) -> list[Prediction]:
-    """Read one prediction of each image.
+def _read_predictions(folder: Path, labels: Sequence[str]) -> list[Prediction]:
+    """Read one prediction for each image from predictions.csv.
 
-    With several classes under study, predictions.csv has one line for an image
-    and each of these classes.
+    This file has a line for each image and each positive class.
 
     Args:
-        folder: Folder of the scores of a network.
-        labels: Classes under study.
+        folder: Folder of the scores of a network, with predictions.csv.
+        labels: Positive classes.
 
     Returns:
-        For an image of a class under study, the prediction about this class.
-        For any other image, the prediction about the first of `labels`.
+        For an image of a positive class, the line of this class. For any other
+        image, the line of the first positive class.
     """
     predictions = []
     for prediction in read_predictions(folder / PREDICTIONS, labels):
         shown = prediction.photograph.label
-        if prediction.label == (shown if shown in labels else labels[0]):
+        chosen_label = shown if shown in labels else labels[0]
+        if prediction.label == chosen_label:
             predictions.append(prediction)
     return predictions
 
 
-def _is_right(prediction: Prediction, labels: Sequence[str]) -> bool:
-    """Return whether a prediction is right about the classes under study.
+def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:
+    """Return whether a prediction is correct as far as the positive classes are concerned.
 
-    An image of a class under study must be predicted as this class. Any other
-    image must be predicted as none of these classes.
+    For an image of a positive class, this class must be predicted. For any other
+    image, none of the positive classes must be predicted.
 
     Args:
         prediction: Prediction of a network for an image.
-        labels: Classes under study.
+        labels: Positive classes.
     """
     shown = prediction.photograph.label
     if shown in labels:
@@ -438,11 +482,12 @@ def _is_right(prediction: Prediction, labels: Sequence[str]) -> bool:
     return prediction.predicted not in labels
 
 
-def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:
-    """Choose at most PICTURES images, and draw them with the answers of both networks.
+def _draw_images(pairs: Iterable[Pair], images: Path) -> list[ComparedImage]:
+    """Choose at most PICTURES images, and draw them with the predictions of both networks.
 
-    Images whose log-odds differ most between the two networks come first. Each
-    class and source of images has one image before any of them has a second.
+    The images on whose log-odds the two networks differ most are preferred. Each
+    combination of a class and a source gets one image before any of them gets a
+    second one.
 
     Args:
         pairs: Predictions of both networks for each image.
@@ -455,44 +500,47 @@ def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:
         first_of_group.setdefault((photograph.label, photograph.source), pair)
     chosen = list(first_of_group.values())
     chosen += [pair for pair in ordered if pair not in chosen]
-    return [_contrast(pair, images) for pair in chosen[:PICTURES]]
+    return [_draw_image(pair, images) for pair in chosen[:PICTURES]]
 
 
-def _contrast(pair: Pair, images: Path) -> Contrast:
-    """Draw an image with the answers of both networks.
+def _draw_image(pair: Pair, images: Path) -> ComparedImage:
+    """Draw an image, and describe the predictions of both networks for it.
 
     Args:
-        pair: Predictions of the original and of the hardened network for the
-            image.
+        pair: Prediction of the original network, and of the hardened network.
         images: Folder that the path of the image is relative to.
     """
     photograph = pair[0].photograph
     subject = in_words(photograph.label)
     if photograph.source:
         subject += f", {in_words(photograph.source)}"
-    answers = [answer_of(prediction) for prediction in pair]
-    alt = f"{subject}; original network: {answers[0].text}; hardened network: {answers[1].text}"
+    original = describe_prediction(pair[0])
+    hardened = describe_prediction(pair[1])
+    alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
     pixels = Image.fromarray(read_square(images / photograph.path, SIDE))
-    return Contrast(plots.encoded(pixels, alt), subject, *answers)
+    return ComparedImage(plots.encoded(pixels, alt), subject, original, hardened)
 
 
-def answer_of(prediction: Prediction) -> Answer:
-    """Describe the class that a network gives an image.
+def describe_prediction(prediction: Prediction) -> ShownPrediction:
+    """Describe the class that a network predicts for an image.
 
     Args:
-        prediction: Prediction for an image.
+        prediction: Prediction with the class of the image, and with the positive
+            class.
 
     Returns:
-        The class with its probability, and whether it is right.
+        Text and verdict, as `ShownPrediction` explains them.
     """
+    has_positive_class = prediction.predicted == prediction.label
     verdict = ""
     if prediction.predicted == prediction.photograph.label:
         verdict = "right"
-    elif prediction.positive or prediction.predicted == prediction.label:
+    elif prediction.positive or has_positive_class:
         verdict = "wrong"
-    return Answer(f"{in_words(prediction.predicted)} {prediction.probability:.0%}", verdict)
+    text = f"{in_words(prediction.predicted)} {prediction.probability:.0%}"
+    return ShownPrediction(text, verdict)
 
 
 def in_words(label: str) -> str:
-    """Write the name of a class in words, such as "sweet pepper" for "other_sweet_pepper"."""
+    """Write the label of an object in words: "other_sweet_pepper" becomes "sweet pepper"."""
     return label.removeprefix(OTHER_PREFIX).replace("_", " ")

@@ -17,9 +17,9 @@ from train.evaluation.tables import Estimate
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# The first two colors are those of the original and of the hardened network on all pages. Their
-# contrast to a white and to a dark page is above 3. The others are from Okabe and Ito (2008), for
-# color-blind readers. The styles and markers of lines repeat the distinction.
+# Colors of the lines of a plot. The first two colors are those of the original and of the hardened
+# network. Their contrast to a white and to a dark page is above 3. The other colors are from Okabe
+# and Ito (2008), who chose them for color-blind readers.
 COLORS = ("#7d8590", "#2f81f7", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 LINES = ("--", "-", ":", "-.")
 MARKERS = "osD^vP"
@@ -29,15 +29,15 @@ WIDTH = 440
 # `encoded` writes images of at most this many pixels per side as PNG, and larger
 # ones as JPEG.
 SMALL = 192
-# `_draw_curves` marks the points of lines that have fewer points than this.
+# Lines with fewer points than this have a marker at each point.
 MARKED = 30
-# Color of text and axes in the file of matplotlib. `_plot` replaces it by the text
-# color of the page, which is light or dark.
+# Color of text and axes in the SVG that matplotlib writes. It stands for the text color
+# of the page, and is replaced by "currentColor".
 INK = "#123456"
-# Style sheet that `_plot` inserts into each SVG. It sets the text color for light
-# and for dark pages.
+# Style sheet that is inserted into each SVG. It sets the text color to dark on light
+# pages and to light on dark pages.
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
-# Settings of matplotlib with which `_plot` draws.
+# Settings of matplotlib (rcParams) for the plots of a report.
 PLOT = {
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -54,20 +54,20 @@ PLOT = {
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
-# Pairs of x and y. None stands for an unknown y.
+# Points of a line: pairs of x and y. None stands for an unknown y.
 Points = Sequence[tuple[float, float | None]]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image of a page.
+    """An image on an HTML page.
 
     Attributes:
-        data: The bytes of its file.
-        kind: The kind of the file: svg+xml, png or jpeg.
-        alt: A description for readers who do not see it.
-        width: The width on the page, in CSS pixels.
-        caption: The text below it.
+        data: Bytes of the file of the image.
+        kind: Subtype of the media type of the file: "svg+xml", "png" or "jpeg".
+        alt: Description for readers who do not see the image.
+        width: Width on the page, in CSS pixels.
+        caption: Text below the image.
     """
 
     data: bytes
@@ -78,18 +78,18 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """Encode the bytes of the file as an address for the page."""
+        """Data URI that contains the whole image, for the attribute `src` of an `img` element."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode()}"
 
 
 def style(index: int) -> dict[str, Any]:
-    """Return matplotlib's keywords for the lines of a method.
+    """Return the color and the style of the lines of a method, as matplotlib takes them.
 
     Args:
-        index: The place of the method among the methods.
+        index: Index of the method among the methods of the plot.
 
     Returns:
-        The color and the line style.
+        Keyword arguments "color" and "linestyle".
     """
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
@@ -99,15 +99,15 @@ def curves(
     title: str,
     x_title: str = "epoch",
 ) -> Picture | None:
-    """Plot a quantity over epochs or rounds, with a line for each seed of a method.
+    """Plot a metric over epochs or rounds, with a line for each seed of each method.
 
     Args:
-        methods: The points of each seed, by method.
-        title: The quantity.
-        x_title: What x counts.
+        methods: For each method, the points of a line for each seed.
+        title: Name of the metric.
+        x_title: Title of the x axis.
 
     Returns:
-        The plot. None if no line has two points that differ.
+        The plot. None if the metric is constant in each line.
     """
     lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
     for method, seeds in methods.items():
@@ -115,8 +115,8 @@ def curves(
         for points in seeds:
             lines_of_method[method].append([(x, y) for x, y in points if y is not None])
     all_lines = [line for lines in lines_of_method.values() for line in lines]
-    # A line whose values are all equal shows nothing.
-    if not any(len({y for _, y in line}) > 1 for line in all_lines):
+    is_constant = [len({y for _, y in line}) < 2 for line in all_lines]
+    if all(is_constant):
         return None
 
     means = []
@@ -149,24 +149,24 @@ def _draw_curves(
             marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
             x, y = zip(*line, strict=True)
             axes.plot(x, y, marker=marker, ms=4, label=name, **style(index))
-            # Only the first line of a method has an entry in the legend.
+            # Without a label, the other lines of the method have no entry in the legend.
             name = None
     axes.set(xlabel=x_title)
     axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
 
 def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
-    """Plot ROC curves, one for each seed of a method.
+    """Plot ROC curves, with a curve for each seed of each method.
 
     Args:
-        methods: Pairs of the scores of the positives and of the negatives, one
-            pair for each seed, by method.
+        methods: For each method, a pair of arrays for each seed: the scores of
+            the positive images, and the scores of the negative images.
         label: Positive classes in words, for the title of the plot.
 
     Returns:
-        The plot. None if no seed has both positives and negatives.
+        The plot. None if no seed has both positive and negative images.
     """
-    # The pairs of each method that have both positives and negatives.
+    # For each method, the seeds that have both positive and negative images.
     known = {}
     for method, pairs in methods.items():
         known[method] = [
@@ -176,9 +176,9 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
         ]
     if not any(known.values()):
         return None
-    # One network has the color of networks after hardening, as on all charts.
-    first = 1 if len(methods) == 1 else 0
-    styles = {method: style(index) for index, method in enumerate(methods, first)}
+    # A single network gets the second color, which is the color of a hardened network.
+    first_color = 1 if len(methods) == 1 else 0
+    styles = {method: style(index) for index, method in enumerate(methods, first_color)}
     means = []
     for method, pairs in known.items():
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
@@ -194,28 +194,30 @@ def by_radius(
     title: str,
     x_title: str,
 ) -> Picture:
-    """Plot the fraction of views that stay recognized by the radius of attacks.
+    """Plot which fraction of views is still recognized under attacks of a given radius.
 
     Args:
-        lines: Fraction at each radius, by name. Each second line is of random
-            draws against the network of the line before it.
+        lines: Fraction of the views at each radius, by the name of the line.
+            Each network has two lines in turn: attacks, and random changes of
+            the same radius.
         radii: Radii in ascending order.
         title: Title of the plot.
-        x_title: Title of the radii.
+        x_title: Title of the x axis, which shows the radii.
 
     Returns:
-        The plot, with the radii at equal distances.
+        The plot. The radii stand at equal distances.
     """
     ends = [f"{name} {_percent(values[-1])}" for name, values in lines.items()]
     alt = f"{title}: still recognized at the largest radius: {', '.join(ends)}"
 
     def draw(axes: "Axes") -> None:
         positions = np.arange(len(radii))
-        # One network has the second color, that of networks after hardening.
-        first = 1 if len(lines) <= 2 else 0
+        # A single network gets the second color, which is the color of a hardened network.
+        first_color = 1 if len(lines) <= 2 else 0
         for index, (name, values) in enumerate(lines.items()):
             is_random = index % 2 == 1
-            _draw_fractions(axes, positions, values, name, COLORS[first + index // 2], is_random)
+            color = COLORS[first_color + index // 2]
+            _draw_fractions(axes, positions, values, name, color, is_random)
         axes.set(ylim=(-0.02, 1.02), xlabel=x_title, ylabel="still recognized")
         axes.set_xticks(positions, [f"{radius:g}" for radius in radii])
 
@@ -223,7 +225,7 @@ def by_radius(
 
 
 def _percent(estimate: Estimate) -> str:
-    """Write a fraction in percent, such as "81%", or "-" if it is unknown."""
+    """Write a fraction in percent without its interval, such as "81%", or "-" if it is unknown."""
     return "-" if estimate.value is None else f"{estimate.value:.0%}"
 
 
@@ -235,7 +237,7 @@ def _draw_fractions(
     color: str,
     is_random: bool,
 ) -> None:
-    """Draw the line of the fractions of views that stay recognized.
+    """Draw a line with the fraction of views that is still recognized at each radius.
 
     Args:
         axes: Axes to draw on.
@@ -243,8 +245,8 @@ def _draw_fractions(
         values: Fraction at each radius, with its 95% interval.
         name: Name of the line in the legend.
         color: Color of the line.
-        is_random: Whether the line is of random draws. It is then dotted.
-            Otherwise it is of attacks, and has error bars.
+        is_random: Whether random changes are drawn, as a dotted line. Otherwise
+            attacks are drawn, as a line with error bars.
     """
     heights = np.array([estimate.value for estimate in values], float)
     if is_random:
@@ -252,14 +254,14 @@ def _draw_fractions(
         return
     lows = np.array([estimate.low for estimate in values], float)
     highs = np.array([estimate.high for estimate in values], float)
-    # Rounding can put the lower end just above the fraction, or the upper end
-    # just below it. Error bars must not be negative.
+    # Error bars must not be negative. Rounding errors can put an end of the interval on
+    # the wrong side of the fraction.
     errors = np.stack([heights - lows, highs - heights]).clip(min=0)
     axes.errorbar(positions, heights, errors, color=color, marker="o", ms=4, capsize=3, label=name)
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
-    """Draw a transparent SVG for light and dark pages.
+    """Draw a plot as a transparent SVG, which fits light and dark pages.
 
     Args:
         draw: Function that draws on the axes.
@@ -267,8 +269,8 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
         alt: Description for readers who do not see the plot.
 
     Returns:
-        The plot. A browser shows its text and axes in dark color on light
-        pages, and in light color on dark pages.
+        The plot. Its text and axes are dark on light pages, and light on dark
+        pages.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -280,26 +282,27 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
         draw(axes)
         handles, labels = axes.get_legend_handles_labels()
         if labels:
-            legend = dict(zip(labels, handles, strict=True))  # This keeps each label once.
+            # A dictionary has each label once.
+            legend = dict(zip(labels, handles, strict=True))
             columns = 1 if len(max(labels, key=len)) > 16 else 3
             figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=columns)
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    # The style sheet is inserted before the first definition of the SVG.
+    # The style sheet is inserted before the first element <defs> of the SVG.
     start, tag, rest = file.getvalue().partition("<defs>")
     page = start + STYLE + tag + rest.replace(INK, "currentColor")
     return Picture(page.encode(), "svg+xml", alt, WIDTH, title)
 
 
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
-    """Encode an image, as PNG if it is small, and otherwise as JPEG.
+    """Encode an image for a page: a small image as PNG, a larger one as JPEG.
 
     Args:
         image: The image.
-        alt: A description for readers who do not see it.
-        caption: The text below it.
+        alt: Description for readers who do not see the image.
+        caption: Text below the image.
 
     Returns:
-        The picture, shown at its own size.
+        The encoded image, with one CSS pixel for each pixel.
     """
     file = io.BytesIO()
     if max(image.size) <= SMALL:
@@ -310,21 +313,21 @@ def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
 
 
 def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
-    """Read the image of a file, and reduce it.
+    """Read an image from a file, and encode it for a page.
 
     Args:
         path: The file.
-        alt: A description for readers who do not see it.
-        widest: The width in pixels, at most.
-        caption: The text below it.
+        alt: Description for readers who do not see the image.
+        widest: Largest width in pixels. A wider image is reduced.
+        caption: Text below the image.
 
     Returns:
-        The picture. Nothing if the file is missing or broken.
+        List of one encoded image. Empty if the file is missing or damaged.
     """
     try:
         with Image.open(path) as image:
             pixels = image.convert("RGB")
-    except Exception:  # Pillow's decoders raise almost anything at a broken file.
+    except Exception:  # Pillow raises errors of many types for a damaged file.
         return []
     pixels.thumbnail((widest, 4 * widest))
     return [encoded(pixels, alt, caption)]

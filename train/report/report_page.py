@@ -35,10 +35,10 @@ from train.report.first_screen import (
     NETWORKS,
     Compared,
     FirstScreen,
+    choose_disagreements,
     compare_networks,
-    contrasts,
+    describe_place,
     in_words,
-    place_of,
 )
 from train.report.plots import Picture
 from train.report.summary import Methods, RunSummary, Scored, ScoredRun
@@ -48,21 +48,22 @@ from train.runs.run_log import RENDERS
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, published
 from train.system.user_errors import user_message
 
-# Name of the file.
+# File name of the page.
 PAGE = "report.html"
-# Largest number of methods in plots and comparisons.
+# Largest number of methods in plots and comparisons. A method is a way to train a
+# network.
 MAX_METHODS = 6
-# Largest number of seeds of a method in plots and comparisons.
+# Largest number of runs of a method, with different seeds, in plots and comparisons.
 MAX_SEEDS = 5
 # Largest number of unfinished runs in plots.
 MAX_UNFINISHED = 3
-# Largest number of attacks of which the page shows images.
+# Largest number of attacks for which the page shows images.
 MAX_ATTACKS = 12
-# Largest number of examples of an attack of which the page shows images.
+# Largest number of examples for which the page shows images, of each attack.
 ATTACK_EXAMPLES = 4
-# Number of epochs of which the renders are shown.
+# Largest number of epochs for which the page shows renders.
 SHOWN_EPOCHS = 3
-# Characters at the end of the name of a folder that the legend of a plot shows.
+# The legend of a plot shows this number of characters from the end of a folder's name.
 FOLDER_NAME_LENGTH = 24
 # Largest width of an image with a grid of renders, in pixels.
 GRID_WIDTH = 720
@@ -81,22 +82,24 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         out: Folder that report.html is written to.
 
     Returns:
-        Path of the page. A run or attack that cannot be read is named on it.
+        Path of the page. A run or attack that cannot be read is listed on it.
 
     Raises:
-        InputError: If a folder is missing or none holds a run or an attack.
+        InputError: If a folder is missing, or if no folder holds a run or an
+            attack.
     """
     found = summary.find(folders)
     methods = summary.group_by_method(found.runs)
-    drawn = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
+    # Methods and runs that plots and comparisons show.
+    shown = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
     renders = {}
     examples = {}
-    for method, runs in drawn.items():
+    for method, runs in shown.items():
         first = runs[0]
         if first.epochs:
-            renders[method] = _pictures(first, "epoch", "Renders")
-            examples[method] = _pictures(first, "attacks", "Renders before and after")
-    groups = summary.group_by_images(drawn)
+            renders[method] = _read_renders(first, "epoch", "Renders")
+            examples[method] = _read_renders(first, "attacks", "Renders before and after")
+    groups = summary.group_by_images(shown)
     return write_page(
         out,
         "runs.html.jinja",
@@ -108,13 +111,13 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         tables=[table for table in summary.run_tables(methods, {}) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
-        curves=_curves(_drawn_epochs(drawn, found.unfinished)),
-        seconds=summary.seconds_table(drawn),
+        curves=_plot_metrics(_collect_epochs(shown, found.unfinished)),
+        seconds=summary.seconds_table(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders=renders,
         examples=examples,
         attacks=found.attacks,
-        shown=[_attack(attack) for attack in found.attacks[:MAX_ATTACKS]],
+        shown=[_attack_section(attack) for attack in found.attacks[:MAX_ATTACKS]],
     )
 
 
@@ -126,8 +129,8 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
         folders: Folders that the user named.
 
     Returns:
-        Text with the numbers of networks, unfinished runs and attacks, with the
-        folders, and with the time at which the newest file was written.
+        Text with the numbers of networks, of unfinished runs and of attacks,
+        with the folders, and with the time of the newest file in them.
     """
     counts = []
     if found.runs:
@@ -154,12 +157,13 @@ def _title(found: summary.Findings, methods: Methods) -> str:
 
     Args:
         found: Runs and attacks on the page.
-        methods: Runs of each method. Initial networks count as methods.
+        methods: Runs of each method. An initial network, with whose weights runs
+            began, counts as a method.
 
     Returns:
-        Text with the positive classes. If no method is an initial network, the
-        methods follow. Without any method, the title is "Attacks" or
-        "Unfinished runs".
+        Title with the positive classes and, if the runs began with random
+        weights, with the methods. Without finished runs, the title is "Attacks"
+        or "Unfinished runs".
     """
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
@@ -174,24 +178,23 @@ def _title(found: summary.Findings, methods: Methods) -> str:
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-# For each method, a list of its runs. A run is a list of its epochs, and an epoch
-# is a mapping of metrics by name, from one line of metrics.jsonl.
+# Epochs of the runs of each method. A run is a list of its epochs. An epoch is a mapping
+# with the value of each metric by name, which is a line of metrics.jsonl.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
-def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
-    """Collect the epochs that the plots of metrics show.
+def _collect_epochs(methods: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
+    """Collect the metrics of each epoch that are plotted.
 
     Args:
-        drawn: Finished runs of each method in plots.
+        methods: Finished runs of each method.
         unfinished: Runs that are not finished.
 
     Returns:
         Epochs of the runs of each method. Each of the first MAX_UNFINISHED
-        unfinished runs with epochs is a method of its own, such as
-        "unfinished: FOLDER".
+        unfinished runs counts as a method with the name "unfinished: FOLDER".
     """
-    epochs = {method: [run.epochs for run in runs] for method, runs in drawn.items()}
+    epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
     started = [run for run in unfinished if run.epochs]
     for run in started[:MAX_UNFINISHED]:
         name = run.folder.name[-FOLDER_NAME_LENGTH:]
@@ -200,19 +203,20 @@ def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> E
 
 
 def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
-    """Render a template inside the frame that all pages share, and write it to report.html.
+    """Render a template to HTML, and write it to report.html.
 
     Args:
-        out: Folder of the page. If it does not exist, it is made.
-        body: File name of the template with the sections of the page.
-        script: JavaScript of the page, the only one that a browser runs in it.
-        **content: Values of the template. All pages need `title`, and `about`,
+        out: Folder of the page. If it does not exist, it is created.
+        body: File name of the template with the sections of the page. The
+            template page.html.jinja adds the head and the styles of all pages.
+        script: JavaScript of the page. The browser runs no other script.
+        **content: Values for the template. All pages need `title` and `about`,
             the line below the title.
 
     Returns:
         Path of the page.
     """
-    # Training imports this module, and needs jinja2 only at its end.
+    # This import takes time, and a training run needs it only at its end.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -223,7 +227,7 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
         lstrip_blocks=True,
     )
     environment.filters["as_text"] = as_text
-    environment.filters["command"] = _command
+    environment.filters["command"] = _shell_command
     environment.filters["fraction"] = fraction
     environment.filters["hits"] = format_fraction
     environment.filters["interval"] = format_interval
@@ -237,24 +241,26 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
 
 
 def _sha256(script: str) -> str:
-    """Return the hash by which the content security policy of a page allows its script."""
+    """Return the SHA-256 of a script in base64.
+
+    The content security policy of a page lets the browser run the script with this hash.
+    """
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
     """Write the page of finished runs, and describe it for the console.
 
-    If the page cannot be written, the text says why. No error is raised, since
-    the runs are finished and saved, and their command must not fail.
+    The text says why if the page cannot be written. No error is raised: the runs
+    are finished and saved, so their command must not fail.
 
     Args:
         folders: Folders of the runs.
         out: Folder that report.html is written to.
 
     Returns:
-        Text for the console: the path of the page, below one paragraph that
-        says what hardening changed. The paragraph is absent if the runs have no
-        scores before and after hardening.
+        Text with the path of the page. A paragraph before it says what hardening
+        changed, if the runs have scores before and after hardening.
     """
     try:
         lines = [f"report: {write_report(folders, out)}"]
@@ -267,26 +273,26 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
         return f"no report: {user_message(error) or traceback.format_exc()}"
 
 
-def _command(config: Mapping[str, Any]) -> str:
-    """Return the command line that started a run or an attack.
+def _shell_command(config: Mapping[str, Any]) -> str:
+    """Return the shell commands that repeat a run or an attack.
 
     Args:
         config: Configuration in config.yaml of the run or the attack.
 
     Returns:
-        Lines for a shell: `cd` to the folder in which the command was started,
-        and the command. Empty if the configuration records no command.
+        A line `cd FOLDER`, with the folder in which the command was started, and
+        a line with the command. Empty if the configuration records no command,
+        as in earlier versions.
     """
     folder = config.get("working_folder")
-    # Earlier versions did not record the command.
     command = config.get("command") or ""
     if folder and command:
         return f"cd {shlex.quote(folder)}\n{command}"
     return command
 
 
-def _curves(methods: Epochs) -> list[Picture]:
-    """Plot the metrics in `CURVES` by epoch, and the success of attacks by round of renders.
+def _plot_metrics(methods: Epochs) -> list[Picture]:
+    """Plot accuracies by epoch, and the success of attacks on renders in training.
 
     Args:
         methods: Epochs of the runs of each method.
@@ -296,7 +302,7 @@ def _curves(methods: Epochs) -> list[Picture]:
     """
     pictures = []
     for name, title in CURVES.items():
-        # For each method, a line for each run. Its points are (epoch, metric).
+        # Each run of a method has a line, which is a list of pairs (epoch, metric).
         lines: dict[str, list[plots.Points]] = {}
         for method, runs in methods.items():
             lines[method] = []
@@ -312,41 +318,40 @@ def _curves(methods: Epochs) -> list[Picture]:
 
 
 def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
-    """List the success of attacks in each round of renders of a run.
+    """Read the success rate of the attacks on training renders in each round of a run.
 
-    If an epoch has several rounds, the names of its metrics begin with the
-    number of the round, as in "round_3/attack_success". If it has one round,
-    they begin with "augment/".
+    A round is a part of the training with the same renders. The metrics of the
+    third round of an epoch have names such as "round_3/attack_success". If an
+    epoch has only one round, the names begin with "augment/".
 
     Args:
         epochs: Metrics of each epoch by name.
 
     Returns:
-        For each round of all epochs in turn, the fraction of renders that the
-        attack makes misclassified, among those that were classified correctly
-        before. None if no render was.
+        For each round, in the order of time, the fraction of renders that are
+        misclassified after the attack, among those that are classified correctly
+        before it. None if no render is.
     """
     rates = []
     for epoch in epochs:
-        rounds = {name.partition("/")[0] for name in epoch if name.startswith("round_")}
-        # By number, "round_10" follows "round_9".
-        ordered = sorted(rounds, key=lambda name: int(name.removeprefix("round_")))
+        prefixes = {name.partition("/")[0] for name in epoch if name.startswith("round_")}
+        # The order of the numbers: "round_10" follows "round_9".
+        ordered = sorted(prefixes, key=lambda prefix: int(prefix.removeprefix("round_")))
         for prefix in ordered or ["augment"]:
             rates.append(attack_success(epoch, f"{prefix}/"))
     return rates
 
 
-def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
-    """Read the images of renders of the first, the middle and the last epoch of a run.
+def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
+    """Read images of the training renders of the first, the middle and the last epoch of a run.
 
     Args:
-        run: Finished run.
-        kind: Start of the names of the files, which are renders/KIND_EPOCH.png
-            in the folder of the run.
+        run: Finished run. Its folder has the images renders/KIND_EPOCH.png.
+        kind: KIND in these file names: "epoch" or "attacks".
         title: What the images show, for readers who do not see them.
 
     Returns:
-        An image for each of at most SHOWN_EPOCHS epochs that have this file.
+        An image for each of at most SHOWN_EPOCHS epochs.
     """
     path_of_epoch = {}
     for path in (run.folder / RENDERS).glob(f"{kind}_*.png"):
@@ -361,47 +366,71 @@ def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
 
 
 def _accuracy_sentences(methods: Methods) -> list[str]:
-    """Compare each method with its initial network on the test images, in sentences.
+    """Compare each method with the network that it began with, on the test images.
 
     Args:
         methods: Runs of each method.
 
     Returns:
-        For each method, a sentence with the agreement of both networks if it
-        was measured. Otherwise a sentence with both accuracies. A method that
-        began with random weights has no sentence.
+        A sentence for each method. A method that began with random weights has
+        no sentence.
     """
     sentences = []
     for method, runs in methods.items():
-        agreements = [run.scores.get("test/agreement") for run in runs]
-        agreements_known = [agreement for agreement in agreements if agreement is not None]
-        if agreements_known:
-            agreement = fmean(agreements_known)
-            sentences.append(
-                f"{method}: on photographs that training did not use, the network predicts the "
-                f"same class as the original in {agreement:.1%} of the cases."
-            )
-            continue
-        initial = [run.before.accuracy for run in runs if run.before]
-        known = [accuracy for accuracy in initial if accuracy is not None]
-        if not known:
-            continue
-        before = fmean(known)
-        after = fmean(run.scores["test/accuracy"] for run in runs)
-        images = runs[0].config.get("test_images", "the test images")
-        change = f"accuracy went from {before:.1%} to {after:.1%}"
-        sentences.append(f"{method}: {change} on {images}.")
+        sentence = _agreement_sentence(method, runs) or _accuracy_sentence(method, runs)
+        if sentence is not None:
+            sentences.append(sentence)
     return sentences
 
 
+def _agreement_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
+    """Say how often the predictions of a network are those of the network that it began with.
+
+    Args:
+        method: Name of the method.
+        runs: Runs of the method.
+
+    Returns:
+        The sentence. None if the agreement was not measured.
+    """
+    agreements = [run.scores["test/agreement"] for run in runs if "test/agreement" in run.scores]
+    if not agreements:
+        return None
+    return (
+        f"{method}: on photographs that training did not use, the network predicts the "
+        f"same class as the original in {fmean(agreements):.1%} of the cases."
+    )
+
+
+def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
+    """Say how training changed the accuracy on the test images.
+
+    Args:
+        method: Name of the method.
+        runs: Runs of the method.
+
+    Returns:
+        The sentence. None if the accuracy before the training is unknown.
+    """
+    initial_accuracies = [run.before.accuracy for run in runs if run.before]
+    known = [accuracy for accuracy in initial_accuracies if accuracy is not None]
+    if not known:
+        return None
+    before = fmean(known)
+    after = fmean(run.scores["test/accuracy"] for run in runs)
+    images = runs[0].config.get("test_images", "the test images")
+    return f"{method}: accuracy went from {before:.1%} to {after:.1%} on {images}."
+
+
 def _relit_sentences(methods: Methods) -> list[str]:
-    """Say what each training on relit photographs did.
+    """Say how training on photographs in the light of a projector changed predictions.
 
     Args:
         methods: Runs of each method.
 
     Returns:
-        A sentence for each method that was trained with `experiment=photographs`.
+        A sentence for each method that was trained on such photographs, with
+        `experiment=photographs`.
     """
     sentences = []
     for method, runs in methods.items():
@@ -419,63 +448,61 @@ def _relit_sentences(methods: Methods) -> list[str]:
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
-    """Compare two networks on the first images on which both were scored.
+    """Make the first screen from the first images on which two networks were scored.
 
     Args:
-        groups: Scored runs of each method, by a title of the images.
+        groups: For each set of images, by its title, the runs of each method
+            with their scores on these images.
 
     Returns:
-        The first screen. None if no images were scored by two networks that can
-        be compared.
+        The first screen. None if no two networks can be compared.
     """
-    screens = []
     for group in groups.values():
         with suppress(InputError):
-            screens.append(_compare_on(group))
-    known = [screen for screen in screens if screen is not None]
-    return known[0] if known else None
+            screen = _compare_on(group)
+            if screen is not None:
+                return screen
+    return None
 
 
 def _compare_on(group: Scored) -> FirstScreen | None:
-    """Compare a method with its reference on the images that both were scored on.
+    """Compare two networks on the images that both were scored on.
+
+    If a method began with a trained network, the network of the last such method
+    is compared with it. Otherwise, the network of the last method is compared
+    with that of the first method.
 
     Args:
-        group: Scored runs of each method on the same images.
+        group: Runs of each method with their scores on the same images.
 
     Returns:
-        The first screen. It compares the last method that has an initial
-        network with this network. If no method has one, it compares the last
-        method with the first. None with a single method.
+        The first screen. None if there is only one network.
     """
     evaluations = compare.read_evaluations(group)
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
         return None
-    # Pairs whose reference is an initial network.
-    initial = [pair for pair in pairs if group[pair[1]][0].run.method == summary.INITIAL]
-    method, base = (initial or pairs)[-1]
+    # Pairs of a method and the network that it began with.
+    with_initial = [pair for pair in pairs if group[pair[1]][0].run.method == summary.INITIAL]
+    is_hardening = bool(with_initial)
+    method, base = with_initial[-1] if is_hardening else pairs[-1]
     scored = group[method][0]
-    names = ("before hardening", "after hardening") if initial else (base, method)
-    subjects = NETWORKS if initial else (f"the network “{base}”", f"the network “{method}”")
-    label = join_words([in_words(name) for name in scored.scores.labels], "or")
+    names = ("before hardening", "after hardening") if is_hardening else (base, method)
+    subjects = NETWORKS if is_hardening else (f"the network “{base}”", f"the network “{method}”")
     images = images_folder(scored.run, scored.name)
+    labels = scored.scores.labels
     rows = {}
     if images is not None:
-        rows = contrasts(
-            group[base][0].folder,
-            scored.folder,
-            images,
-            scored.scores.labels,
-            subjects,
-        )
+        folder_before = group[base][0].folder
+        rows = choose_disagreements(folder_before, scored.folder, images, labels, subjects)
     compared = Compared(
-        label=label,
+        label=join_words([in_words(name) for name in labels], "or"),
         before=evaluations[base],
         after=evaluations[method],
         names=names,
         subjects=subjects,
-        change="hardening" if initial else f"“{method}”",
-        place=place_of(images, scored.name),
+        change="hardening" if is_hardening else f"“{method}”",
+        place=describe_place(images, scored.name),
         trained_objects=_classes_with_trained_objects(scored, images),
     )
     return compare_networks(compared, rows)
@@ -501,39 +528,43 @@ def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> lis
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:
-    """Find the folder of the images that a run was scored on.
+    """Find the folder of the images on which a run was scored.
 
     Args:
-        run: A finished run.
-        name: Name of the folder of its scores.
+        run: Finished run.
+        name: Name of the sub-folder of the run with the scores on these images.
 
     Returns:
-        Folder of the images. None if the configuration does not name it, or if
-        it has been moved.
+        Folder of the images. None if the configuration does not name the folder,
+        or if the folder has been moved.
     """
     photos = OmegaConf.select(run.config, "evaluate.photos")
-    named = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
-    folder = named.get(name)
+    folders = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
+    folder = folders.get(name)
     if not folder:
+        # The run may have rendered the images itself.
         rendered = run.folder / KEPT_ASIDE
         return rendered if name == LABORATORY and rendered.is_dir() else None
-    start = run.config.get("working_folder") or ""
-    candidates = (published(Path(folder)), Path(start) / folder)
-    return next(filter(Path.is_dir, candidates), None)
+    working_folder = Path(run.config.get("working_folder") or "")
+    for candidate in (published(Path(folder)), working_folder / folder):
+        if candidate.is_dir():
+            return candidate
+    return None
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
-    """Collect the plots, tables and images of runs that were scored on the same images.
+    """Collect the content of a section of the page about the scores on the same images.
 
     Args:
         title: Title of the images.
-        group: Scored runs of each method, from `summary.group_by_images`.
+        group: Runs of each method with their scores on these images.
 
     Returns:
-        Values of the macro `scores` in page.html.jinja:
+        Mapping for the macro `scores` of the template page.html.jinja:
 
         - "name": the title;
-        - "sheets": contact sheet of the first run of each method;
+        - "sheets": for each method, an image with the scored images of its first
+          run;
         - "rocs": plots of ROC curves;
         - "tables": tables of metrics and of their differences;
         - "problem": why the differences are unknown, or an empty text.
@@ -549,7 +580,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     try:
         evaluations = compare.read_evaluations(group)
         if evaluations:
-            rocs = _rocs(evaluations)
+            rocs = _plot_rocs(evaluations)
             tables += _evaluation_tables(evaluations)
             tables.append(compare.class_table(group))
     except InputError as error:
@@ -563,34 +594,38 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     }
 
 
-def _rocs(methods: compare.Evaluations) -> list[Picture | None]:
-    """Plot the ROC curves of all images and, with several labels, of each label.
+def _plot_rocs(methods: compare.Evaluations) -> list[Picture | None]:
+    """Plot the ROC curves of all methods.
 
     Args:
         methods: Evaluations of each method on the same images.
 
     Returns:
-        A plot with the curves of all methods for all images and for each label.
-        None in place of a plot without positives or without negatives.
+        A plot for all images and, if there are several positive classes, a plot
+        for each of them. None in place of a plot without positive or without
+        negative images.
     """
     first_evaluation = next(iter(methods.values()))[0]
     pictures = []
-    for part, pool in first_evaluation.pools.items():
-        if not part.is_overall:
+    for subset, pool in first_evaluation.pools.items():
+        if not subset.is_overall:
             continue
         scores = {}
         for method, evaluations in methods.items():
-            scores[method] = [evaluation.pools[part].scores for evaluation in evaluations]
+            scores[method] = [evaluation.pools[subset].scores for evaluation in evaluations]
         pictures.append(plots.roc(scores, pool.label))
     return pictures
 
 
 def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
-    """Make the table of differences and, if there are parts of the images, the table of parts.
+    """Make tables of the metrics of methods on the same images.
 
     Args:
-        methods: Evaluations of each method. Each has a pool of all images, and
-            a pool for each label and source, if the images have any.
+        methods: Evaluations of each method.
+
+    Returns:
+        A table of the differences between methods. If the images have several
+        sources or positive classes, a table with rows for each of them follows.
     """
     tables = [compare.overall_differences(methods)]
     first_evaluation = next(iter(methods.values()))[0]
@@ -599,20 +634,20 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     return tables
 
 
-def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
-    """Collect what runs.html.jinja shows of an attack.
+def _attack_section(attack: summary.AttackSummary) -> dict[str, Any]:
+    """Collect the content of a section of the page about an attack.
 
     Args:
-        attack: Attack with a row for each example.
+        attack: Outcome of the attack.
 
     Returns:
-        Mapping with these keys:
+        Mapping for the template runs.html.jinja:
 
         - "folder": folder of the attack;
-        - "rows": rows of all examples;
+        - "rows": a row of a table for each example;
         - "checks": pairs of the name of a check and its result;
         - "images": pictures of some examples, by their title;
-        - "config": configuration of the attack. Empty if there is no file.
+        - "config": settings of the attack. Empty if they are not recorded.
     """
     images = {}
     for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):

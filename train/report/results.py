@@ -19,16 +19,17 @@ from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import METRICS
 from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
-# Files that each command writes to a folder, as patterns of `Path.glob`.
-# `require_replaceable` looks for all of them, and names the first that it finds.
+# Files that each command writes to its output folder, as patterns of `Path.glob`.
+# A command refuses a folder with one of these files.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
 OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
 OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
 OF_FIT = ("light.json", "background.png", "comparison.png")
-# Files that several commands write.
+# Files that most commands write: the configuration and the report.
 SHARED = (CONFIG, PAGE)
+# All of these files.
 RESULTS = (
     *OF_RUN,
     *OF_ATTACK,
@@ -42,18 +43,18 @@ RESULTS = (
 
 
 def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[str] = ()) -> None:
-    """Check that a command would not replace earlier results.
+    """Check that a command would not replace results of an earlier command.
 
     Args:
         path: File or folder that the command will write. It may be missing.
-        key: Setting that names it, for the error message.
+        key: Setting that has the path, for the error message.
         overwrite: Whether the user allows the command to replace results.
-        own: Patterns in RESULTS that the check ignores, because the command
-            continues with the files of these patterns.
+        own: Patterns in RESULTS of files that may be there, because the command
+            continues with them.
 
     Raises:
-        InputError: If `overwrite` is false, and the file exists or the folder
-            holds results of a command.
+        InputError: If the file exists, or if the folder holds results, and
+            `overwrite` is False.
     """
     if overwrite or not path.exists():
         return
@@ -62,7 +63,10 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
             f"{key}={path} exists: choose another file, or set overwrite=true to replace it",
         )
     for pattern in RESULTS:
-        found = None if pattern in own else next(path.glob(pattern), None)
+        if pattern in own:
+            continue
+        # The first file that matches the pattern.
+        found = next(path.glob(pattern), None)
         if found:
             name = found.relative_to(path)
             raise InputError(
@@ -72,24 +76,24 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
 
 
 def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> None:
-    """Check that a training run would not replace earlier results.
+    """Check that a training run would not replace results of an earlier command.
 
-    A folder with a checkpoint passes, because the run itself checks it. A run
-    that ended before its first checkpoint has no results. The same command
-    starts it again.
+    A folder with a checkpoint is accepted here, because the class `Run` checks
+    such a folder. The files of a run that ended before its first checkpoint may
+    be replaced, because they are not results.
 
     Args:
         folder: Folder of the run. It may be missing.
-        key: Setting that names it, for the error message.
+        key: Setting that has the folder, for the error message.
         overwrite: Whether the user allows the command to replace results.
-        resume: Whether the run continues an earlier one.
+        resume: Whether the run continues an earlier run in the folder.
 
     Raises:
-        InputError: See `require_replaceable`.
+        InputError: If the folder holds other results, and `overwrite` is False.
     """
     if checkpoint.exists(folder):
         return
-    # Files of a run that ended before its first checkpoint.
+    # Names of the files that an unfinished run without a checkpoint has written.
     own: tuple[str, ...] = ()
     if _is_of_training(folder) and not is_finished(folder):
         own = (CONFIG, METRICS)
@@ -99,7 +103,7 @@ def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> No
 
 
 def _is_of_training(folder: Path) -> bool:
-    """Return whether pnb-train wrote the configuration in a folder."""
+    """Return whether the config.yaml in a folder is the configuration of a training run."""
     with suppress(InputError):
         return isinstance(read_config(folder / CONFIG).get("train"), Mapping)
     return False

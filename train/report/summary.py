@@ -29,33 +29,35 @@ from train.runs.run_log import BEFORE, PHASES, read_metrics
 from train.runs.saved_networks import PUBLISHED, load_selected
 from train.settings import label_names, published
 
-# Number of methods up to which they are named by their settings.
+# With more methods than this, methods are named by numbers instead of by their settings.
 MAX_NAMED = 30
-# Characters of the longest such name.
+# A method whose settings need a longer name than this is named by a number.
 LONGEST_NAME = 56
-# Name of a network that runs began with, in place of that of a method.
+# Method of a network with whose weights runs began.
 INITIAL = "the initial network"
-# Names of both networks if nothing but one method with renders is compared with
-# the network that it began with.
+# Names of two networks in tables: a network that was trained with renders, and the
+# network with whose weights it began.
 BEFORE_HARDENING = "before hardening"
 AFTER_HARDENING = "after hardening"
 
 
 @dataclass(frozen=True)
 class PhotographScores:
-    """Scores on one folder of photographs, as summary.json or a published network has them.
+    """Scores of a network on one folder of photographs.
+
+    They are read from summary.json, or from the file of a published network.
 
     Attributes:
-        images: Hash of the photographs. It is equal where two networks were
-            scored on the same ones.
-        labels: Classes under study.
-        metrics: Each metric in `METRICS` by name. None if the scores lack it.
-        by_label: The metrics of each label, by label and by name of the
-            metric. Empty with a single label.
-        thresholds: Threshold of the log-odds by label. Empty without an
-            operating point.
-        operating_point: How the thresholds were chosen, in words. Empty without
-            an operating point.
+        images: Hash of the photographs. Two networks were scored on the same
+            photographs if the hashes are equal.
+        labels: Positive classes.
+        metrics: Each metric in `METRICS` by name. None if it is unknown.
+        by_label: The metrics of each positive class by the name of the class.
+            Empty if there is only one positive class.
+        thresholds: Threshold on the log-odds of each positive class. Empty if
+            none was chosen.
+        operating_point: How the thresholds were chosen, in words. Empty if none
+            was chosen.
     """
 
     images: str
@@ -67,17 +69,17 @@ class PhotographScores:
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> "PhotographScores":
-        """Read scores from the entries of a file. Files of older versions lack some entries.
+        """Read scores from a mapping, also if an earlier version wrote it with fewer entries.
 
         Args:
-            summary: Contents of summary.json, or the entries that
-                `to_published` returned.
+            summary: Contents of summary.json, or the mapping that `to_published`
+                returned.
 
         Returns:
-            Scores of one folder of photographs.
+            Scores on one folder of photographs.
 
         Raises:
-            Exception: Of any kind, if an entry is missing or damaged.
+            Exception: An error of any type, if an entry is missing or damaged.
         """
         labels = label_names(summary.get("label", ""))
         points = operating_points(summary)
@@ -94,7 +96,11 @@ class PhotographScores:
         )
 
     def to_published(self) -> dict[str, Any]:
-        """Convert the scores to entries that a published network carries."""
+        """Convert the scores to a mapping for the file of a published network.
+
+        Returns:
+            Mapping from which `read` reads the scores.
+        """
         has_several = len(self.labels) > 1
         entries: dict[str, Any] = {
             "images": self.images,
@@ -113,13 +119,14 @@ class PhotographScores:
 
 
 def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
-    """Read the metrics of summary.json, or of one label in it.
+    """Read the metrics on all photographs, or on those for one positive class.
 
     Args:
-        summary: Contents of summary.json, or an entry below "by_label".
+        summary: Contents of summary.json, or of the entry of one positive class
+            in it.
 
     Returns:
-        Each metric in `METRICS` by name. None if the entry lacks it.
+        Each metric in `METRICS` by name. None if the contents lack it.
     """
     return {name: read_metric(summary, name) for name in METRICS}
 
@@ -142,20 +149,24 @@ def _published(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, An
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A finished run, or a network with scores alone.
+    """Settings and scores of a finished training run, or of a network without a run.
+
+    A published network, and a network that pnb-evaluate scored, have no run.
 
     Attributes:
-        folder: Folder of the run.
-        method: Name of its renders, or of the network.
-        settings: Settings that decide its result, by dotted key.
-        photographs: Scores by the name of their sub-folder.
+        folder: Folder of the run or of the network.
+        method: Kind of renders in the training, such as "adversarial". Without a
+            run, the name of the network.
+        settings: Settings that decide the result, by dotted key.
+        photographs: Scores on photographs, by the name of the sub-folder of
+            `folder` that holds them.
         accuracy: Accuracy on the test images. None if it was not measured.
         seed: Seed of the run. None without a run.
-        config: Configuration of the run.
-        epochs: Lines of metrics.jsonl, one for each epoch.
-        scores: Last line of metrics.jsonl.
-        before: Network that the run began with. None if it began with random
-            weights.
+        config: All settings of the run.
+        epochs: Metrics of each epoch by name.
+        scores: Final scores by name.
+        before: Network with whose weights the run began. None if it began with
+            random weights.
     """
 
     folder: Path
@@ -170,16 +181,16 @@ class RunSummary:
     before: "RunSummary | None" = None
 
 
-# Runs by the name of their method.
+# The runs of each method, by the name of the method. They differ in their seed.
 Methods = Mapping[str, Sequence[RunSummary]]
 
 
 class ScoredRun(NamedTuple):
-    """A run and one of its folders of scores.
+    """A run, and the scores of its network on one folder of photographs.
 
     Attributes:
-        run: Run that was scored.
-        name: Name of the sub-folder.
+        run: The run.
+        name: Name of the sub-folder of the run with these scores.
     """
 
     run: RunSummary
@@ -187,44 +198,46 @@ class ScoredRun(NamedTuple):
 
     @property
     def scores(self) -> PhotographScores:
-        """Scores in this folder."""
+        """Scores in this sub-folder."""
         return self.run.photographs[self.name]
 
     @property
     def folder(self) -> Path:
-        """Folder of the scores."""
+        """Path of this sub-folder."""
         return self.run.folder / self.name
 
 
-# The scored runs of each method.
+# The runs of each method with their scores on the same images.
 Scored = Mapping[str, Sequence[ScoredRun]]
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether a folder holds a run with its final scores.
+    """Return whether a folder holds a finished run, which has its final scores.
 
     Args:
         folder: Folder of a run.
 
     Returns:
-        Whether the last line of metrics.jsonl has the scores.
+        Whether the last line of metrics.jsonl has final scores. All lines before
+        it have the number of an epoch.
     """
     lines = read_metrics(folder)
     return bool(lines) and "epoch" not in lines[-1]
 
 
 def summarize(folder: Path) -> RunSummary:
-    """Read a finished run, an evaluation of pnb-evaluate, or a published network.
+    """Read the settings and scores in the folder of a run, an evaluation or a published network.
 
     Args:
-        folder: Folder that one of these commands wrote.
+        folder: Folder of a finished run, of the scores that pnb-evaluate wrote,
+            or of a published network. "pretrained/best" is installed.
 
     Returns:
         Settings and scores.
 
     Raises:
-        InputError: If the folder lacks these, or if a file lacks an entry of
-            the tables.
+        InputError: If the folder holds none of the three, or if a file is
+            damaged.
     """
     folder = published(folder)
     try:
@@ -232,7 +245,7 @@ def summarize(folder: Path) -> RunSummary:
     except InputError:
         raise
     except Exception as error:
-        # Entries may be missing or of any type.
+        # An entry that is missing or of a wrong type raises errors of many types.
         files = f"{CONFIG}, {run_log.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {single_line(error)}"
         raise InputError(
@@ -240,47 +253,51 @@ def summarize(folder: Path) -> RunSummary:
         ) from error
     if summary is None:
         raise InputError(
-            f"{folder} holds no finished run: let it finish, or resume it",
+            f"{folder} holds no finished run: let its run finish or resume it, "
+            "or give another folder",
         )
     return summary
 
 
 def _read(folder: Path) -> RunSummary | None:
-    """Read a finished run, an evaluation or a published network.
+    """Read the settings and scores in a folder.
 
     Args:
-        folder: Folder that may hold one of the three.
+        folder: Folder of a finished run, of the scores that pnb-evaluate wrote,
+            or of a published network.
 
     Returns:
-        The settings and scores. None if the folder holds none of the three.
+        Settings and scores. None if the folder is none of the three.
     """
-    whole = folder.absolute()
-    # An evaluation and a published network have no settings of a training.
-    # The last two parts of the path are the name of the method.
-    name = str(Path(*whole.parts[-2:]))
-    settings = {"network": str(whole)}
     if is_finished(folder):
         return _read_run(folder)
+    path = folder.absolute()
+    # A network without a run has the last two parts of its path as a name.
+    name = str(Path(*path.parts[-2:]))
+    settings = {"network": str(path)}
     if (folder / SUMMARY).is_file():
-        scores = {whole.name: PhotographScores.read(read_json(folder / SUMMARY))}
-        return RunSummary(whole.parent, name, settings, scores, accuracy=None)
+        scores = {path.name: PhotographScores.read(read_json(folder / SUMMARY))}
+        return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
-        values = load_selected(folder)[1].get("scores", {})
-        # The other values are single numbers, such as "test/accuracy".
-        entries = {key: value for key, value in values.items() if isinstance(value, dict)}
-        scores = {key: PhotographScores.read(entry) for key, entry in entries.items()}
-        return RunSummary(folder, name, settings, scores, values.get("test/accuracy"))
+        stored = load_selected(folder)[1].get("scores", {})
+        scores = {}
+        for key, value in stored.items():
+            # Scores on photographs are mappings. The test accuracy is a number.
+            if isinstance(value, dict):
+                scores[key] = PhotographScores.read(value)
+        return RunSummary(folder, name, settings, scores, stored.get("test/accuracy"))
     return None
 
 
 def _read_run(folder: Path) -> RunSummary:
-    """Read a finished run and, if there is one, the network that it began with.
+    """Read a finished run, and the scores of the network with whose weights it began.
 
     Args:
         folder: Folder of the run, with config.yaml and metrics.jsonl.
 
     Returns:
-        The run. Its field `before` has the scores of the initial network.
+        The run. Its field `before` has the network before the training, if that
+        was a trained network.
     """
     # Each line of metrics.jsonl is an epoch. The last line has the final scores.
     *epochs, scores = read_metrics(folder)
@@ -310,13 +327,13 @@ def _read_run(folder: Path) -> RunSummary:
 
 
 def read_summaries(folder: Path) -> dict[str, PhotographScores]:
-    """Read the scores in the sub-folders of a run's folder.
+    """Read the scores on photographs in all sub-folders of a folder.
 
     Args:
-        folder: Folder of a run.
+        folder: Folder of a run, or of the scores of its initial network.
 
     Returns:
-        Scores by the name of their sub-folder.
+        Scores by the name of the sub-folder.
     """
     summaries = {}
     for path in sorted(folder.glob(f"*/{SUMMARY}")):
@@ -331,33 +348,38 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
         runs: Runs that are compared.
 
     Returns:
-        The setting in words by its key, without the method and the seed, which
-        tables always show.
+        Name of each such setting in words, by its dotted key. The kind of
+        renders and the seed are left out, because tables always show them.
     """
     keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
     varied = {}
     for key in sorted(keys):
-        if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs):
+        values = [run.settings.get(key) for run in runs]
+        if any(value != values[0] for value in values):
+            # "train.learning_rate" becomes "learning rate".
             words = re.sub(r"^(augment|train|scene|renderer|evaluate)\.|[._]", " ", key)
             varied[key] = words.strip()
     return varied
 
 
 def group_by_method(runs: Sequence[RunSummary]) -> Methods:
-    """Group runs that differ only in the seed.
+    """Group runs that differ only in the seed, and name each group.
 
     Args:
-        runs: Runs, which may have begun with other networks.
+        runs: Finished runs and networks without a run.
 
     Returns:
-        Runs by the name of their method. The networks that they began with come
-        first, once. A name has the method and the settings in which its groups
-        differ, or a number and the method if those are many or long.
+        The runs of each method, by the name of the method. The networks with
+        whose weights runs began come first, each once. The name of a method has
+        the kind of renders, and the settings in which methods with the same kind
+        of renders differ. If there are many such settings, a number replaces
+        them.
     """
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*_initial_networks(runs), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
+    # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
     if len(heads) == 2 and heads[0].method == INITIAL and heads[1].method != "none":
         return dict(zip((BEFORE_HARDENING, AFTER_HARDENING), groups.values(), strict=True))
@@ -366,43 +388,59 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
         varied[method] = varied_settings([head for head in heads if head.method == method])
     named: dict[str, list[RunSummary]] = {}
     for number, group in enumerate(groups.values(), 1):
-        head = group[0]
-        parts = [f"{words}={head.settings.get(key)}" for key, words in varied[head.method].items()]
-        name = ", ".join([head.method, *parts])
+        name = _name_by_settings(group[0], varied[group[0].method])
         is_short = len(heads) <= MAX_NAMED and len(name) <= LONGEST_NAME
         if not is_short or name in named:
-            name = f"{number}: {head.method}"
+            name = f"{number}: {group[0].method}"
         named[name] = group
     return named
 
 
-def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
-    """List the networks that runs began with.
+def _name_by_settings(run: RunSummary, varied: Mapping[str, str]) -> str:
+    """Name a method by the kind of renders and by some of its settings.
 
     Args:
-        runs: Runs, several of which may have begun with the same network.
+        run: Run of the method.
+        varied: Settings in the name: their names in words by dotted key.
 
     Returns:
-        The initial networks in the order of the runs. Two initial networks are
-        the same if their settings and the images that they were scored on are
-        equal. Runs that began with random weights have none.
+        Name such as "adversarial, epochs=5".
+    """
+    values = [f"{words}={run.settings.get(key)}" for key, words in varied.items()]
+    return ", ".join([run.method, *values])
+
+
+def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
+    """List the networks with whose weights runs began, each network once.
+
+    Two networks are the same if they have the same settings and were scored on
+    the same images.
+
+    Args:
+        runs: Finished runs. A run that began with random weights has no initial
+            network.
+
+    Returns:
+        The initial networks in the order of the runs.
     """
     networks = {}
     for run in runs:
         if run.before:
             images = [scores.images for scores in run.before.photographs.values()]
-            networks[repr((run.before.settings, images))] = run.before
+            identity = repr((run.before.settings, images))
+            networks[identity] = run.before
     return [*networks.values()]
 
 
 def group_by_images(methods: Methods) -> dict[str, Scored]:
-    """Group runs by the images that they were scored on.
+    """Group runs by the images on which they were scored.
 
     Args:
         methods: Runs of each method.
 
     Returns:
-        Scored runs of each method, by a title of the images.
+        For each set of images, by its title, the runs of each method with their
+        scores on these images.
     """
     groups: dict[str, dict[str, list[ScoredRun]]] = {}
     for method, runs in methods.items():
@@ -420,19 +458,20 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
 
 
 def _title_of(group: Scored) -> str:
-    """Name the images that a group of networks was scored on.
+    """Write a title for the images on which a group of networks was scored.
 
     Args:
-        group: Scored runs of each method, all on the same images.
+        group: Runs of each method with their scores on these images.
 
     Returns:
         Name of the sub-folder of the scores. The numbers of positive and
-        negative images follow if the AUC of the first run records the numbers.
+        negative images follow if they are known.
     """
     members = [scored for scored_runs in group.values() for scored in scored_runs]
-    # A trained run is preferred, because its settings name the sub-folder.
-    # Only a trained run has epochs.
-    first = next((scored for scored in members if scored.run.epochs), members[0])
+    # The user has chosen the names of the sub-folders of a training run. Only a
+    # training run has epochs.
+    of_training = [scored for scored in members if scored.run.epochs]
+    first = of_training[0] if of_training else members[0]
     auc = first.scores.metrics["auc"]
     if not isinstance(auc, AreaUnderCurve):
         return first.name
@@ -453,36 +492,53 @@ def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
 
     Args:
         methods: Runs of each method.
-        groups: Scored runs by a title of the images, as `group_by_images` groups them.
+        groups: For each set of images, by its title, the runs of each method
+            with their scores on these images.
 
     Returns:
-        Table of the accuracy, a table for each group, and a table of the
-        settings in which the methods differ, if there are any. They have a row per
-        run and, below several seeds of a method, one with their mean ± standard
-        deviation.
+        A table of the accuracy, and a table of the scores on each set of images.
+        They have a row for each run and, if a method has several seeds, a row
+        with their mean ± standard deviation. If the settings of the methods
+        differ, a table of these settings follows.
     """
     tables = [_accuracy_table(methods)]
     tables += [score_table(title, group) for title, group in groups.items()]
-    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
-    varied = varied_settings([*heads.values()])
-    if varied:
-        header = ["network", *varied.values()]
-        rows = []
-        for method, head in heads.items():
-            rows.append([method, *(str(head.settings.get(key)) for key in varied)])
-        tables.append(Table("settings in which the methods differ", header, rows))
+    settings = _settings_table(methods)
+    if settings.rows:
+        tables.append(settings)
     return tables
 
 
-def _accuracy_table(methods: Methods) -> Table:
-    """Make the table of the accuracy on the test images.
+def _settings_table(methods: Methods) -> Table:
+    """Make a table of the settings in which methods differ.
 
     Args:
         methods: Runs of each method.
 
     Returns:
-        Table with two columns: the accuracy of the selected epoch, and the
-        accuracy of the last epoch. Methods without an accuracy have no row.
+        Table with a row for each method and a column for each setting. It has no
+        rows if the settings are the same.
+    """
+    # The first run of each method. Networks without a run have no settings of a training.
+    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
+    varied = varied_settings([*heads.values()])
+    rows = []
+    if varied:
+        for method, head in heads.items():
+            rows.append([method, *(str(head.settings.get(key)) for key in varied)])
+    return Table("settings in which the methods differ", ["network", *varied.values()], rows)
+
+
+def _accuracy_table(methods: Methods) -> Table:
+    """Make a table of the accuracy of each run on the test images.
+
+    Args:
+        methods: Runs of each method.
+
+    Returns:
+        Table with the accuracy of the network that the training selected, and
+        with the accuracy of the network after the last epoch. Methods without an
+        accuracy have no row.
     """
     lines: dict[str, list[Line]] = {}
     test_images = []
@@ -504,18 +560,19 @@ def score_table(title: str, group: Scored) -> Table:
 
     Args:
         title: Title of the table.
-        group: Scored runs of each method, as `group_by_images` groups them.
+        group: Runs of each method with their scores on these images.
 
     Returns:
-        Table with a row for each run and, with several labels, for each label.
+        Table with a row for each run. With several positive classes, it also has
+        a row for each run and each of these classes.
     """
     lines: dict[str, list[Line]] = {}
     for method, scored_runs in group.items():
         for scored in scored_runs:
-            parts = {method: scored.scores.metrics}
+            metrics_of_row = {method: scored.scores.metrics}
             for label, metrics in scored.scores.by_label.items():
-                parts[f"{method}, {label_title(label)}"] = metrics
-            for name, metrics in parts.items():
+                metrics_of_row[f"{method}, {label_title(label)}"] = metrics
+            for name, metrics in metrics_of_row.items():
                 line = (scored.run.seed, [metrics[metric] for metric in METRICS])
                 lines.setdefault(name, []).append(line)
     points = {scored.scores.operating_point for runs in group.values() for scored in runs}
@@ -526,28 +583,21 @@ def score_table(title: str, group: Scored) -> Table:
 
 
 def label_title(label: str) -> str:
-    """Return the title of the row of a label in tables.
-
-    Args:
-        label: Class under study.
-
-    Returns:
-        Title such as "label=orange".
-    """
+    """Return the title of the row of a positive class in tables, such as "label=orange"."""
     return f"label={label}"
 
 
 def seconds_table(methods: Methods) -> Table:
-    """Make a table of the seconds of an epoch.
+    """Make a table of the time that an epoch of each method takes.
 
     Args:
         methods: Runs of each method.
 
     Returns:
-        Table with a row for the first run of each method. A cell is a mean over
-        the epochs of this run. The columns are all phases together, each phase,
-        the time of the classifier within the attack, and the operators, which
-        are computed once in a run.
+        Table with a row for each method. Cells are means over the epochs of its
+        first run, in seconds. The columns are the whole epoch, each phase of it
+        (such as "training"), the passes through the classifier within attacks,
+        and the operators from light to image, which are computed once in a run.
     """
     titles = {phase: phase.replace("_", " and ") for phase in PHASES}
     titles["attack_classifier"] = "attack: in the classifier"
@@ -563,11 +613,12 @@ def seconds_table(methods: Methods) -> Table:
 
 
 def _mean_seconds(run: RunSummary, phase: str) -> float | None:
-    """Average the seconds of a phase over the epochs of a run.
+    """Average the seconds that a phase of an epoch takes over the epochs of a run.
 
     Args:
-        run: Run with a mapping of metrics for each epoch.
-        phase: Name of the phase. The metric "seconds/PHASE" holds its seconds.
+        run: Run with its metrics.
+        phase: Name of the phase, such as "training". The metric "seconds/PHASE"
+            has its seconds.
 
     Returns:
         Mean over the epochs that record this phase. None if no epoch does.
@@ -586,14 +637,14 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
 
     Args:
         title: Title of the table.
-        header: Titles of the columns of metrics.
-        lines: For each method, the seed and the metrics of each of its runs.
-            The metrics have the order of `header`.
+        header: Titles of the columns that have metrics.
+        lines: For each method, a pair for each of its runs: the seed, and the
+            metrics in the order of `header`.
 
     Returns:
-        Table with the columns "network", "seed" and those of `header`. Below
-        several seeds of a method, one more row has the mean ± standard
-        deviation of each metric.
+        Table with the columns "network", "seed" and those of `header`. If a
+        method has several seeds, a row with the mean ± standard deviation of
+        each metric follows the rows of its runs.
     """
     rows = []
     for method, runs in lines.items():
@@ -601,20 +652,20 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
             cells = map(format_interval, metrics)
             rows.append([method, "" if seed is None else str(seed), *cells])
         if len({seed for seed, _ in runs}) > 1:
-            # Each entry of `columns` has one metric of all runs.
+            # A column has the values of one metric in all runs of the method.
             columns = zip(*(metrics for _, metrics in runs), strict=True)
-            rows.append([method, f"{len(runs)} seeds", *map(_spread, columns)])
+            rows.append([method, f"{len(runs)} seeds", *map(_format_spread, columns)])
     return Table(title, ["network", "seed", *header], rows)
 
 
-def _spread(metrics: Sequence[Estimate | None]) -> str:
+def _format_spread(metrics: Sequence[Estimate | None]) -> str:
     """Write the mean and the standard deviation of a metric over runs.
 
     Args:
-        metrics: The same metric of each run. None if a run lacks it.
+        metrics: The metric of each run. None if it is unknown for a run.
 
     Returns:
-        Text such as "0.912 ± 0.004", or "-" if a run lacks the metric.
+        Text such as "0.912 ± 0.004", or "-" if the metric of a run is unknown.
     """
     values = [metric.value for metric in metrics if metric is not None and metric.value is not None]
     if len(values) < len(metrics):
@@ -623,13 +674,13 @@ def _spread(metrics: Sequence[Estimate | None]) -> str:
 
 
 class ExampleRow(NamedTuple):
-    """Row of a table about an example of an attack.
+    """Row of a table about an example, which an attack changes to fool a classifier.
 
     Attributes:
         number: Number of the example.
-        label: Class of the example, or the classes of its views.
-        before: Predicted class of each view before the attack, with its
-            probability.
+        label: True class of the example, or the true classes of its views.
+        before: Predicted class of each view and its probability before the
+            attack, such as "81.0% orange, 55.3% lemon".
         after: The same after the attack.
         outcome: Success or failure in words, such as "success in 12 steps".
     """
@@ -648,12 +699,13 @@ class AttackSummary:
     Attributes:
         folder: Folder of the attack.
         rows: A row for each attacked example.
-        successes: Number of examples that are misclassified after the attack,
-            also with a sensor's noise. Attacks of earlier versions counted
-            without noise.
-        without_noise: The same number for images without noise.
-        correct: Number of examples that were classified correctly before the
-            attack. Only these examples can be successes.
+        successes: Number of examples that are misclassified after the attack, in
+            images with the simulated noise of a sensor. Attacks of earlier
+            versions of the library had no noise.
+        without_noise: Number of examples that are misclassified after the attack
+            in images without noise.
+        correct: Number of examples that are classified correctly before the
+            attack. Only these examples count as successes.
         checks: Results of `nb.check` by name.
     """
 
@@ -666,22 +718,23 @@ class AttackSummary:
 
 
 def read_attack(folder: Path) -> AttackSummary:
-    """Read the folder of an attack.
+    """Read the outcome of an attack from its folder.
 
     Args:
         folder: Folder with attack.jsonl.
 
     Returns:
-        Its examples and the number of successes.
+        Examples, numbers of successes, and checks.
 
     Raises:
-        InputError: If no attack wrote the file.
+        InputError: If attack.jsonl is damaged, or if no attack wrote it.
     """
     path = folder / LINES
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        # A line describes an example or, with the key "checks", the whole attack.
+        # A line has the key "example" or, if it is about the whole attack, "checks".
         examples = [line for line in lines if "example" in line]
+        checks = [dict(line["checks"]) for line in lines if "checks" in line]
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(
             folder=folder,
@@ -689,12 +742,13 @@ def read_attack(folder: Path) -> AttackSummary:
             successes=sum(bool(line["success"]) for line in correct),
             without_noise=sum(_is_success_without_noise(line) for line in correct),
             correct=len(correct),
-            checks=next((dict(line["checks"]) for line in lines if "checks" in line), {}),
+            checks=checks[0] if checks else {},
         )
     except Exception as error:
-        # JSON of any depth and type raises errors of many kinds.
+        # A file with other contents than expected raises errors of many types.
         raise InputError(
-            f"{path} is damaged or was written by no attack ({single_line(error)})",
+            f"{path} is damaged or was written by no attack ({single_line(error)}): "
+            "use the folder of another attack",
         ) from error
 
 
@@ -702,30 +756,30 @@ def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
     """Return whether the attack on an example succeeds in images without noise.
 
     Args:
-        line: Line of attack.jsonl. Earlier versions have only the key
-            "success", which was measured without noise.
+        line: Line of the example in attack.jsonl. Files of earlier versions have
+            only the key "success", which was measured without noise.
     """
     return bool(line.get("success_without_noise", line["success"]))
 
 
 def _example_row(line: Mapping[str, Any]) -> ExampleRow:
-    """Make the table row of an example from its line in attack.jsonl.
+    """Make the row of a table about an example.
 
     Args:
-        line: Line of the example. "label", "predicted" and "confidence" hold
-            a list with one entry for each view.
+        line: Line of the example in attack.jsonl. The values of "label",
+            "predicted" and "confidence" are lists with an item for each view.
     """
     return ExampleRow(
         number=int(line["example"]),
-        # A class that several views share is named once.
+        # A dictionary has a class once if several views show it.
         label=", ".join(dict.fromkeys(map(str, line["label"]))),
-        before=_predicted(line["predicted_before"], line["confidence_before"]),
-        after=_predicted(line["predicted"], line["confidence"]),
-        outcome=_outcome(line),
+        before=_format_predictions(line["predicted_before"], line["confidence_before"]),
+        after=_format_predictions(line["predicted"], line["confidence"]),
+        outcome=_describe_outcome(line),
     )
 
 
-def _predicted(names: Sequence[str], probabilities: Sequence[float]) -> str:
+def _format_predictions(names: Sequence[str], probabilities: Sequence[float]) -> str:
     """Write the predicted class of each view with its probability.
 
     Args:
@@ -739,7 +793,7 @@ def _predicted(names: Sequence[str], probabilities: Sequence[float]) -> str:
     return ", ".join(f"{probability:.1%} {name}" for name, probability in pairs)
 
 
-def _outcome(line: Mapping[str, Any]) -> str:
+def _describe_outcome(line: Mapping[str, Any]) -> str:
     """Say whether the attack on an example succeeded, and in how many steps.
 
     Args:
@@ -762,9 +816,9 @@ class Unfinished(NamedTuple):
     """A run that is not finished, or a folder that cannot be read.
 
     Attributes:
-        folder: Its folder.
-        state: Its state in words, or why it cannot be read.
-        epochs: Lines of its epochs in metrics.jsonl.
+        folder: The folder.
+        state: State of the run in words, or why the folder cannot be read.
+        epochs: Metrics of each finished epoch by name.
     """
 
     folder: Path
@@ -777,11 +831,10 @@ class Findings:
     """Runs and attacks that were found in folders.
 
     Attributes:
-        runs: Finished runs and scored networks, ordered by method, so that the
-            others are compared with `none`, or with a network that no run
-            trained.
+        runs: Networks without a run, and then finished runs, those without
+            renders first. Tables compare all others with the first one.
         attacks: Attacks.
-        unfinished: Other runs.
+        unfinished: Runs that are not finished, and folders that cannot be read.
     """
 
     runs: list[RunSummary] = field(default_factory=list)
@@ -790,23 +843,26 @@ class Findings:
 
 
 def find(folders: Sequence[Path]) -> Findings:
-    """Find runs and attacks.
+    """Find the runs and attacks in folders and in all folders below them.
 
     Args:
-        folders: Folders of runs and attacks, or folders that hold them.
+        folders: Folders of runs and attacks, or folders that contain them.
 
     Returns:
-        What is in the folders and below them.
+        Runs and attacks.
 
     Raises:
-        InputError: If the folder is missing, or if nothing is found.
+        InputError: If a folder does not exist, or if there is no run and no
+            attack.
     """
+    # A dictionary has each folder once.
+    paths: dict[Path, None] = {}
     for folder in folders:
         if not folder.is_dir():
             raise InputError(
-                f"runs: {folder} is not a folder: give those of runs, of a sweep or of attacks",
+                f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks",
             )
-    paths = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
+        paths.update(dict.fromkeys(_walk(folder)))
     if not paths:
         names = ", ".join(map(str, folders))
         raise InputError(f"runs: {names} holds no run and no attack: give other folders")
@@ -815,7 +871,7 @@ def find(folders: Sequence[Path]) -> Findings:
         try:
             _add(found, path)
         except (InputError, OSError) as error:
-            # The lock in another user's folder raises OSError.
+            # OSError is raised if the folder belongs to another user.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
     methods = [*MODES]
     found.runs.sort(key=lambda run: methods.index(run.method) if run.method in methods else -1)
@@ -823,12 +879,11 @@ def find(folders: Sequence[Path]) -> Findings:
 
 
 def _add(found: Findings, path: Path) -> None:
-    """Read a folder, and append its content to a list of the findings.
+    """Read a folder, and add its run or attack to the findings.
 
     Args:
-        found: Findings, which are changed.
-        path: Folder of an attack, a scored network, or a run. A run that is not
-            finished goes to `found.unfinished`.
+        found: Findings, one list of which is extended.
+        path: Folder of an attack, of the scores of a network, or of a run.
     """
     if (path / LINES).is_file():
         found.attacks.append(read_attack(path))
@@ -840,21 +895,24 @@ def _add(found: Findings, path: Path) -> None:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """Yield the folders of runs, attacks and evaluations in a folder and below it.
+    """Yield a folder and all folders below it that hold a run, an attack or scores.
 
-    The sub-folders of a run that hold its own scores are left out, because the
-    run is shown with these scores.
+    Sub-folders with the scores of a run are left out, because the run includes
+    these scores.
+
+    Args:
+        folder: Folder to search.
     """
-    of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
-    of_others = {LINES, SUMMARY, PUBLISHED}
-    for root, below, files in os.walk(folder):
+    files_of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
+    files_of_others = {LINES, SUMMARY, PUBLISHED}
+    for root, subfolders, file_names in os.walk(folder):
         path = Path(root)
-        names = set(files)
-        below.sort()
-        is_run = bool(names & of_run)
+        names = set(file_names)
+        subfolders.sort()
+        is_run = bool(names & files_of_run)
         if is_run:
-            evaluations = {name for name in below if (path / name / SUMMARY).is_file()}
-            # os.walk visits the folders that stay in this list.
-            below[:] = [name for name in below if name != BEFORE and name not in evaluations]
-        if is_run or names & of_others or names >= {CONFIG, "train.log"}:
+            scored = {name for name in subfolders if (path / name / SUMMARY).is_file()}
+            # os.walk continues with the folders that stay in this list.
+            subfolders[:] = [name for name in subfolders if name not in {BEFORE, *scored}]
+        if is_run or names & files_of_others or names >= {CONFIG, "train.log"}:
             yield path

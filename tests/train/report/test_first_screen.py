@@ -16,7 +16,7 @@ from train.evaluation.scores.predictions import (
     write_predictions,
 )
 from train.report.comparison import Evaluation, pools_of
-from train.report.first_screen import NETWORKS, Compared, compare_networks, contrasts
+from train.report.first_screen import NETWORKS, Compared, choose_disagreements, compare_networks
 from train.report.summary import RunSummary
 
 # Classes of the images, and the classes that two networks predict.
@@ -44,7 +44,7 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
     before = write(tmp_path / "before", BEFORE)
     after = write(tmp_path / "after", AFTER)
-    gained, lost = contrasts(before, after, tmp_path, LABELS).values()
+    gained, lost = choose_disagreements(before, after, tmp_path, LABELS).values()
     # The third image is wrong twice, and the last one is right twice.
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
