@@ -652,7 +652,7 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
     if len(found) > 1:
         first, second = (next(iter(group.values()))[0].folder for group in found[:2])
         raise InputError(
-            f"{second} has scores for other photographs or sources than {first}: "
+            f"{second} has other photographs or sources than {first}: "
             "score both networks on the same folder with pnb-evaluate",
         )
     if not found and photographs != PHOTOGRAPHS:
