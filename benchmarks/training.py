@@ -103,6 +103,7 @@ def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, 
         "data=npz",
         f"data.path={options.data}",
         "data.validation=0.05",
+        f"label={options.label}",
         f"scene.meshes={options.meshes}",
         f"train.images_per_epoch={options.images}",
         f"train.device={options.device}",
@@ -112,7 +113,7 @@ def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, 
     return last_epoch(run, *settings, *overrides, *options.overrides)
 
 
-def make_certain(weight: Tensor, bias: Tensor, label: int = 0) -> None:
+def make_certain(weight: Tensor, bias: Tensor, label: int) -> None:
     """Edit the last layer of a network so that it predicts one class for every image.
 
     The logits of the other classes still depend on the image, so that the
@@ -302,15 +303,20 @@ def measure_speed(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def train_certain_network(run: Path, options: argparse.Namespace) -> Path:
-    """Train a network without renders, make it certain of class 0, and return its run folder.
+    """Train a network without renders, make it certain of `options.label`, and return its run.
 
     Args:
         run: Folder of the run.
         options: Parsed command line.
+
+    Returns:
+        Folder of the run.
     """
     train(run, options, "augment=none")
+    with np.load(options.data, allow_pickle=False) as archive:
+        label = archive["classes"].tolist().index(options.label)
     state = checkpoint.load(run / checkpoint.BEST)
-    make_certain(state["model"]["head.weight"], state["model"]["head.bias"])
+    make_certain(state["model"]["head.weight"], state["model"]["head.bias"], label)
     checkpoint.save(run / checkpoint.BEST, state)
     return run
 
@@ -380,7 +386,7 @@ def measure_attack(render_count: int, mesh_count: int, steps: int) -> Row:
     torch.manual_seed(0)
     network = WideResNet(10, 10, 1, 0.0).eval()
     head = network.head.state_dict()
-    make_certain(head["weight"], head["bias"])
+    make_certain(head["weight"], head["bias"], label=0)
     view_count = render_count // (mesh_count * BACKGROUNDS)
     solids = [(f"solid:orange:{seed}", 0) for seed in range(mesh_count)]
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps))
@@ -549,6 +555,7 @@ def add_speed_options(parser: argparse.ArgumentParser) -> None:
         default="[solid:orange:0,solid:orange:1]",
         help="a list, as scene.meshes takes it",
     )
+    add("--label", default="orange", help="class of the meshes")
     add("--images", type=int, default=512, help="number of images in an epoch that is timed")
     add("--rounds", type=int, default=5)
     add("--depth", type=int, default=16)

@@ -137,7 +137,7 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
 def save_random_data(path: Path) -> None:
     """Write a data set of random images in two classes, as data=npz reads it."""
     rng = np.random.default_rng(0)
-    arrays = {"classes": np.array(["orange", "other"])}
+    arrays = {"classes": np.array(["other", "orange"])}
     for split in ("train", "test"):
         arrays[f"{split}_images"] = rng.integers(0, 256, (200, 3, 32, 32), dtype=np.uint8)
         arrays[f"{split}_labels"] = np.arange(200) % 2
