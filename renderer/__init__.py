@@ -1,6 +1,6 @@
-"""Scene to pixels, and pixel gradients to scene parameters. Knows no classifier and no data set.
+"""Differentiable renderer of meshes, which knows no classifier and no data set.
 
-The public names stand in `__init__.pyi`.
+The public names are listed in `__init__.pyi`.
 """
 
 from renderer.lazy import attach

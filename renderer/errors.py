@@ -19,15 +19,13 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-# Largest magnitude of the values of tensors that `require_bounded` accepts. In float32, the
-# product of three such values does not overflow. An overflow would give infinity, and then
-# NaN.
+# Largest magnitude of numbers in arguments. The product of three such numbers does not
+# overflow in float32. An overflow would give infinity, and then NaN.
 MAX_MAGNITUDE = 1e12
-# Largest factor for lights, albedo and lengths in settings. Products of such factors stay
-# below MAX_MAGNITUDE.
+# Largest factor for lights, albedo and lengths in settings. Products of two such factors
+# stay below MAX_MAGNITUDE.
 MAX_SCALE = 1e5
-# Texts by which `is_out_of_memory` recognizes the errors of torch, CUDA, cuDNN and cuBLAS
-# when memory runs out.
+# Texts in the errors of torch, CUDA, cuDNN and cuBLAS that say that memory ran out.
 OUT_OF_MEMORY = (
     "out of memory",
     "can't allocate memory",
@@ -45,13 +43,13 @@ class InputError(ValueError):
 
     Args:
         message: The sentence.
-        argument: Name of the Python argument or field with which the sentence
-            begins. Commands put the key of the settings that contain this
-            argument before it. Empty if the sentence begins with something
-            else.
+        argument: Name of the Python argument with which the sentence begins.
+            Commands extend it to the key of a setting, such as "scene.views".
+            Empty if the sentence begins with something else.
 
     Attributes:
-        argument: The same name.
+        argument: Name of the Python argument with which the sentence begins, or an
+            empty string.
 
     >>> import norm_balls as nb
     >>> nb.ImageSettings(size=32, samples=0)
@@ -64,13 +62,14 @@ class InputError(ValueError):
         self.argument = argument
 
     def within(self, key: str, names: Collection[str]) -> InputError:
-        """Return a copy of the error whose message names the settings that contain the argument.
+        """Return a copy of the error whose sentence begins with the key of some settings.
 
         Args:
-            key: Key of the settings, such as "scene". Empty for settings at the
-                top, which changes nothing.
-            names: Names of their fields. If the sentence is about something
-                else, the key comes before the whole sentence.
+            key: Key of the settings, such as "scene". If it is empty, the error
+                itself is returned.
+            names: Names of the fields of the settings. If the argument of the error
+                is one of them, the key is put before the argument, with a period.
+                Otherwise it is put before the sentence, with a colon.
 
         Returns:
             Error whose sentence begins with the key.
@@ -82,7 +81,7 @@ class InputError(ValueError):
         """
         if not key:
             return self
-        # "light" for an argument such as "light.turbidity" or "light[0]".
+        # An argument such as "light.turbidity" or "light[0]" belongs to the field "light".
         field = self.argument.partition(".")[0].partition("[")[0]
         if field and field in names:
             return InputError(f"{key}.{self}", f"{key}.{self.argument}")
@@ -96,7 +95,8 @@ def single_line(error: Exception) -> str:
         error: Error of any class.
 
     Returns:
-        Message without line breaks, or the name of the class if there is none.
+        Message without line breaks. If the error has no message, the name of its
+        class.
     """
     return " ".join(str(error).split()) or type(error).__name__
 
@@ -133,16 +133,18 @@ def as_device(device: torch.device | str) -> torch.device:
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError) as error:
-        # torch without CUDA raises AssertionError.
+        # torch raises AssertionError for "cuda" if it was built without CUDA.
         raise InputError(
-            f"device={_short(device)} is not available here: "
+            f"device={_short_text(device)} is not available here: "
             "use cpu, or cuda on a machine with a GPU",
             "device",
         ) from error
 
 
 def require_file(path: str | Path, advice: str) -> None:
-    """Check that a path is a regular file, and no pipe, which would block when it is read.
+    """Check that a path is a regular file.
+
+    A named pipe is not accepted, because reading it might never end.
 
     Args:
         path: Path of the file.
@@ -151,7 +153,7 @@ def require_file(path: str | Path, advice: str) -> None:
     Raises:
         InputError: If the path is not a regular file.
     """
-    # isfile also returns False for invalid names and unreadable folders.
+    # For an invalid name or a folder without permission, isfile returns False.
     if os.path.isfile(path):
         return
     problem = "is not a regular file" if os.path.exists(path) else "does not exist"
@@ -176,8 +178,8 @@ def require_range(name: str, value: float | None, least: float, most: float) -> 
     try:
         is_inside = bool(least <= value <= most)
     except (TypeError, ValueError, RuntimeError) as error:
-        # Strings, complex numbers and arrays of several numbers cannot be compared.
-        raise InputError(f"{name}={_short(value)} must be a number", name) from error
+        # The comparison fails for a string, a complex number or an array of several numbers.
+        raise InputError(f"{name}={_short_text(value)} must be a number", name) from error
     if not is_inside:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
 
@@ -194,7 +196,7 @@ def require_choice(name: str, value: object, choices: Collection[str]) -> None:
         InputError: If the value is not one of them.
     """
     if not isinstance(value, str) or value not in choices:
-        raise InputError(f"{name}={_short(value)}: choose one of {', '.join(choices)}", name)
+        raise InputError(f"{name}={_short_text(value)}: choose one of {', '.join(choices)}", name)
 
 
 def require_finite(**tensors: Tensor) -> None:
@@ -209,13 +211,13 @@ def require_finite(**tensors: Tensor) -> None:
     import torch
 
     for name, tensor in tensors.items():
-        # The comparison is False for NaN.
+        # A comparison with NaN is False, so `not` also finds NaN.
         if not _largest_magnitude(tensor) <= torch.finfo(tensor.dtype).max:
             raise InputError(f"{name} holds NaN or infinity: give finite values", name)
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """Check that tensors hold floating-point numbers of at most the magnitude MAX_MAGNITUDE.
+    """Check that tensors hold floating-point numbers with magnitudes of at most MAX_MAGNITUDE.
 
     Args:
         **tensors: Tensors by the names of the arguments.
@@ -230,7 +232,7 @@ def require_bounded(**tensors: Tensor) -> None:
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers", name)
-        # The comparison is False for NaN.
+        # A comparison with NaN is False, so `not` also finds NaN.
         if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
             raise InputError(
                 f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}: "
@@ -246,8 +248,8 @@ def is_whole(value: object) -> bool:
         value: Any value.
 
     Returns:
-        True for whole numbers. False for everything else, also for True and
-        False themselves.
+        True for whole numbers. False for other values, also for the values True
+        and False.
     """
     return isinstance(value, Integral) and not isinstance(value, bool)
 
@@ -259,23 +261,23 @@ def is_number(value: object) -> bool:
         value: Any value.
 
     Returns:
-        True for numbers, and for tensors and arrays of shape () with a real
-        number. False for everything else, also for True and False themselves.
+        True for real numbers, and for tensors and arrays of shape () with a real
+        number. False for other values, also for the values True and False.
     """
     if getattr(value, "ndim", None) == 0:
-        # A tensor or an array of shape (), or a number of NumPy.
+        # The value is a tensor or an array of shape (), or a number of NumPy.
         value = value.item()  # type: ignore[attr-defined]
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def is_flag(value: object) -> bool:
-    """Tell whether a value is True, False, 1 or 0, as a value of Python or NumPy.
+    """Tell whether a value is True, False, 1 or 0.
 
     Args:
-        value: Any value.
+        value: Any value of Python or NumPy.
 
     Returns:
-        True if it is one of the four. False for any other value, such as None.
+        True for the four values. False for other values, such as None.
     """
     if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():
         value = value.item()  # type: ignore[attr-defined]
@@ -283,14 +285,14 @@ def is_flag(value: object) -> bool:
 
 
 def describe(value: Any) -> str:
-    """Describe a value for an error.
+    """Describe a value for an error message.
 
     Args:
         value: Any value.
 
     Returns:
-        Type and shape of a tensor or array, a short text of a plain value, and
-        the type of any other value.
+        Type and shape of a tensor or an array, `repr` of a number, a text or a
+        list, and type of any other value.
     """
     if value is None or isinstance(value, str | bytes | bool | int | float | complex):
         return _short_repr(value)
@@ -300,7 +302,7 @@ def describe(value: Any) -> str:
         return f"the class {value.__name__}"
     if not hasattr(value, "dtype") or not hasattr(value, "shape"):
         return f"of type {type(value).__name__}"
-    # Numbers of NumPy have a type and a shape, but no items that can be set.
+    # Unlike an array, a number of NumPy has no method `__setitem__`.
     if not hasattr(value, "__setitem__"):
         return _short_repr(value)
     is_tensor = type(value).__module__.partition(".")[0] == "torch"
@@ -308,8 +310,8 @@ def describe(value: Any) -> str:
     return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
 
 
-def _short(value: object) -> str:
-    """Convert a value to a short text of one line, without quotes around strings."""
+def _short_text(value: object) -> str:
+    """Convert a value to one line of text. Strings get no quotes, and long values are shortened."""
     return " ".join(value.split()) if isinstance(value, str) else _short_repr(value)
 
 
@@ -319,12 +321,12 @@ def _short_repr(value: object) -> str:
 
 
 def _largest_magnitude(tensor: Tensor) -> float:
-    """Compute the largest magnitude of the values of a tensor, or NaN if a value is NaN."""
+    """Compute the largest magnitude of the values of a tensor. It is NaN if a value is NaN."""
     if not tensor.numel():
         return 0.0
     values = tensor.detach()
-    # aminmax copies a tensor that is not contiguous. A matrix that is not contiguous usually
-    # has contiguous columns, so its transpose needs no copy.
+    # aminmax copies a tensor that is not contiguous. If a matrix is not contiguous, its
+    # transpose usually is, and aminmax does not copy it.
     if values.ndim == 2 and not values.is_contiguous():
         values = values.T
     lowest, highest = values.aminmax()

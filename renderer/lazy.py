@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 
-# Type checkers assume that a variable of this name is true. Importing it from `typing`
+# Type checkers treat a variable with this name as True. Importing the variable from `typing`
 # would take longer than the rest of this module.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -20,9 +20,12 @@ def attach(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Create the module functions that import public names of a package on first use.
 
+    The public names are the names that the stub file `__init__.pyi` imports.
+
     Args:
         package: `__name__` of the package.
-        file: `__file__` of the package. The stub file is in the same folder.
+        file: `__file__` of the package, the path of its `__init__.py`. The stub
+            file is in the same folder.
 
     Returns:
         Values for `__getattr__`, `__dir__` and `__all__` of the package.
@@ -36,33 +39,34 @@ def attach(
     names = sorted(modules)
 
     def get_attribute(name: str) -> object:
-        """Import the module with a public name, and return the value of the name."""
+        """Import the module that defines a public name, and return the value of the name."""
         if name == "__version__":
             from importlib.metadata import version
 
             return version("parametric-norm-balls")
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        # With `fromlist`, __import__ also imports `name` if it is a module itself.
-        return getattr(__import__(modules[name], fromlist=[name]), name)
+        # If `name` is a submodule, `fromlist` makes __import__ import it, too.
+        module = __import__(modules[name], fromlist=[name])
+        return getattr(module, name)
 
     return get_attribute, lambda: names, names
 
 
 def _read_stub(path: str) -> dict[str, str]:
-    """Find the modules from which a stub file imports its names.
+    """Find out from which module a stub file imports each name.
 
     Args:
         path: Path of the stub file.
 
     Returns:
-        Names of the modules by the imported names.
+        Name of the module of each imported name.
     """
     with open(path, encoding="utf-8") as stub:
         tree = ast.parse(stub.read())
-    return {
-        alias.name: str(statement.module)
-        for statement in tree.body
-        if isinstance(statement, ast.ImportFrom)
-        for alias in statement.names
-    }
+    modules = {}
+    for statement in tree.body:
+        if isinstance(statement, ast.ImportFrom):
+            for alias in statement.names:
+                modules[alias.name] = str(statement.module)
+    return modules

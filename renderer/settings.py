@@ -1,11 +1,11 @@
 """Settings: dataclasses whose fields have an explanation, a unit, a range and choices.
 
-The function `setting` creates a field of a settings class. These facts about the field are
-written only there. The base class `Settings` checks the values of an instance with them, and
-`--help` of a command prints them.
+The function `setting` creates a field of a settings class and stores these facts about the
+field. The base class `Settings` checks the values of an instance with them, and `--help` of a
+command prints them.
 
-This module does not import torch and NumPy, and the other modules of settings do not either.
-Commands read and check their settings before they import anything that takes seconds.
+This module and the other modules of settings do not import torch and NumPy, which takes
+seconds. Commands read and check their settings before they import torch.
 """
 
 from __future__ import annotations
@@ -30,39 +30,42 @@ from renderer.errors import (
     require_range,
 )
 
-# Type of the settings class that a function returns an instance of.
+# Type variable for any settings class.
 Kind = TypeVar("Kind")
-# Argument `default` of `setting` for a field that the user must give.
+# Default of a field that has no default, because the user must give a value.
 REQUIRED = MISSING
 
-# Allowed encodings of image values, kinds of normals, and rasterizers.
+# Allowed encodings of image values.
 ENCODINGS = ("linear", "srgb")
+# Allowed kinds of normals.
 NORMALS = ("flat", "smooth")
+# Allowed names of rasterizers.
 RASTERIZERS = ("auto", "opengl", "numba", "numpy")
-# Largest number of bounces of light.
+# Largest number of bounces of light between surfaces.
 MAX_BOUNCES = 100
-# Largest image size in settings of commands, in pixels per side.
+# Largest width and height of images in pixels that the settings of commands allow.
 MAX_SIZE = 4096
-# Largest number of samples in a row of an image. A whole image then has at most a billion.
+# Largest number of samples in a row of an image. A square image then has at most a billion
+# samples.
 MAX_SAMPLES_PER_ROW = 2**15
-# Default number of samples per side of a pixel if gradients include visibility changes at
-# silhouettes.
+# Default number of samples along one side of a pixel if gradients include visibility changes
+# at silhouettes. Other renders use fewer samples.
 SILHOUETTE_SAMPLES = 8
-# Largest number of samples per side of a pixel. The coverage of a pixel is then a multiple of
-# 1/4096.
+# Largest number of samples along one side of a pixel. A pixel then has 4096 samples.
 MAX_SAMPLES = 64
-# Largest degree of the spherical harmonics of a light. Highlights of surfaces with the
-# roughness MIN_ROUGHNESS need this degree.
+# Largest degree of the spherical harmonics of a light. Highlights on surfaces with the smallest
+# allowed roughness, 0.2, need this degree.
 MAX_DEGREE = 40
-# Smallest roughness that is rendered. Highlights of smoother surfaces would need light of a
-# degree above MAX_DEGREE.
+# Smallest roughness of a surface. Highlights on smoother surfaces would need light of a higher
+# spherical-harmonic degree than MAX_DEGREE.
 MIN_ROUGHNESS = 0.2
-# Largest number of cameras of `orbit_cameras`.
+# Largest number of cameras on an orbit.
 MAX_VIEWS = 10**5
-# Largest number of vertices to which `subdivide` divides a mesh. This takes about 5 GB of memory.
+# Largest number of vertices that `subdivide` can be asked to exceed. Such a mesh takes about 5 GB
+# of memory.
 MAX_VERTICES = 10**7
 # Smallest and largest turbidity (haziness) of the air for the skylight, from clear to hazy. Pure
-# air would have 1.
+# air would have the turbidity 1.
 TURBIDITY = (2.0, 10.0)
 
 
@@ -70,7 +73,18 @@ TURBIDITY = (2.0, 10.0)
 class Facts:
     """Explanation, unit, range and choices of a field of a settings class.
 
-    The attributes are the arguments of `setting`, which explains them.
+    Attributes:
+        about: Explanation for the user.
+        unit: Unit of the value.
+        minimum: Smallest permitted value.
+        maximum: Largest permitted value.
+        above: Number that the value must exceed.
+        below: Number that the value must not reach.
+        choices: Names that the value may have.
+        is_pair: True for a list of two numbers [minimum, maximum].
+        is_text: True for a name or a path whose annotation is Any.
+        may_be_empty: True if an empty text is permitted.
+        checks_type: True if the value must have the annotated type.
     """
 
     about: str = ""
@@ -87,25 +101,25 @@ class Facts:
 
     @cached_property
     def limits(self) -> list[Limit]:
-        """Limits of the field's range that are set, at most four."""
-        ends = (
+        """Limits of the range of the field: its minimum, its maximum and so on."""
+        all_limits = (
             Limit("at least", "≥", operator.ge, self.minimum),
             Limit("above", ">", operator.gt, self.above),
             Limit("at most", "≤", operator.le, self.maximum),
             Limit("below", "<", operator.lt, self.below),
         )
-        return [limit for limit in ends if limit.end is not None]
+        return [limit for limit in all_limits if limit.end is not None]
 
 
 @dataclass(frozen=True)
 class Limit:
-    """Limit of a range of numbers.
+    """Limit of a range of numbers, such as "at least 0".
 
     Attributes:
-        words: Words for errors, such as "at least".
-        sign: Sign for `--help`, such as "≥".
+        words: Words of the limit in errors, such as "at least".
+        sign: Sign of the limit in `--help`, such as "≥".
         holds: Function that compares a value with `end`, such as operator.ge.
-        end: Number of the limit. None for no limit.
+        end: Number of the limit. None if the range has no such limit.
     """
 
     words: str
@@ -136,7 +150,7 @@ def setting(
 
     Args:
         default: Default value. A list or a mapping is copied for each instance. A function is
-            called for each instance. REQUIRED: the user must give a value.
+            called for each instance. REQUIRED means that the user must give a value.
         about: Explanation for the user.
         unit: Unit of the value.
         minimum: Smallest permitted value.
@@ -144,15 +158,15 @@ def setting(
         above: Number that the value must exceed.
         below: Number that the value must not reach.
         choices: Names that the value may have.
-        is_pair: The list holds two numbers, [minimum, maximum].
-        is_text: The annotation is Any, but a plain value is a name or a path. The command line
-            then reads 1.10 as text.
-        may_be_empty: An empty text is permitted.
-        checks_type: Check the value against the annotation. If False, Python code may give more
-            than the annotation says.
+        is_pair: True if the value is a list of two numbers [minimum, maximum].
+        is_text: True if the annotation is Any, but the value on the command line is a name or
+            a path. The command line then reads 1.10 as text.
+        may_be_empty: True if an empty text is permitted.
+        checks_type: True checks that the value has the annotated type. False lets Python code
+            give values of other types.
 
     Returns:
-        A field for a dataclass.
+        Field for a dataclass.
 
     >>> from dataclasses import dataclass
     >>> @dataclass
@@ -187,18 +201,21 @@ def setting_like(kind: type, name: str, default: Any) -> Any:
         default: Default value of the new field.
 
     Returns:
-        A field for a dataclass.
+        Field for a dataclass.
     """
     return _field(default, facts_of(kind, name))
 
 
 def _field(default: Any, facts: Facts) -> Any:
-    """Create a field of a dataclass.
+    """Create a field of a dataclass, and store facts about the field in its metadata.
 
     Args:
         default: Default value. A list or a mapping is copied for each instance, and a function
-            is called for each instance. REQUIRED for no default.
-        facts: Explanation, unit and range, which are stored in the metadata of the field.
+            is called for each instance. REQUIRED for a field without a default.
+        facts: Explanation, unit, range and choices of the field.
+
+    Returns:
+        Field for a dataclass.
     """
     metadata = {"facts": facts}
     if default is REQUIRED:
@@ -213,8 +230,8 @@ def _field(default: Any, facts: Facts) -> Any:
 class Settings:
     """Base class of all settings classes, which are dataclasses.
 
-    A new instance raises an InputError if a value has the wrong type, is out of range, is none of
-    the choices, or is an empty text. The error names the first such field.
+    A new instance raises an InputError if a value has the wrong type, is out of range, is not one
+    of the choices, or is an empty text. The error names the first such field.
     """
 
     def __post_init__(self) -> None:
@@ -230,15 +247,14 @@ class Settings:
 def facts_of(kind: type, name: str) -> Facts:
     """Return the explanation, unit, range and choices of a field.
 
-    A subclass may give a field another default without calling `setting`. The facts of the parent
-    class then apply.
+    If a subclass only changes the default of a field, the facts of the parent class apply.
 
     Args:
         kind: Settings class.
         name: Name of the field.
 
     Returns:
-        Facts of the field. They are empty if the field was not created by `setting`.
+        Facts about the field. They are empty if no class created the field with `setting`.
     """
     for base in kind.__mro__:
         fields_of_base: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})
@@ -265,8 +281,9 @@ def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) ->
 
     Args:
         kind: Settings class.
-        values: Values of the fields by name.
-        argument: Name of the argument that holds the mapping, for errors.
+        values: Value of each field by the name of the field. Fields with a default may be
+            missing.
+        argument: Name of the argument that holds the mapping. Errors begin with this name.
 
     Returns:
         Instance of the class.
@@ -294,7 +311,7 @@ def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) ->
 
 @cache
 def _checked_fields(kind: type) -> list[tuple[str, Any, Facts]]:
-    """List the name, the annotated type and the facts of each field of a settings class."""
+    """List the name, the annotated type and the facts of each field of a dataclass."""
     return [(name, hint, facts_of(kind, name)) for name, hint in field_types(kind).items()]
 
 
@@ -303,11 +320,11 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
 
     Args:
         name: Name of the field, for the error.
-        value: Value of the field.
+        value: Value of the field, but not None.
         facts: Range and choices of the field.
 
     Raises:
-        InputError: If the value is not permitted.
+        InputError: If the value or an item is not permitted.
     """
     if isinstance(value, str) and not value and not facts.may_be_empty:
         raise InputError(f"{name} is empty: give a name", name)
@@ -324,12 +341,12 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
 
 
 def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
-    """Check that a number is within limits. NaN is not within any limits.
+    """Check that a value is a number within some limits. NaN is outside of all limits.
 
     Args:
         name: Name of the field, for the error.
         value: Value to check.
-        limits: Limits of the range.
+        limits: Limits of the range. Without any limits, all values are accepted.
 
     Raises:
         InputError: If the value is no number, or not within the limits.
@@ -342,23 +359,24 @@ def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
 
 
 def _check_pair(name: str, value: Any, facts: Facts) -> None:
-    """Check that a list is a pair [minimum, maximum] within the range of its field.
+    """Check that a list is a pair [minimum, maximum] of numbers within the range of its field.
 
     Args:
         name: Name of the field, for the error.
         value: List to check.
-        facts: Range of the field.
+        facts: Facts about the field, with the range in which both numbers must lie.
 
     Raises:
-        InputError: If the list is no such pair.
+        InputError: If the list has not two numbers, if the first number is larger than the
+            second, or if a number is out of range.
     """
-    minimum = -math.inf if facts.minimum is None else facts.minimum
-    maximum = math.inf if facts.maximum is None else facts.maximum
-    if len(value) == 2 and minimum <= value[0] <= value[1] <= maximum:
+    lower_limit = -math.inf if facts.minimum is None else facts.minimum
+    upper_limit = math.inf if facts.maximum is None else facts.maximum
+    if len(value) == 2 and lower_limit <= value[0] <= value[1] <= upper_limit:
         return
     raise InputError(
         f"{name}={list(value)} is no range: "
-        f"give [minimum, maximum], both from {minimum:g} to {maximum:g}",
+        f"give [minimum, maximum], both from {lower_limit:g} to {upper_limit:g}",
         name,
     )
 
@@ -371,7 +389,7 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
 
     Args:
         settings: Instance of the dataclass.
-        unchecked: Names of fields that take more than their annotation says.
+        unchecked: Names of fields that are not checked, because they accept other types, too.
 
     Raises:
         InputError: If a field holds a value of another type.
@@ -382,7 +400,8 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
             raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
 
 
-# For each annotated type, the function that tells whether a value has this type.
+# For each plain type, the function that tells whether a value is accepted for a field that
+# is annotated with this type.
 _CHECKS: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
     int: is_whole,
@@ -394,14 +413,16 @@ _CHECKS: dict[Any, Callable[[object], bool]] = {
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Tell whether a value has the type of an annotation.
+    """Tell whether a value is accepted for a field with a given type annotation.
 
     Args:
         value: Value to check.
-        hint: Type, union of types, or list type such as `list[float]`.
+        hint: Annotation: a type such as int, a union such as `int | None`, a list type such as
+            `list[float]`, or a class.
+
+    Returns:
+        True if the value is accepted.
     """
-    # Plain types, such as int, have a function in `_CHECKS`. Any other annotation is a
-    # union, a list or a class.
     check = _CHECKS.get(hint)
     if check is not None:
         return check(value)
@@ -410,6 +431,7 @@ def _fits(value: object, hint: Any) -> bool:
         return any(_fits(value, option) for option in get_args(hint))
     if origin is list:
         (item_hint,) = get_args(hint)
+        # An array or a tensor with at least one axis counts as a list.
         is_array = getattr(value, "ndim", 0) > 0
         if isinstance(value, str) or not (is_array or isinstance(value, Sequence)):
             return False
@@ -418,7 +440,7 @@ def _fits(value: object, hint: Any) -> bool:
     return isinstance(value, origin or hint)
 
 
-# For each annotated type, the words for a value of this type in errors.
+# Words with which errors ask for a value of each type.
 _NOUNS: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -430,10 +452,11 @@ _NOUNS: dict[Any, str] = {
 
 
 def _expected(hint: Any) -> str:
-    """Describe the values that an annotated type allows, for an error.
+    """Describe the values that a type annotation allows, for an error.
 
     Args:
-        hint: Type, union of types, or list type such as `list[float]`.
+        hint: Annotation: a type such as int, a union such as `int | None`, a list type such as
+            `list[float]`, or a class.
 
     Returns:
         Description such as "a list of numbers or None".
@@ -490,7 +513,7 @@ class ImageSettings(Settings):
     )
 
     def __post_init__(self) -> None:
-        """Check the fields, and the number of samples in a row of the image."""
+        """Check each field, and the number of samples in a row of the image."""
         super().__post_init__()
         require_range("size × samples", self.size * self.samples, 1, MAX_SAMPLES_PER_ROW)
 
@@ -501,7 +524,7 @@ class ImageSettings(Settings):
 
 
 def samples_per_side(samples: int | None, silhouettes: bool) -> int:
-    """Choose the number of samples per side of a pixel.
+    """Choose the number of samples along one side of a pixel.
 
     Args:
         samples: Number that the user chose. None for the default.
@@ -509,7 +532,7 @@ def samples_per_side(samples: int | None, silhouettes: bool) -> int:
             then larger, because the documented accuracy of these gradients needs more samples.
 
     Returns:
-        Number of samples per side of a pixel.
+        The user's number, or the default: 2, or 8 if `silhouettes` is True.
     """
     if samples is not None:
         return samples

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from renderer.errors import InputError, describe, is_flag, is_number
 
-# Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" signed
-# integers, and "u" unsigned integers.
+# Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" is a signed
+# integer, and "u" is an unsigned integer.
 _NUMBERS = "fiu"
-# Number of bytes of the largest floating-point numbers in torch (float64). NumPy also has
-# larger ones, which `_as_numbers` converts.
-_LARGEST_FLOAT_BYTES = 8
+# Number of bytes of a float64 number. NumPy also has larger floating-point numbers, which
+# torch cannot read.
+_FLOAT64_BYTES = 8
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -73,7 +73,7 @@ def as_tensor(name: str, value: object) -> Tensor:
 
 
 def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
-    """Tell whether a value is a list or a tuple with one or more items, which are all tensors."""
+    """Tell whether a value is a list or a tuple of one or more tensors, and nothing else."""
     if not isinstance(value, list | tuple) or not value:
         return False
     return all(isinstance(item, Tensor) for item in value)
@@ -117,30 +117,31 @@ def _as_numbers(value: object) -> np.ndarray | None:
         Contiguous array, or None if the value contains anything but real numbers,
         or lists of unequal lengths.
     """
-    # NumPy calls methods of the value, which can raise any exception.
+    # NumPy calls methods of the value, such as `__array__`. They can raise any exception.
     try:
         array = np.asarray(value)
     except Exception:
         return None
     if array.dtype.kind not in _NUMBERS:
         return None
-    if array.dtype.kind == "f" and array.dtype.itemsize > _LARGEST_FLOAT_BYTES:
+    if array.dtype.kind == "f" and array.dtype.itemsize > _FLOAT64_BYTES:
         array = array.astype(np.float64)
     native_dtype = array.dtype.newbyteorder("=")
-    # ascontiguousarray turns the shape () into (1,), so the shape is restored.
+    # `reshape` is needed because ascontiguousarray changes the shape () to (1,).
     return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
 
 
 def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
-    """Convert an argument to a NumPy array of numbers.
+    """Convert an argument to a NumPy array of real numbers.
 
     Args:
         name: Name of the argument, for the error.
         value: NumPy array, tensor, number, or nested lists of numbers.
-        kinds: Allowed values of `dtype.kind`, such as "iu" for integers.
+        kinds: Allowed types of the numbers, as letters of `dtype.kind`. "iu" allows
+            only integers. The default also allows floating-point numbers.
 
     Returns:
-        Array. A given array is returned as it is.
+        Array. If the value is an array already, it is returned unchanged.
 
     Raises:
         InputError: If the value is anything else.
@@ -185,13 +186,13 @@ def as_folder(name: str, value: object) -> Path:
             is a file.
     """
     path = as_path(name, value)
-    for existing in (path, *path.absolute().parents):
-        if not os.path.lexists(existing):
+    for ancestor in (path, *path.absolute().parents):
+        if not os.path.lexists(ancestor):
             continue
-        # A broken symbolic link is no file, so `exists` is False for it.
-        if existing.exists() and not existing.is_dir():
+        # `exists` is False for a symbolic link without a target, which is no file.
+        if ancestor.exists() and not ancestor.is_dir():
             raise InputError(
-                f"{name}={path} cannot be a folder, because {existing} is a file: give the path of "
+                f"{name}={path} cannot be a folder, because {ancestor} is a file: give the path of "
                 "a folder",
                 name,
             )
@@ -200,22 +201,23 @@ def as_folder(name: str, value: object) -> Path:
 
 
 def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
-    """Convert an argument to a list whose items are all of one kind.
+    """Convert an argument to a list, and check the type of its items.
 
     Args:
         name: Name of the argument, for the error.
         value: List, tuple or another ordered iterable, but not a string, mapping
             or set.
-        kind: Type of the items, or a tuple of types.
-        expected: What to give, for the error.
+        kind: Type that each item must have, or a tuple of types.
+        expected: Words for what the user should give, such as "a list of cameras",
+            for the error.
 
     Returns:
         List of the items.
 
     Raises:
-        InputError: If the value is not a list, or an item has another type.
+        InputError: If the value is not a list, or if an item has another type.
     """
-    # A tensor or array with shape () is iterable by its type, but has no items.
+    # The types Tensor and np.ndarray are iterable, but a value of shape () has no items.
     is_scalar = isinstance(value, Tensor | np.ndarray) and not value.ndim
     is_unordered_or_text = isinstance(value, str | bytes | Mapping | Set)
     if is_scalar or is_unordered_or_text or not isinstance(value, Iterable):
@@ -234,7 +236,8 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
         name: Name of the argument, for the error.
         value: Value of the argument.
         kind: Required type, or a tuple of types.
-        expected: What to give, for the error.
+        expected: Words for what the user should give, such as "a whole number", for
+            the error.
 
     Raises:
         InputError: If the value has another type.
@@ -273,7 +276,7 @@ def require_number(name: str, value: object) -> None:
 
 
 def require_flag(name: str, value: object) -> None:
-    """Check that an argument is True or False.
+    """Check that an argument is True or False. The numbers 1 and 0 are accepted, too.
 
     Without this check, a string such as "no" would count as True.
 
@@ -289,7 +292,7 @@ def require_flag(name: str, value: object) -> None:
 
 
 def require_seed(name: str, value: object) -> None:
-    """Check that an argument can seed a random stream.
+    """Check that an argument can be the seed of random numbers.
 
     Args:
         name: Name of the argument, for the error.
@@ -300,4 +303,4 @@ def require_seed(name: str, value: object) -> None:
     """
     require_whole(name, value)
     if int(value) < 0:  # type: ignore[call-overload]
-        raise InputError(f"{name}={value}: give a whole number from 0", name)
+        raise InputError(f"{name}={value} is negative: give a whole number of at least 0", name)
