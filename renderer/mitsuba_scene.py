@@ -1,21 +1,21 @@
 """Scenes for Mitsuba 3, as files or in memory.
 
-A scene is a dictionary of `renderer.io.mitsuba_entries`. `load` passes it to
-Mitsuba. `write_mitsuba_scene` writes it as scene.xml, with .ply files and
-textures beside it, which needs no Mitsuba.
+A scene is a dictionary (see `renderer.io.mitsuba_entries`). `load` passes it to
+Mitsuba. `write_mitsuba_scene` writes it as a file scene.xml, with .ply files and
+textures, and does not need Mitsuba.
 
 The renderers differ in these ways:
 
-- Diffuse surfaces of Mitsuba reflect albedo / π of the irradiance, and our
-  surfaces reflect albedo times the irradiance. The scale of the lights
-  compensates for this. It also contains the albedo scale, because a bounce
-  would otherwise apply that scale again.
+- The radiance of a diffuse surface is the irradiance times albedo / π in
+  Mitsuba, and the irradiance times the albedo in our renderer. The lights for
+  Mitsuba are therefore multiplied by π. They are also multiplied by the albedo
+  scale. In the materials, the albedo scale would apply again at each bounce.
 - Mitsuba always has shadows. If our render has none, a concave mesh is darker in
   Mitsuba.
-- Gloss is the plugin `principled`, with the same lobe. Its diffuse part does not
-  lose the light that the coat reflects. The color is therefore scaled by the
-  fraction that our diffuse part keeps on average. A difference of 1 to 3%
-  remains.
+- Specular reflection is the plugin `principled`, with the same lobe. Below its
+  coat, the diffuse reflection does not lose the light that the coat reflects.
+  The color is therefore multiplied by the fraction of the light that passes the
+  coat on average. A difference of 1 to 3% remains.
 
 Both renderers return radiance that is premultiplied with the coverage.
 """
@@ -48,19 +48,19 @@ from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shading.lobes import coat_mean
 from renderer.surface.texture_bake import with_added_albedo
 
-# Name of the scene file that `write_mitsuba_scene` writes.
+# Name of the file in which a Mitsuba scene is written.
 SCENE = "scene.xml"
-# Number of samples per pixel in Mitsuba. With so many, the noise under smooth lighting
+# Number of samples per pixel in Mitsuba. With 256 samples, the noise under smooth lighting
 # is below 1/255.
 SAMPLES = 256
-# Default variant of Mitsuba. It needs no LLVM, and renders the same bits with any
-# number of threads.
+# Default variant of Mitsuba. It does not need the library LLVM, and renders the same bits
+# with any number of threads.
 VARIANT = "scalar_rgb"
-# Variant of Mitsuba that computes gradients. It needs LLVM.
+# Variant of Mitsuba that computes gradients. It needs the library LLVM.
 DIFFERENTIABLE = "llvm_ad_rgb"
-# XML tag for each Python type of a value in a scene file.
+# XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
-# XML tag for each plugin of Mitsuba in a scene file.
+# XML tag in a Mitsuba scene file for an object of each type, such as an emitter for "envmap".
 PLUGIN_TAGS = {
     "path": "integrator",
     "direct": "integrator",
@@ -84,12 +84,12 @@ PLUGIN_TAGS = {
     "box": "rfilter",
     "multijitter": "sampler",
 }
-# `_PartWriter` divides specular factors by the albedo scale, or by this number if the
-# albedo scale is smaller.
-SMALLEST_SCALE = 1e-6
-# Smallest parameter `specular` of the plugin `principled`. With 0, metals would reflect
-# nothing. With this value, the reflectance at normal incidence is 8e-6.
-SMALLEST_SPECULAR = 1e-4
+# Smallest number by which specular factors are divided. They are divided by the albedo scale,
+# which can be 0.
+MIN_DIVISOR = 1e-6
+# Smallest parameter `specular` of Mitsuba's material "principled". With 0, metals would
+# reflect nothing. With 1e-4, the reflectance at normal incidence is 8e-6.
+MIN_SPECULAR = 1e-4
 
 
 @contextmanager
@@ -99,10 +99,10 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     The previous variant is restored at the end of the block.
 
     Args:
-        variant: Variant of Mitsuba, such as VARIANT or DIFFERENTIABLE.
+        variant: Variant of Mitsuba, such as "scalar_rgb" or "llvm_ad_rgb".
 
     Yields:
-        The module.
+        The module `mitsuba`.
 
     Raises:
         InputError: If Mitsuba is not installed, or if the variant needs LLVM
@@ -121,7 +121,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
             f"the variant {variant} of Mitsuba needs LLVM, which was not found ({error}): install "
             "libllvm19, or set DRJIT_LIBLLVM_PATH"
         ) from error
-    # With a single thread, Mitsuba would wait forever when it reads an .exr file.
+    # Mitsuba needs two threads. With one, it would wait forever when it reads an .exr file.
     drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
         yield module
@@ -131,19 +131,19 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
-    """Create a Mitsuba object from an entry of a scene.
+    """Create a Mitsuba object, such as a scene or a material, from a dictionary.
 
     Args:
-        module: Module of Mitsuba.
-        scene: Entry of the object, with arrays for transforms and images (see
-            `renderer.io.mitsuba_entries`).
+        module: The module `mitsuba`.
+        scene: Dictionary as for `mitsuba.load_dict`, but with NumPy arrays for
+            transformations and images (see `renderer.io.mitsuba_entries`).
 
     Returns:
         Object of Mitsuba.
     """
     converted = dict(scene)
     for name, value in scene.items():
-        # Mitsuba itself converts dictionaries of colors.
+        # A dictionary of the type "rgb" is a color, which Mitsuba itself converts.
         if isinstance(value, dict) and value["type"] != "rgb":
             converted[name] = load(module, value)
         elif isinstance(value, np.ndarray):
@@ -154,14 +154,15 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """Render the first cameras of a scene file with Mitsuba.
+    """Render a scene file with Mitsuba, from the first cameras in the file.
 
     Args:
         path: Scene file (.xml).
         views: Number of cameras.
 
     Returns:
-        Linear radiance and coverage, float32, shape (views, 4, size, size).
+        Linear red, green and blue radiance and coverage of each pixel, float32,
+        shape (views, 4, size, size).
 
     Raises:
         InputError: If Mitsuba is not installed or cannot render the file.
@@ -169,9 +170,10 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
-            images = [
-                _as_square(np.array(module.render(scene, sensor=view))) for view in range(views)
-            ]
+            images = []
+            for view in range(views):
+                image = np.array(module.render(scene, sensor=view))
+                images.append(_as_square(image))
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"Mitsuba cannot render {path}: {reason}") from error
@@ -179,14 +181,14 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 
 
 def _as_square(image: np.ndarray) -> torch.Tensor:
-    """Move the channels to the front, and stretch an image to a square.
+    """Move the channels of an image to the first axis, and stretch the image to a square.
 
     Args:
-        image: Image, shape (H, W, C). H differs from W if the camera has pixels
-            that are not square.
+        image: Image of H rows and W columns, shape (H, W, C). H differs from W if
+            the camera has pixels that are not square.
 
     Returns:
-        Image, shape (C, W, W).
+        Square image, shape (C, W, W).
     """
     channels = torch.from_numpy(image).permute(2, 0, 1)
     height, width = channels.shape[1:]
@@ -196,21 +198,21 @@ def _as_square(image: np.ndarray) -> torch.Tensor:
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
-    """Compute the environment map of a light for Mitsuba.
+    """Compute an environment map of a light with Mitsuba's layout of rows.
 
-    In Mitsuba, the first and the last row of a map are the poles. In our maps,
-    the poles are the edges of these rows. Our map with 256 rows would make the
-    light 0.2% dimmer in Mitsuba.
+    In Mitsuba, the centers of the first and the last row are the poles. In our
+    maps, the outer edges of these rows are the poles. If Mitsuba read one of our
+    maps with 256 rows, the light would be 0.2% too dim.
 
     Args:
-        coefficients: Spherical-harmonic coefficients of the lighting,
+        coefficients: Spherical-harmonic coefficients of the light,
             shape (K, 3).
         height: Number of rows of the map.
 
     Returns:
         Radiance, float64, shape (height, 2 · height, 3).
     """
-    # A map with a single row has directions in the plane z = 0.
+    # The directions of a map with a single row are horizontal: they have z = 0.
     horizontal, _ = equirectangular(1, 2 * height)
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
     up = torch.tensor([0.0, 0.0, 1.0])
@@ -220,18 +222,20 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Part:
-    """F faces of a mesh that have the same texture and the same gloss.
+    """F faces of a mesh that have the same texture and the same specular reflection.
+
+    Arrays of corners have one row for each face and one column for each of its
+    three corners.
 
     Attributes:
-        positions: Positions of the three corners of each face in world axes,
-            shape (F, 3, 3).
+        positions: Positions of the corners in world axes, shape (F, 3, 3).
         normals: Unit normals of the corners, shape (F, 3, 3).
         uvs: Texture coordinates of the corners as in `Mesh`, shape (F, 3, 2).
         colors: Linear colors of the corners, shape (F, 3, 3).
         texture: Texture, uint8, shape (H, W, 3). None for faces without a
             texture.
-        gloss: Roughness, metallic and specular factor, shape (3,). None for a
-            matte mesh.
+        gloss: Roughness, metallic and specular factor of all faces, shape (3,).
+            None for a matte mesh.
         factors: Texture with factors for roughness and metallic, uint8,
             shape (H, W, 2). None for faces without such a texture.
     """
@@ -246,26 +250,27 @@ class Part:
 
 
 def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
-    """Split a mesh into parts, each of which has one texture and one gloss.
+    """Split a mesh into parts, each of which has one texture and one specular reflection.
 
-    Mitsuba cannot multiply a texture by corner colors. If a face with a texture
-    has corners that are not white, new textures that contain the colors are
-    computed.
+    Mitsuba cannot multiply a texture by corner colors. If corners of faces with a
+    texture are not white, the colors are first multiplied into new textures.
 
     Args:
         mesh: Mesh with F faces.
-        normals: Normals of the corners, shape (F, 3, 3).
+        normals: Unit normals of the three corners of each face,
+            shape (F, 3, 3).
         encoding: Encoding of colors and textures, "linear" or "srgb".
 
     Returns:
-        Parts in ascending order of the texture and the gloss.
+        Parts in ascending order of the index of the texture and the gloss.
     """
     textured_colors = mesh.corner_colors[mesh.texture_ids >= 0]
     if (textured_colors != 1).any():
-        mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
+        no_added_albedo = np.zeros((len(mesh.faces), 3))
+        mesh, _ = with_added_albedo(mesh, no_added_albedo, encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    # One row for each face, with the texture and the gloss. Faces with equal rows
-    # become one part.
+    # Faces with the same key become one part. The key is the index of the texture and, if the
+    # mesh has gloss, the three values of the gloss.
     keys = mesh.texture_ids[:, None]
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
@@ -273,17 +278,19 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
     for key in np.unique(keys, axis=0):
         is_in_part = (keys == key).all(axis=1)
         texture_id = int(key[0])
-        has_texture = texture_id >= 0
+        texture = None
+        factors = None
+        if texture_id >= 0:
+            texture = mesh.textures[texture_id]
+            factors = mesh.gloss_textures[texture_id] if mesh.gloss_textures else None
         part = Part(
             positions=mesh.vertices[mesh.faces[is_in_part]],
             normals=normals[is_in_part],
             uvs=mesh.corner_uvs[is_in_part],
             colors=colors[is_in_part],
-            texture=mesh.textures[texture_id] if has_texture else None,
+            texture=texture,
             gloss=None if mesh.gloss is None else key[1:],
-            factors=mesh.gloss_textures[texture_id]
-            if has_texture and mesh.gloss_textures
-            else None,
+            factors=factors,
         )
         parts.append(part)
     return parts
@@ -298,22 +305,22 @@ def shape(
     uvs: np.ndarray | None = None,
     colors: np.ndarray | None = None,
 ) -> Any:
-    """Create a mesh of Mitsuba in memory.
+    """Create a Mitsuba mesh in memory.
 
     Args:
-        module: Module of Mitsuba.
-        surface: Dictionary of its bsdf.
+        module: The module `mitsuba`.
+        surface: Material as a dictionary for Mitsuba (a "bsdf").
         positions: Positions of the vertices, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
-        normals: Normals of the vertices, shape (V, 3). None shades each face
-            flat.
-        uvs: Texture coordinates of the vertices as in `Mesh`, shape (V, 2).
-            None leaves them out.
-        colors: Linear colors of the vertices, shape (V, 3), for the attribute
-            "vertex_color". None leaves them out.
+        normals: Unit normals of the vertices, shape (V, 3). None shades each face
+            with its own normal.
+        uvs: Texture coordinates of the vertices as in `Mesh`, shape (V, 2). None
+            for a mesh without texture coordinates.
+        colors: Linear colors of the vertices, shape (V, 3), which become the
+            attribute "vertex_color". None for a mesh without this attribute.
 
     Returns:
-        Mesh of Mitsuba.
+        Mitsuba mesh.
     """
     properties = module.Properties()
     properties["bsdf"] = load(module, surface)
@@ -330,7 +337,7 @@ def shape(
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)
     buffers["faces"] = faces.astype(np.uint32).ravel()
-    # Mitsuba has v = 0 at the upper edge of a texture.
+    # In Mitsuba, v = 0 is the upper edge of a texture. In our meshes, it is the lower edge.
     texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
     values_by_name = {"positions": positions, "normals": normals, "texcoords": texcoords}
     for name, values in values_by_name.items():
@@ -349,31 +356,33 @@ def write_mitsuba_scene(
     light: str,
     local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
 ) -> None:
-    """Write a scene file for Mitsuba, with the files that it refers to.
+    """Write a scene file for Mitsuba, with the mesh and texture files that it refers to.
 
     Args:
         folder: Folder for the files. It is created.
         mesh: Mesh to show.
         albedo_scale: Factor for the albedo of the mesh.
-        cameras: Cameras, which become the sensors of the scene.
+        cameras: Cameras of the scene.
         settings: Size, normals, encoding and bounces of the images.
         light: Path of the environment map, relative to `folder`.
-        local_lights: Local lights with their coefficients, shape (N, 3) each.
+        local_lights: Pairs of a `Lamps` or `Projector` object and its coefficients,
+            shape (N, 3).
 
     Raises:
         OSError: If a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    emitters = _local_emitters(folder, local_lights, albedo_scale)
+    local_emitters = _local_emitters(folder, local_lights, albedo_scale)
     sky = environment({"filename": light}, math.pi * albedo_scale)
-    # Rays from surfaces find the environment with less noise than rays to it.
-    sky["sampling_weight"] = 0.0 if emitters else 1.0
+    # Rays with random directions from surfaces find the environment with little noise. The
+    # rays that are aimed at emitters are therefore all aimed at local lights, if there are any.
+    sky["sampling_weight"] = 0.0 if local_emitters else 1.0
+    emitter_samples = 1 if local_emitters else 0
     sensors = []
     for camera in cameras:
         sampler = {"type": "multijitter", "sample_count": SAMPLES}
         sensors.append({**sensor_of(camera, settings.size), "sampler": sampler})
-    emitter_samples = 1 if emitters else 0
-    objects = [integrator(settings.bounces, emitter_samples), sky, *emitters, *sensors]
+    objects = [integrator(settings.bounces, emitter_samples), sky, *local_emitters, *sensors]
     normals = corner_normals(mesh.vertices, mesh.faces, settings.normals)
     for number, part in enumerate(split_parts(mesh, normals, settings.encoding)):
         writer = _PartWriter(folder, number, part, settings.encoding, albedo_scale)
@@ -386,33 +395,33 @@ def write_mitsuba_scene(
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Append a value of a scene to an XML element.
+    """Append a value of a Mitsuba scene to an XML element.
 
     Args:
         parent: XML element.
         name: Name of the value, or an empty string for no name.
-        value: Number, flag, string, list of numbers, array or entry of a scene.
+        value: Number, flag, string or list of numbers. An array of shape (4, 4) is a
+            transformation. A dictionary is a color, or an object such as a camera.
     """
-    named = {"name": name} if name else {}
-    # Arrays are matrices of transformations. Dictionaries are colors or plugins.
+    attributes = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
-        transform = xml.SubElement(parent, "transform", named)
-        text = " ".join(f"{entry:.17g}" for entry in value.ravel())
+        transform = xml.SubElement(parent, "transform", attributes)
+        text = " ".join(f"{number:.17g}" for number in value.ravel())
         xml.SubElement(transform, "matrix", value=text)
     elif not isinstance(value, dict):
-        xml.SubElement(parent, VALUE_TAGS[type(value)], named, value=_as_text(value))
+        xml.SubElement(parent, VALUE_TAGS[type(value)], attributes, value=_as_text(value))
     elif value["type"] == "rgb":
-        xml.SubElement(parent, "rgb", named, value=_as_text(value["value"]))
+        xml.SubElement(parent, "rgb", attributes, value=_as_text(value["value"]))
     else:
         plugin = value["type"]
-        element = xml.SubElement(parent, PLUGIN_TAGS[plugin], named, type=plugin)
-        for key, entry in value.items():
+        element = xml.SubElement(parent, PLUGIN_TAGS[plugin], attributes, type=plugin)
+        for key, item in value.items():
             if key != "type":
-                _append(element, key, entry)
+                _append(element, key, item)
 
 
 def _as_text(value: Any) -> str:
-    """Convert a number, a flag, a string or a list of numbers to the text of a scene file."""
+    """Convert a number, a flag, a string or a list of numbers to text for a Mitsuba scene file."""
     if isinstance(value, list):
         return " ".join(map(str, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -421,16 +430,17 @@ def _as_text(value: Any) -> str:
 def _local_emitters(
     folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
 ) -> list[Scene]:
-    """Create the entries of local lights, and write the patterns of projectors as .exr files.
+    """Describe local lights for Mitsuba, and write the patterns of projectors as .exr files.
 
     Args:
         folder: Folder for the files.
-        lights: Local lights with their coefficients, shape (N, 3) each.
-        albedo_scale: Factor for the albedo of the mesh. The lights are multiplied
-            by it, because the materials do not contain it.
+        lights: Pairs of a `Lamps` or `Projector` object and its coefficients,
+            shape (N, 3).
+        albedo_scale: Factor for the albedo of the mesh. It multiplies the lights
+            instead, because the materials in the file do not contain it.
 
     Returns:
-        Entry of each emitter, with file names instead of images.
+        Entry of each emitter for a Mitsuba scene. Patterns are names of files.
     """
     emitters: list[Scene] = []
     for basis, coefficients in lights:
@@ -445,37 +455,40 @@ def _local_emitters(
 
 
 class _PartWriter:
-    """Writer for the files of one part of a mesh, such as part_0.ply and texture_0.png."""
+    """Writer of one part of a mesh as files for Mitsuba, such as part_0.ply and texture_0.png.
+
+    All faces of the part have the same texture and the same specular reflection.
+    """
 
     def __init__(
         self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
     ) -> None:
-        """Store the arguments, and compute how much of the albedo a glossy part keeps.
+        """Store the arguments, and compute the fraction of light that passes a glossy coat.
 
         Args:
             folder: Folder for the files.
             number: Number of the part in the names of the files.
-            part: Part to write.
+            part: Part of the mesh to write.
             encoding: Encoding of the texture, "linear" or "srgb".
-            albedo_scale: Factor for the albedo of the mesh. The lights are
-                multiplied by it, not the materials.
+            albedo_scale: Factor for the albedo of the mesh. It multiplies the lights
+                of the scene, not the materials.
         """
         self._folder = folder
         self._number = number
         self._part = part
         self._encoding = encoding
         self._albedo_scale = albedo_scale
+        # Without metallic and specular factor, nothing is reflected specularly.
         is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
-        # A part without metallic and specular factor is matte.
         self._gloss = part.gloss if is_glossy else None
         # Factor for the albedo, because less light is reflected below a coat.
-        self._kept = 1.0 if self._gloss is None else _kept_fraction(self._gloss)
+        self._albedo_factor = 1.0 if self._gloss is None else _reflected_albedo(self._gloss)
 
     def write(self) -> Scene:
-        """Write the files of the part.
+        """Write the mesh and the textures of the part as files.
 
         Returns:
-            Entry of the shape with its material.
+            Entry of the mesh and its material for a Mitsuba scene.
         """
         mesh_file = self._write_mesh()
         albedo = self._albedo()
@@ -486,7 +499,7 @@ class _PartWriter:
         return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
 
     def _write_mesh(self) -> str:
-        """Write the .ply file, in which each corner of a face is a vertex.
+        """Write a .ply file in which each corner of each face is a vertex of its own.
 
         Returns:
             Name of the file.
@@ -494,14 +507,15 @@ class _PartWriter:
         import trimesh
 
         part = self._part
-        # u, v, red, green and blue of each corner, shape (3 F, 5).
-        corner_values = np.concatenate([part.uvs, self._kept * part.colors], axis=-1)
+        colors = self._albedo_factor * part.colors
+        # Texture coordinates u and v, red, green and blue of each corner, shape (3 F, 5).
+        corner_values = np.concatenate([part.uvs, colors], axis=-1)
         corner_values = corner_values.reshape(-1, 5).astype(np.float32)
         surface = trimesh.Trimesh(
             part.positions.reshape(-1, 3),
             np.arange(len(corner_values)).reshape(-1, 3),
             vertex_normals=part.normals.reshape(-1, 3),
-            # The attributes of the .ply file have the names u, v, r, g and b.
+            # Mitsuba reads the attributes u, v, r, g and b of the vertices of a .ply file.
             vertex_attributes=dict(zip("uvrgb", corner_values.T, strict=True)),
             process=False,
         )
@@ -510,55 +524,63 @@ class _PartWriter:
         return name
 
     def _albedo(self) -> Scene:
-        """Write the texture as an image if the part has one.
+        """Write the texture of the part as an image file, if there is a texture.
 
         Returns:
-            Entry of the albedo, which is the image or the vertex colors.
+            Albedo for a Mitsuba material: the image file, or the vertex colors.
         """
         texture = self._part.texture
         if texture is None:
             return {"type": "mesh_attribute", "name": "vertex_color"}
-        kept_albedo = self._kept * decode(torch.from_numpy(texture) / 255, self._encoding)
-        image = to_bytes(encode(kept_albedo, self._encoding))
+        albedo = self._albedo_factor * decode(torch.from_numpy(texture) / 255, self._encoding)
+        image = to_bytes(encode(albedo, self._encoding))
         name = f"texture_{self._number}.png"
         write_image(self._folder / name, Image.fromarray(image.numpy()))
         return {"type": "bitmap", "filename": name, "raw": self._encoding == "linear"}
 
     def _glossy_material(self, gloss: np.ndarray, albedo: Scene) -> Scene:
-        """Write roughness and metallic as images if the part has a gloss texture.
+        """Describe a material with specular reflection for Mitsuba.
+
+        If the part has a texture of roughness and metallic, it is written as image
+        files.
 
         Args:
             gloss: Roughness, metallic and specular factor, shape (3,).
-            albedo: Entry of the albedo.
+            albedo: Albedo for a Mitsuba material, as `_albedo` returns it.
 
         Returns:
-            Entry of the material.
+            Entry of the material, of the type "principled".
         """
-        # The albedo was multiplied by `_kept`. Metals need the full albedo, so metallic
-        # is divided by it.
-        roughness, metallic, specular_factor = (gloss / [1, self._kept, 1]).tolist()
-        # In `principled`, the reflectance at normal incidence is 0.08 · specular. It is
-        # 0.04 for our refractive index of 1.5. The lights were multiplied by the albedo
-        # scale, but the coat must not be brighter, so its reflectance is divided by it.
-        specular = specular_factor / 2 / max(self._albedo_scale, SMALLEST_SCALE)
+        roughness, metallic, specular_factor = gloss.tolist()
+        # A metal has no coat and needs the full albedo, but the albedo was multiplied by
+        # `_albedo_factor`. A larger value for metallic compensates for this.
+        metallic /= self._albedo_factor
+        # At normal incidence, the reflectance in Mitsuba is 0.08 · specular. It must be 0.04
+        # times the specular factor, for a refractive index of 1.5. The lights of the scene
+        # are multiplied by the albedo scale, so the reflectance is divided by it.
+        specular = specular_factor / 2 / max(self._albedo_scale, MIN_DIVISOR)
         return {
             "type": "principled",
             "base_color": albedo,
-            "specular": min(max(specular, SMALLEST_SPECULAR), 1.0),
+            "specular": min(max(specular, MIN_SPECULAR), 1.0),
             "roughness": self._gloss_value("roughness", roughness, minimum=MIN_ROUGHNESS),
             "metallic": self._gloss_value("metallic", metallic, minimum=0.0),
         }
 
     def _gloss_value(self, name: str, factor: float, minimum: float) -> Scene | float:
-        """Describe roughness or metallic as a number, or write it as an image.
+        """Describe the roughness or the metallic value of a material for Mitsuba.
+
+        If the part has a texture of roughness and metallic, one channel of the
+        texture is written as an image file.
 
         Args:
             name: "roughness" or "metallic".
-            factor: Value for all faces, or factor for the gloss texture.
+            factor: Value for all faces. If there is a texture, factor for the
+                texture.
             minimum: Smallest value that the renderer uses.
 
         Returns:
-            Number, or entry of an image.
+            Number, or entry of the image file for a Mitsuba scene.
         """
         factors = self._part.factors
         if factors is None:
@@ -570,7 +592,7 @@ class _PartWriter:
         return {"type": "bitmap", "filename": file_name, "raw": True}
 
 
-def _kept_fraction(gloss: np.ndarray) -> float:
+def _reflected_albedo(gloss: np.ndarray) -> float:
     """Compute which fraction of its albedo a glossy surface reflects under uniform light.
 
     A metal reflects all of the albedo. A dielectric reflects the albedo times the
