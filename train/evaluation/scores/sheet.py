@@ -200,7 +200,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
             images. The name of this curve is empty in the table.
         by_name: Log-odds of the positives and of the negatives of each source
             or label, by its name.
-        label: Positive classes in words, for the title of an axis.
+        label: Positive classes in words, for the title.
     """
     # This import is here because it takes half a second.
     from matplotlib.figure import Figure
