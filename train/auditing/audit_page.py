@@ -211,13 +211,16 @@ def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
             has a success.
 
     Returns:
-        The frames that `frames_of` returned, with the keys "network" and
-        "light" in addition. None if no attack has a success.
+        The result of `frames_of`, with the classes in words and the additional
+        keys "network" and "light". None if no attack has a success.
     """
     for name, by_kind in counts.items():
         for kind, part in by_kind.items():
             if "slider" in part:
-                return {"network": name, "light": KINDS[kind].title, **part["slider"]}
+                slider = part["slider"]
+                classes = [in_words(label) for label in slider["classes"]]
+                named = {"network": name, "light": KINDS[kind].title, "classes": classes}
+                return {**slider, **named}
     return None
 
 

@@ -235,4 +235,4 @@ def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> plots.P
         light: Kind of lighting, with its radii.
         lines: Fractions at each radius, by the name of the line.
     """
-    return plots.by_radius(lines, (0, *light.radii), light.title, f"radius, {light.unit}")
+    return plots.by_radius(lines, (0, *light.radii), light.title, f"radius ({light.unit})")

@@ -92,23 +92,23 @@ class LightKind(NamedTuple):
 KINDS = {
     "lighting": LightKind(
         title="light from all around",
-        unit="in each coefficient",
+        unit="change of each coefficient",
         radii=(0.02, 0.05, 0.1, 0.3),
     ),
     "skylight": LightKind(
         title="a daylight sky",
-        unit="times 57.3° of the sun, or 4 of turbidity",
+        unit="1 is 57.3° of the sun, or 4 of turbidity",
         radii=(0.1, 0.3, 1.0, 3.0),
     ),
     "projector": LightKind(
         title="a projector",
-        unit="of its power, in each pixel",
+        unit="fraction of its power, in each pixel",
         radii=(0.03, 0.1, 0.3, 1.0),
         local=(ProjectorSettings(),),
     ),
     "lamps": LightKind(
         title="four lamps",
-        unit="of power, in each channel",
+        unit="change of the power in each channel",
         radii=(0.3, 1.0, 3.0, 10.0),
         local=(LampsSettings(),),
     ),

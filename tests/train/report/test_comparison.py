@@ -314,7 +314,7 @@ def differences(oranges: np.ndarray, others: np.ndarray) -> list[float]:
 
 
 def bootstrap(methods: TwoArms, replicate_count: int) -> np.ndarray:
-    """Return 95 % intervals of the differences in recall and in AUC, shape (2, 2).
+    """Return 95% intervals of the differences in recall and in AUC, shape (2, 2).
 
     The loop draws seeds and images one replicate at a time.
     """

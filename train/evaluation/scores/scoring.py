@@ -449,7 +449,7 @@ def format_scores(scores: Scores) -> str:
 
 
 def format_overall(scores: Scores) -> str:
-    """Format the metrics of all images as one Markdown table, with 95 % intervals.
+    """Format the metrics of all images as one Markdown table, with 95% intervals.
 
     The table has a row for each metric. The metrics in `DETAILS` are left out.
 
@@ -472,7 +472,7 @@ def format_overall(scores: Scores) -> str:
         for metric, cell in zip(metric_titles, cells, strict=True):
             if metric not in details:
                 rows.append((metric, cell))
-    overall_table = Table(f"{title}; 95 % intervals", ["metric", scores.label], rows)
+    overall_table = Table(f"{title}; 95% intervals", ["metric", scores.label], rows)
     return "\n".join([str(overall_table), *_notes(scores)])
 
 
@@ -495,7 +495,7 @@ def _fraction_table(scores: Scores) -> Table:
     for title, metrics in _metrics_of_rows(scores):
         proportions: list[Proportion] = [getattr(metrics, name) for name in names]
         rows.append([title, *map(format_fraction, proportions)])
-    return Table("95 % intervals over images", ["", *map(metric_title, names)], rows)
+    return Table("95% intervals over images", ["", *map(metric_title, names)], rows)
 
 
 def _bootstrap_table(scores: Scores) -> Table:
@@ -515,7 +515,7 @@ def _bootstrap_table(scores: Scores) -> Table:
     for title, metrics in _metrics_of_rows(scores):
         rows.append([title, *(format_interval(metrics.find(name)) for name in names)])
     header = ["", *map(metric_title, names)]
-    return Table(f"95 % intervals over {resampled}", header, rows)
+    return Table(f"95% intervals over {resampled}", header, rows)
 
 
 def _class_table(scores: Scores) -> Table:

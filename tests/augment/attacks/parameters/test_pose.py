@@ -149,7 +149,7 @@ def result(attacked) -> augment.AttackResult:
 def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, by_color):
     """The grid has 9 × 9 views in the ball. The random poses are as many as descent renders.
 
-    Descent reaches at least 95 % of their gain.
+    Descent reaches at least 95% of their gain.
     """
     steps = torch.linspace(-3, 3, 9)
     grid = torch.zeros(81, 9)
