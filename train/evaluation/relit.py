@@ -44,6 +44,7 @@ TITLES = {
 }
 # Sentences of reports about what the simulation of the light leaves out.
 MODELED = (
+    "A slide is the picture that a projector shows. "
     "This models a flat print of each photograph in the light of a projector, with the shading of "
     "a random smooth surface. There are no cast shadows, highlights or changes of the shape."
 )
