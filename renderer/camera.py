@@ -417,7 +417,7 @@ class PerspectiveCamera(Camera):
     1.0
     """
 
-    # Only a perspective camera has its distance as a field.
+    # The distance is a field of perspective cameras only.
     distance: float = field(kw_only=True)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
@@ -609,7 +609,7 @@ class PinholeCamera(PerspectiveCamera):
         distance = float(np.linalg.norm(position)) or 1.0
         pivot = position - distance * back
         azimuth = math.atan2(back[1], back[0])
-        # Without roll, this horizontal vector would be the axis to the right.
+        # This horizontal vector would be the camera's axis to the right if there were no roll.
         right_without_roll = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         roll = math.atan2(-up @ right_without_roll, right @ right_without_roll)
         return cls(
@@ -911,6 +911,6 @@ def orbit_cameras(
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
     fov = _as_scalar("fov", fov)
     require_range("fov", fov, MIN_FOV, MAX_FOV)
-    # From this distance, `width` appears at the angle `fov`.
+    # The image of width `width` appears at the angle `fov` from this distance.
     distance = width / 2 / math.tan(math.radians(fov) / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

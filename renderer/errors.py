@@ -153,7 +153,7 @@ def require_file(path: str | Path, advice: str) -> None:
     Raises:
         InputError: If the path is not a regular file.
     """
-    # For an invalid name or a folder without permission, isfile returns False.
+    # isfile returns False for an invalid name, and in a folder without permission.
     if os.path.isfile(path):
         return
     problem = "is not a regular file" if os.path.exists(path) else "does not exist"

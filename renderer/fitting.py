@@ -89,14 +89,14 @@ CLIPPED_VALUE = 0.995
 # The light is fitted up to this many times. Each fit ignores the clipped pixels that the last
 # fit made brighter than 1.
 CLIPPING_ROUNDS = 3
-# In all directions of a grid, the radiance of a light must be at least this fraction of its
-# mean radiance. The margin keeps the radiance positive between the directions.
+# Smallest radiance of a light in all directions of a grid, as a fraction of its mean
+# radiance. The margin keeps the radiance positive between the directions.
 MIN_RADIANCE_RATIO = 0.01
 # Largest number of iterations of SciPy's `nnls`, per direction of the grid in which the
 # radiance of a light is constrained. Three iterations are usual.
 MAX_NNLS_ITERATIONS = 100
-# At first, the radiance of a light is only constrained in every 16th direction of the grid.
-# Directions in which it is negative are added afterwards.
+# The radiance of a light is first constrained in every 16th direction of the grid. Directions
+# in which the radiance is negative are added afterwards.
 FIRST_DIRECTION_STEP = 16
 # Number of subdivisions of the icosphere whose vertices are the directions in which the
 # radiance of a light is constrained, while a camera is searched.
@@ -833,7 +833,8 @@ def _fit_channels(
     # Coefficient 0 is uniform light, so this is the channel of the brightest color.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
-    # For each channel, the multiple of `best_light` with the smallest squared error.
+    # The expected light of a channel is the multiple of `best_light` with the smallest
+    # squared error.
     squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
     factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
@@ -951,8 +952,7 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     mask_low, mask_high = _mask_box(mask)
     mesh_area = float(np.prod(mesh_high - mesh_low))
     mask_area = float(np.prod(mask_high - mask_low))
-    # In the image of a camera that is wider by this factor, lengths are smaller by this
-    # factor.
+    # A camera that is wider by this factor shows the mesh smaller by this factor.
     factor = math.sqrt(mesh_area / mask_area)
     width = camera.width * factor
     mask_center = (mask_low + mask_high) / 2

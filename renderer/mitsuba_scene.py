@@ -337,7 +337,8 @@ def shape(
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)
     buffers["faces"] = faces.astype(np.uint32).ravel()
-    # In Mitsuba, v = 0 is the upper edge of a texture. In our meshes, it is the lower edge.
+    # The texture coordinate v = 0 is the upper edge of a texture in Mitsuba, and the lower
+    # edge in our meshes.
     texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
     values_by_name = {"positions": positions, "normals": normals, "texcoords": texcoords}
     for name, values in values_by_name.items():
@@ -478,7 +479,7 @@ class _PartWriter:
         self._part = part
         self._encoding = encoding
         self._albedo_scale = albedo_scale
-        # Without metallic and specular factor, nothing is reflected specularly.
+        # A surface whose metallic value and specular factor are 0 is matte.
         is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
         self._gloss = part.gloss if is_glossy else None
         # Factor for the albedo, because less light is reflected below a coat.
@@ -555,9 +556,9 @@ class _PartWriter:
         # A metal has no coat and needs the full albedo, but the albedo was multiplied by
         # `_albedo_factor`. A larger value for metallic compensates for this.
         metallic /= self._albedo_factor
-        # At normal incidence, the reflectance in Mitsuba is 0.08 · specular. It must be 0.04
-        # times the specular factor, for a refractive index of 1.5. The lights of the scene
-        # are multiplied by the albedo scale, so the reflectance is divided by it.
+        # Mitsuba's reflectance at normal incidence is 0.08 · specular. It must be 0.04 times
+        # the specular factor, for a refractive index of 1.5. The lights of the scene are
+        # multiplied by the albedo scale, so the reflectance is divided by it.
         specular = specular_factor / 2 / max(self._albedo_scale, MIN_DIVISOR)
         return {
             "type": "principled",

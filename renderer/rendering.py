@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
-# What errors ask for if the argument `lights` of `render` is wrong.
+# Words with which errors ask for the argument `lights` of `render`.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
 # Default camera for pictures of lights. It looks from the same direction as the first camera
 # of `orbit_cameras`.

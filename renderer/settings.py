@@ -400,8 +400,8 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
             raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
 
 
-# For each plain type, the function that tells whether a value is accepted for a field that
-# is annotated with this type.
+# Functions that tell whether a value is accepted for a field, by the type with which the
+# field is annotated.
 _CHECKS: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
     int: is_whole,

@@ -311,7 +311,7 @@ def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
     # rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
     edge_ends = faces[:, EDGES].reshape(-1, 2)
     vertex_count = faces.max(initial=0) + 1
-    # In a mesh of V vertices, an edge from vertex a to vertex b has the key a · V + b.
+    # An edge from vertex a to vertex b gets the key a · V + b, for V vertices.
     keys = edge_ends @ [vertex_count, 1]
     # Key of the same edge in the opposite direction: b · V + a.
     reversed_keys = edge_ends @ [1, vertex_count]
@@ -319,7 +319,7 @@ def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
     reversed_key_order = np.argsort(reversed_keys)
     sorted_keys = keys[key_order]
     is_repeated = (np.diff(sorted_keys) == 0).any()
-    # In closed surfaces, each edge occurs once in each direction, so the set of keys
+    # Each edge of a closed surface occurs once in each direction, so the set of keys
     # equals the set of reversed keys.
     if is_repeated or not np.array_equal(sorted_keys, reversed_keys[reversed_key_order]):
         return None
@@ -709,8 +709,8 @@ def _shared_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     vertex_count = len(mesh.vertices)
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
-    # In a mesh of V vertices, a side from vertex a to vertex b has the key a · V + b.
-    # np.unique sorts these numbers faster than pairs of vertices.
+    # A side from vertex a to vertex b gets the key a · V + b, for V vertices. np.unique
+    # sorts these numbers faster than pairs of vertices.
     side_keys = side_ends @ [vertex_count, 1]
     edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
     # Dividing the key a · V + b by V gives the quotient a and the remainder b.

@@ -96,7 +96,7 @@ def vertex_normals(
     vertex_of_corner = faces.T.flatten()
     zero_vectors = corner_vectors.new_zeros(3, len(vertices))
     vertex_vectors = zero_vectors.index_add(1, vertex_of_corner, corner_vectors)
-    # For each vertex, the sum of the lengths of the area vectors around it, shape (V,).
+    # Sum of the lengths of the area vectors around each vertex, shape (V,).
     zero_lengths = corner_vectors.new_zeros(len(vertices))
     corner_lengths = _length(corner_vectors.detach())
     length_sums = zero_lengths.index_add(0, vertex_of_corner, corner_lengths)
@@ -341,7 +341,7 @@ def _power_of_two(edges: Tensor) -> Tensor:
     """
     if not edges.numel():
         return edges.new_ones(())
-    # For a number x > 0, frexp gives the exponent e with 2^(e - 1) <= x < 2^e.
+    # frexp gives the exponent e of a number x > 0 with 2^(e - 1) <= x < 2^e.
     _, exponent = torch.frexp(edges.abs().max())
     return torch.ldexp(edges.new_ones(()), exponent)
 
@@ -405,7 +405,7 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         - the exact difference minus the rounded difference.
     """
     rounded = a - b
-    # Without rounding, `negative_b` would be -b, and both errors would be 0.
+    # `negative_b` would be -b without rounding, and both errors would be 0.
     negative_b = rounded - a
     error_of_a = a - (rounded - negative_b)
     error_of_b = b + negative_b

@@ -553,7 +553,7 @@ def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # Each quadrilateral becomes the triangles a, b, c and a, c, d.
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     ring_of_face = np.repeat(np.arange(ring_count - 1), 2 * point_count)
-    # At the first and at the last ring, half of the triangles have two equal corners.
+    # Half of the triangles at the first and at the last ring have two equal corners.
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])
     return vertices, faces[has_area], ring_of_face[has_area]
 

@@ -34,7 +34,7 @@ def read_image(path: str | Path, size: int) -> Tensor:
         InputError: If the file does not exist or cannot be read.
     """
     require_file(path, "give an image file")
-    # For a damaged file, Pillow can raise almost any exception.
+    # Pillow can raise almost any exception for a damaged file.
     try:
         square = read_square(path, size)
     except Exception as error:
@@ -158,7 +158,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
     if image.mode == "F":
         raise ValueError("the pixels are floating-point numbers, so the value of white is unknown")
     if image.mode.startswith("I"):
-        # In the mode "I", a pixel has 16 bits. `Image.convert` would clip such values at
+        # Pixels of the mode "I" have 16 bits. `Image.convert` would clip their values at
         # 255 instead of dividing them by 256.
         scaled = np.clip(np.asarray(image) // 256, 0, 255)
         return Image.fromarray(scaled.astype(np.uint8))

@@ -173,7 +173,7 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
     if suffix not in formats:
         known = ", ".join(sorted(formats))
         raise InputError(f"{path} has no known mesh format: use one of {known}")
-    # For a damaged file, trimesh and Pillow can raise almost any exception.
+    # trimesh and Pillow can raise almost any exception for a damaged file.
     try:
         return _read_parts(path, suffix, linear, gloss)
     except Exception as error:
@@ -268,7 +268,7 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
             Path(self.parent, Path(relative_path).name),
         )
         for file in candidates:
-            # For a named pipe, `is_file` is False. Reading a pipe might never end.
+            # `is_file` is False for a named pipe. Reading a pipe might never end.
             if file.is_file() and file.suffix.lower() == ".mtl":
                 self.materials = _as_utf8(file.read_bytes())
                 return self.materials

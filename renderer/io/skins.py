@@ -149,13 +149,13 @@ def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -
     joint_count = len(skeleton.joints)
     # Weight with which each joint moves each vertex.
     weights = np.zeros((len(part.vertices), joint_count))
-    # For each joint, the matrix that maps a vertex of the part to the position in the
-    # scene to which this joint alone would move the vertex, shape (J, 4, 4).
+    # Matrix of each joint that maps a vertex of the part to the position in the scene to
+    # which this joint alone would move the vertex, shape (J, 4, 4).
     matrices = node_matrix[None].repeat(joint_count, axis=0)
     joints_above = skeleton.joints_from(node_number)
     if "skin" in tree["nodes"][node_number]:
         skin = tree["skins"][tree["nodes"][node_number]["skin"]]
-        # For each joint of this skin, its index among the J joints of the file.
+        # Index of each joint of this skin among the J joints of the file.
         joint_indices = np.array([skeleton.index_of[joint] for joint in skin["joints"]])
         attributes = scene.geometry[geometry_name].vertex_attributes
         # glTF stores matrices column by column, so they are transposed.
@@ -292,7 +292,7 @@ def _add_weights(
         if not name.startswith(JOINTS):
             continue
         values = attributes[name.replace(JOINTS, WEIGHTS)]
-        # In glTF, the largest value of an unsigned integer type stands for the weight 1.
+        # The largest value of an unsigned integer type stands for the weight 1 in glTF.
         largest = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
         values = values / largest
         # A joint with the weight 0 may be any number, so it is replaced by joint 0.
