@@ -211,7 +211,8 @@ class Camera(ABC):
         cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
-        # This sum is sin_polar, except for rounding errors.
+        # The sum equals sin_polar, except for rounding errors. Using sin_polar instead would
+        # change the last bits of images.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
         up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]

@@ -64,9 +64,9 @@ MAX_STEPS = 20
 # The refinement of a camera ends if a step changes the squared error, or the camera, by less
 # than this fraction.
 MIN_GAIN = 1e-3
-# Step sizes of numerical derivatives for an image of one pixel: for the polar angle and the
-# azimuth in radians, the relative width, and the shifts right and up as fractions of the
-# width. Larger images have smaller steps. The shifts are always half a pixel.
+# Step sizes of numerical derivatives, times the image size in pixels. The five parameters
+# of a camera are the polar angle and the azimuth in radians, the relative width, and the
+# shifts right and up as fractions of the width.
 DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
 # Smallest angle in radians between a refined camera and +z or -z. Exactly there, the azimuth
 # would have no effect.
@@ -101,7 +101,8 @@ FIRST_DIRECTION_STEP = 16
 # Number of subdivisions of the icosphere whose vertices are the directions in which the
 # radiance of a light is constrained, while a camera is searched.
 SEARCH_GRID = 2
-# The same number of subdivisions for the light that is returned.
+# Number of subdivisions of the icosphere whose vertices are the directions in which the
+# radiance of the returned light is constrained.
 FINAL_GRID = 5
 # The object covers a pixel completely if its share of the pixel is larger than this. A limit
 # of 0.99 would be too low: a white background in the other hundredth of the pixel can be
@@ -218,7 +219,7 @@ def fit_photograph(
     guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
     window = camera_image.window(center, side, guessed_up)
     scene = fit.fit(window, None)
-    # The first fit tells the direction for the second fit.
+    # The first fit gives a better direction of the z-axis for the second fit.
     up = _up_direction(scene.camera, window)
     # The camera of the photograph is upright, so the z-axis does not point to its right.
     up[0] = 0
@@ -481,8 +482,9 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
         cameras: Cameras in order of preference.
 
     Returns:
-        The cameras of which an axis differs from that of each earlier returned
-        camera by more than `MIN_CAMERA_ANGLE` degrees.
+        Different cameras in the same order. A camera is left out if all its axes
+        differ from those of an earlier camera by less than `MIN_CAMERA_ANGLE`
+        degrees.
     """
     kept_cameras: list[Camera] = []
     max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
@@ -556,11 +558,11 @@ class _Target(NamedTuple):
         """
         # 1 in pixels that the object covers completely, and 0 elsewhere, shape (1, H, H).
         is_inside = (mask > WHOLE_PIXEL).double()[None]
-        # Both means below are over a square of pixels around each pixel. Their quotient is
-        # the mean color of the inside pixels in this square.
+        # Side of the square of pixels around each pixel over which colors are averaged.
         side = 2 * BORDER + 1
         mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
         inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
+        # Mean color of those pixels of the square that lie inside of the object.
         border_color = mean_color / inside_fraction.clamp(min=1e-9)
         color = torch.where(is_inside > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
@@ -591,7 +593,7 @@ class _Target(NamedTuple):
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
         unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
-        # Radiance of the P covered pixels under each of these lights, shape (3, 49, P).
+        # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
         no_coverage = self.mask.new_zeros(self.size**2)
@@ -830,7 +832,7 @@ def _fit_channels(
         channel, the expected light is zero.
     """
     regularized = normal_matrix + torch.diag(penalty)
-    # Coefficient 0 is uniform light, so this is the channel of the brightest color.
+    # The brightest channel reflects most of a uniform light, which is coefficient 0.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
     # The expected light of a channel is the multiple of `best_light` with the smallest
@@ -852,8 +854,9 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
     grid, so the constraint is R x ≥ 0. With the Cholesky decomposition S = L Lᵀ
     and y = Lᵀ x, the problem is to find the point y of the cone
     {y: R L⁻ᵀ y ≥ 0} that is nearest to L⁻¹ w. By Moreau's decomposition, this
-    point is L⁻¹ w + L⁻¹ Rᵀ m, with the vector m ≥ 0 for which its length is
-    smallest. SciPy's `nnls` (non-negative least squares) finds m.
+    point is L⁻¹ w + L⁻¹ Rᵀ m. Here m ≥ 0 is the vector that makes the length of
+    this sum as small as possible. SciPy's `nnls` (non-negative least squares)
+    finds m.
 
     Args:
         matrices: Positive definite matrix S of each of C channels,
@@ -865,13 +868,14 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
     Returns:
         Light x of each channel, shape (49, C).
     """
-    # Matrix R of the docstring, shape (N, 49) for N directions.
+    # Matrix R that maps a light to its radiance in N directions, shape (N, 49).
     radiance_rows = _radiance_rows(grid)
     lights = []
     for matrix, right_side in zip(matrices.numpy(), right_sides.numpy(), strict=True):
         lower = np.linalg.cholesky(matrix)
-        # The vector L⁻¹ w and the matrix L⁻¹ Rᵀ of the docstring.
+        # L⁻¹ w is the value of y without constraints.
         unconstrained = solve_triangular(lower, right_side, lower=True)
+        # The columns of L⁻¹ Rᵀ are the vectors whose dot product with y must not be negative.
         constraints = solve_triangular(lower, radiance_rows.T, lower=True)
         nearest = _nearest_in_cone(unconstrained, constraints)
         # The light is x = L⁻ᵀ y.
@@ -880,18 +884,18 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
 
 
 def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[Any]:
-    """Find the nearest point that has no negative product with any of N vectors.
+    """Find the nearest point whose dot product with each of N vectors is not negative.
 
     Only few of the vectors limit the result. The problem is first solved with
-    some of them. Vectors whose product with the solution is negative are added
-    until there are none. The result is the same as with all vectors.
+    some of them. Vectors whose dot product with the solution is negative are
+    added until there are none. The result is the same as with all vectors.
 
     Args:
-        point: Given point, shape (K,).
+        point: Given point in K dimensions, shape (K,).
         constraints: The N vectors as columns, shape (K, N).
 
     Returns:
-        Point that is nearest to the given point, shape (K,).
+        Nearest point to the given point, shape (K,).
     """
     constraint_count = constraints.shape[1]
     is_used = np.arange(constraint_count) % FIRST_DIRECTION_STEP == 0

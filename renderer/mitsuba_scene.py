@@ -437,8 +437,8 @@ def _local_emitters(
         folder: Folder for the files.
         lights: Pairs of a `Lamps` or `Projector` object and its coefficients,
             shape (N, 3).
-        albedo_scale: Factor for the albedo of the mesh. It multiplies the lights
-            instead, because the materials in the file do not contain it.
+        albedo_scale: Factor for the albedo of the mesh. The lights are multiplied
+            by it instead of the materials.
 
     Returns:
         Entry of each emitter for a Mitsuba scene. Patterns are names of files.
@@ -471,8 +471,8 @@ class _PartWriter:
             number: Number of the part in the names of the files.
             part: Part of the mesh to write.
             encoding: Encoding of the texture, "linear" or "srgb".
-            albedo_scale: Factor for the albedo of the mesh. It multiplies the lights
-                of the scene, not the materials.
+            albedo_scale: Factor for the albedo of the mesh. The lights of the scene
+                are multiplied by it instead of the materials.
         """
         self._folder = folder
         self._number = number

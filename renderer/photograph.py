@@ -145,7 +145,7 @@ class Window:
         resolution = size * samples
         # Positions of all samples along one side, in pixels from the window center.
         offsets = ((np.arange(resolution) + 0.5) / resolution - 0.5) * self.side
-        # Positions upward from the window center of the sample rows of each row of pixels.
+        # Heights of samples above the window center, with one row for each row of pixels.
         # The first row of pixels is at the top.
         heights = -offsets.reshape(size, samples)
         rows = []

@@ -175,7 +175,7 @@ def render(
         closed=mesh.closed,
     )
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
-    # Computes the bounces and the shadows of environment light. None without both.
+    # Object that computes bounces and shadows of environment light. None without both.
     transport = build_transport(moved_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
@@ -184,7 +184,7 @@ def render(
         indirect = None
         if transport:
             surface = Surface(moved_mesh, view, settings, given_gloss=gloss)
-            # Takes the albedo and the environment light, and returns the radiance that
+            # Function of the albedo and the environment light. It returns the radiance that
             # shadows and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
         shaded_view = ShadedView(

@@ -32,7 +32,7 @@ from renderer.errors import (
 
 # Type variable for any settings class.
 Kind = TypeVar("Kind")
-# Default of a field that has no default, because the user must give a value.
+# Value of the argument `default` of `setting` for a field that the user must set.
 REQUIRED = MISSING
 
 # Allowed encodings of image values.
@@ -354,8 +354,8 @@ def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
     if limits and not is_number(value):
         raise InputError(f"{name}={describe(value)} must be a number", name)
     if not all(limit.holds(value, limit.end) for limit in limits):
-        ends = " and ".join(f"{limit.words} {limit.end:g}" for limit in limits)
-        raise InputError(f"{name}={value} must be {ends}", name)
+        range_in_words = " and ".join(f"{limit.words} {limit.end:g}" for limit in limits)
+        raise InputError(f"{name}={value} must be {range_in_words}", name)
 
 
 def _check_pair(name: str, value: Any, facts: Facts) -> None:

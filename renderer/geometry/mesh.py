@@ -630,7 +630,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
-    # The divided mesh has all old vertices, so it can take over the small faces.
+    # The vertex indices of the small faces are valid in the divided mesh, too, because it
+    # has all old vertices.
     arrays: dict[str, Any] = {}
     for name in PER_FACE:
         rows_of_small_faces = getattr(small_faces, name)

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 # if their sum is shorter than this fraction of the sum of their lengths. Such a short
 # sum consists of rounding errors only.
 CANCELLATION = 64 * torch.finfo(torch.float64).eps
-# A call may be about a few faces of a large mesh. If the mesh has at least this many
-# vertices per corner of these faces, only the vertices of these faces are processed,
-# which is then faster than processing all vertices.
+# Ratio of the vertices of a mesh to the corners of the given faces. From this ratio on, it
+# is faster to process only the vertices of these faces than all vertices of the mesh.
 SPARSE_VERTEX_RATIO = 2
 # A triangle counts as a sliver if the sine of the angle at its first corner is at most
 # this number. Below it, a plain float64 cross product of the two edges would have a
@@ -208,10 +207,11 @@ def area_vectors(
 
 
 class _AreaVectors(torch.autograd.Function):
-    """Area vectors of faces with their derivative, see `area_vectors`.
+    """Area vectors of faces, with their gradient with respect to the vertices.
 
-    The area vector of a face is u × v. The edges u and v lead from the first
-    corner of the face to the second and the third corner.
+    The area vector of a face is u × v, where the edges u and v lead from the
+    first corner of the face to the second and the third corner. It is normal to
+    the face, and its length is twice the area.
     """
 
     @staticmethod
@@ -269,8 +269,9 @@ class _AreaVectors(torch.autograd.Function):
             the faces have no gradient.
         """
         faces, edge_u, edge_v, scale = ctx.saved_tensors
-        # The gradient of g · (u × v) is v × g with respect to u, and g × u with
-        # respect to v. The second corner is the end of u, and the third the end of v.
+        # With g for `upstream`, the gradient of g · (u × v) is v × g with respect to u,
+        # and g × u with respect to v. The edge u ends at the second corner, and the edge
+        # v at the third corner.
         second_corner_gradient = _cross(edge_v, upstream)
         third_corner_gradient = _cross(upstream, edge_u)
         # The first corner is the start of both edges, so the signs are reversed.

@@ -59,14 +59,15 @@ class Skin:
         Returns:
             Displacements of the vertices in the axes of the mesh, shape (V, 3).
         """
-        # A row (x, y, z, 1) times the matrix minus the identity is a displacement.
+        # Subtracting the identity from the matrix of a joint gives a matrix that maps a
+        # point (x, y, z, 1) to its displacement.
         identity = torch.eye(4, 3).to(rotations)
         joint_matrices = torch.stack(self._joint_matrices(rotations))
-        # The matrices of the J joints below each other, shape (4 J, 3).
+        # Matrices of the J joints, one below the other, shape (4 J, 3).
         displacement_matrix = (joint_matrices - identity).flatten(0, 1)
-        # Shares of all joints in a row for each vertex, shape (V, 4 J). The matrix
-        # product below therefore adds up the displacements by all joints.
+        # Each row has the shares of all joints in the position of a vertex, shape (V, 4 J).
         carried = torch.from_numpy(self.carried).to(rotations).flatten(1)
+        # The matrix product adds up the displacements by all joints.
         return carried @ displacement_matrix
 
     def _joint_matrices(self, rotations: Tensor) -> list[Tensor]:

@@ -21,7 +21,8 @@ from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
-    import trimesh  # It takes half a second, so functions import it where they use it.
+    # Importing trimesh takes half a second, so the functions that need it import it.
+    import trimesh
     from trimesh.visual.material import PBRMaterial
 
 # Temporary names of the vertex attributes for colors and normals. trimesh writes attributes

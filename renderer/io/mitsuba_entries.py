@@ -133,6 +133,8 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
         Entry of the camera for a Mitsuba scene, as `sensor` returns it.
     """
     if isinstance(camera, PerspectiveCamera):
+        # The principal point is measured from the image center in halves of the image, and
+        # Mitsuba measures the image center from the principal point.
         film_center = (-camera.principal_right / 2, camera.principal_up / 2)
         pose = pose_of(camera)
         aspect = camera.pixel_aspect
@@ -155,7 +157,7 @@ def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
         Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     pose = camera.pose()
-    # The columns of the pose are the axes x, y and z and the position of the camera.
+    # The columns are the axes x, y and z and the position. Mitsuba's x and z are opposite.
     pose[:3] *= [-scale, scale, -1, 1]
     return pose
 

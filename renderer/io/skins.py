@@ -86,6 +86,8 @@ def _glb_with_json(content: bytes, text: bytes) -> bytes:
     """
     # The length of the JSON chunk of a .glb file must be a multiple of 4 bytes.
     text += b" " * (-len(text) % 4)
+    # The first 4 bytes of the file are "glTF". Then come the version, the length of the
+    # file, and the length of the JSON text.
     version, _, old_json_length = struct.unpack_from("<III", content, 4)
     other_chunks = content[GLB_HEADER_BYTES + old_json_length :]
     total_length = GLB_HEADER_BYTES + len(text) + len(other_chunks)
@@ -234,7 +236,7 @@ class _Skeleton:
         for parent, item in enumerate(nodes):
             for child in item.get("children", []):
                 self._parent_node[child] = parent
-        # A joint has more joints above it than its parent has.
+        # A child has more joints above it than its parent, so parents come first.
         self.joints = sorted(
             self._joint_nodes, key=lambda joint: (len(self.joints_from(joint)), joint)
         )

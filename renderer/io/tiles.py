@@ -123,7 +123,7 @@ def draw_grid(
     lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
     tops = list(accumulate((height + GAP for height in row_heights), initial=first_top))
 
-    # Another column would begin one GAP after the right edge of the last column.
+    # Another column would begin at lefts[-1], one GAP after the end of the last column.
     right = max(lefts[-1] - GAP, MARGIN + _text_width(heading, TITLE_SIZE))
     bottom = max(tops[-1] - GAP, first_top)
     sheet = Image.new("RGB", (right + MARGIN, bottom + MARGIN), PAPER)
