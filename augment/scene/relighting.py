@@ -19,7 +19,7 @@ from augment.scene.objects import SceneObject
 from renderer.camera import Camera
 from renderer.image import background_term
 from renderer.settings import ImageSettings
-from renderer.transport.operator_stacks import STACKED, OperatorStack, Rows
+from renderer.transport.operator_stacks import PIXELS_PER_STACK, OperatorStack, Rows
 from renderer.transport.operators import TransferOperator
 
 
@@ -89,7 +89,7 @@ class Relighting:
         """Assign an operator to each image, and a stack to each operator.
 
         Images of the same view share an operator. Each stack has as many
-        operators as fit into `STACKED`.
+        operators as fit into `PIXELS_PER_STACK`.
         """
         # The view of each operator: index of the object, and camera. Sorting by the object puts
         # the operators of one object into few stacks.
@@ -97,7 +97,7 @@ class Relighting:
         operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
         # Index in `_views_of_operators` of the operator of each image, shape (N,).
         self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
-        self._operators_per_stack = max(1, STACKED // self.settings.size**2)
+        self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.size**2)
         # Index of the stack of each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
         self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)

@@ -98,7 +98,8 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
     # The number s = 1 / (1 + λ)² of each row, in a shape that broadcasts to `values`.
     s = offset.new_zeros(())
-    # Squared distance of the point for s from the center, and its derivative by s.
+    # Squared distance between the center and the nearest point of the box, and its
+    # derivative with respect to s.
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
     for _ in range(_MAX_STEPS):

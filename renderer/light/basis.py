@@ -397,7 +397,7 @@ class SumBasis(Basis):
     parts: tuple[Harmonics | LocalBasis, ...]
 
     def __post_init__(self) -> None:
-        """Check that at most one part is an environment light."""
+        """Check that at most one of the bases in `parts` is environment light."""
         if sum(part.environment is not None for part in self.parts) > 1:
             raise InputError(
                 "parts has two environment lights: use one, and add the coefficients of both"

@@ -135,7 +135,7 @@ def read_map(path: str | Path) -> Tensor:
     except Exception as error:
         message = str(error).partition("\n")[0]
         raise InputError(f"environment map {path} cannot be read: {message}") from error
-    # The comparison is also False for NaN.
+    # NaN is refused, too, because a comparison with NaN is False.
     if not (np.abs(radiance) <= MAX_MAGNITUDE).all():
         raise InputError(
             f"environment map {path} has NaN, infinity or radiance above {MAX_MAGNITUDE:g}: "

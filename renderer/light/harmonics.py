@@ -344,7 +344,7 @@ def monomial_coefficients(degree: int) -> Tensor:
     divisors = []
     for a in range(degree, -1, -1):
         for b in range(degree - a, -1, -1):
-            # The first power of a, b and c = degree - a - b that is not zero.
+            # Divide by a, or by b if a = 0, or by the power of z (`degree`) if a = b = 0.
             divisors.append(a or b or degree)
     # First all monomials with a factor x, then those with a factor y but not x (the
     # last `degree` rows of the derivative with respect to y), and then z^degree.

@@ -87,6 +87,7 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
     window = torch.ones(len(coefficients), dtype=torch.float64)
     rows = max(FEWEST_ROWS, 2 * degree)
     for width in (1.0, NARROWER):
+        # Radiance of the narrower highlight for cameras in all directions.
         highlights = to_map(coefficients * (window * narrow_lobe)[:, None], rows)
         if (highlights >= 0).all():
             break

@@ -65,7 +65,7 @@ class Lamps(LocalBasis):
     def __post_init__(self) -> None:
         """Check the fields, and convert the positions to tuples of numbers."""
         positions = as_array("positions", self.positions)
-        if positions.shape[1:] != (3,) or not all(map(any, positions)):
+        if positions.shape[1:] != (3,) or (positions == 0).all(axis=1).any():
             raise InputError(
                 f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
                 "each lamp, and no lamp at the origin"

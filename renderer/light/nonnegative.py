@@ -343,7 +343,8 @@ def _split_channels(coefficients: Tensor) -> Array:
         SH coefficients of the R channels of all lights, float64, shape (R, 1, K).
         Each row is a light with one channel, as a `_QuadraticProgram` takes it.
     """
-    return coefficients.detach().mT.flatten(0, -2)[:, None].cpu().double().numpy()
+    rows = coefficients.detach().mT.flatten(0, -2)
+    return rows[:, None].cpu().double().numpy()
 
 
 class _QuadraticProgram:
@@ -382,9 +383,9 @@ class _QuadraticProgram:
         self._offset = original - center
         self._low = np.broadcast_to(low, original.shape)
         self._high = np.broadcast_to(high, original.shape)
-        # The point c + t (v - c) lies on the surface of the ball with this t. Constraints
-        # only move the solution closer to the center c, so a smaller t is never needed.
         distance = float(np.linalg.norm(self._offset))
+        # With this t, the point c + t (v - c) lies on the surface of the ball. Constraints
+        # only move the solution closer to the center c, so a smaller t is never needed.
         self._min_t = min(radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
         self.nearest = self._unconstrained_point().clip(low, high)
@@ -422,9 +423,8 @@ class _QuadraticProgram:
             is_on_sphere = abs(missing) <= _RADIUS_TOLERANCE * self._radius
             if is_inside or is_on_sphere:
                 break
-            derivatives = list(
-                map(_differentiate, self._offset, nearest - target, self._active_constraints)
-            )
+            channels = zip(self._offset, nearest - target, self._active_constraints, strict=True)
+            derivatives = [_differentiate(*channel) for channel in channels]
             velocity = np.stack([derivative.solution for derivative in derivatives])
             # r² - |x - c|² = (r - |x - c|) (r + |x - c|).
             missing_squared = missing * (self._radius + distance)
@@ -452,9 +452,14 @@ class _QuadraticProgram:
             - the SH coefficients of the nearest light, shape (C, K);
             - for each channel, the rows of `constraints` with positive multipliers.
         """
-        solutions = map(_least_distance, target, constraints, self._low, self._high)
-        nearest, active_constraints = zip(*solutions, strict=True)
-        return np.stack(nearest), list(active_constraints)
+        nearest = []
+        active_constraints = []
+        channels = zip(target, constraints, self._low, self._high, strict=True)
+        for channel, rows, low, high in channels:
+            solution, active_rows = _least_distance(channel, rows, low, high)
+            nearest.append(solution)
+            active_constraints.append(active_rows)
+        return np.stack(nearest), active_constraints
 
     def _step_to_sphere(
         self, velocity: Array, displacement: Array, missing_squared: float
@@ -553,7 +558,8 @@ def _least_distance(
     if not len(harmonics):
         return original, harmonics
     size = len(original)
-    # Dividing h by this norm divides the result d by the norm, too.
+    # The vector h is divided by this norm, so that the numbers are not much larger than 1.
+    # The result d is then divided by it, too.
     norm = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
@@ -563,7 +569,9 @@ def _least_distance(
     from_high = (original - high)[is_bounded]
     # Vector h, with the entries in the order of the rows of G.
     right_sides = np.concatenate([-harmonics @ original, from_low, from_high])
+    # Matrix E of the problem of non-negative least squares.
     dual_matrix = np.concatenate([left_sides.T, right_sides[None] / norm])
+    # Vector f = (0, ..., 0, 1).
     last_unit_vector = np.eye(size + 1)[size]
     multipliers, _ = nnls(dual_matrix, last_unit_vector)
     residual = dual_matrix @ multipliers

@@ -580,7 +580,7 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
     # Axes: Fresnel term, lobe function, polynomial in the roughness, polynomial in the
     # cosine.
     coefficients = table[term_indices, :function_count]
-    # Both have one row for each polynomial and one column for each sample.
+    # Values of polynomials: one row for each polynomial, one column for each sample.
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = roughness_polynomials(roughness)
     if has_one_roughness:

@@ -354,7 +354,8 @@ class _Irradiance(torch.autograd.Function):
         polynomial = _IrradiancePolynomial(light)
         # Each pair has the irradiance of a block of normals, and its gradient.
         pairs = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
-        value, gradient = (torch.cat(blocks, dim=-1) for blocks in zip(*pairs, strict=True))
+        value = torch.cat([block_value for block_value, _ in pairs], dim=-1)
+        gradient = torch.cat([block_gradient for _, block_gradient in pairs], dim=-1)
         # Deleting the list releases the memory of the blocks.
         del pairs
         zero_normals = torch.nonzero(lengths == 0).squeeze(1)

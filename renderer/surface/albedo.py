@@ -331,7 +331,6 @@ def paint_faces(
             values.
     """
     sample_to_seen_face = fragments.sample_to_seen_face
-    # Added color at the S samples and of the G seen faces.
     added_at_samples = face_albedo(added, fragments)
     added_to_face = added.index_select(0, fragments.faces)
     hue_of_face = None

@@ -21,17 +21,17 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Int
 
-# `find_distinct_pixels` finds equal pixels only if there are at least so many copies. With
+# Equal pixels are only searched in views with at least this many copies of pixels. With
 # fewer copies, copying the results would take more time than it saves.
 FEWEST_COPIES = 2**12
 
 
 @dataclass(frozen=True)
 class DistinctPixels:
-    """The distinct pixels of a view, and the other pixels, which are copies of them.
+    """The D distinct pixels of a view, and the other pixels, which are copies of them.
 
-    A pixel is an index of a covered pixel, or of a pixel of the image (see
-    `at`).
+    Pixels are given by their indices among the P covered pixels, or, after `at`,
+    by other indices such as those in the image.
 
     Attributes:
         distinct: The D distinct pixels, ascending, shape (D,).
@@ -45,7 +45,7 @@ class DistinctPixels:
     copy_to_distinct: Int[Tensor, " copies"]
 
     def at(self, new_index: Tensor) -> DistinctPixels:
-        """Replace the index of each pixel by another index.
+        """Return a copy in which pixels have other indices, such as those in the image.
 
         Args:
             new_index: New index of each covered pixel, shape (P,).
@@ -71,7 +71,8 @@ class DistinctPixels:
         distinct = self.distinct.expand(*batch_shape, -1)
         copies = self.copies.expand(*batch_shape, -1)
         copy_to_distinct = self.copy_to_distinct.expand(*batch_shape, -1)
-        # On a CPU, gather and scatter_ take half the time of index_select and index_copy_.
+        # On a CPU, `scatter_` and `gather` take half the time of `index_copy_` and
+        # `index_select`.
         canvas.scatter_(-1, distinct, values)
         return canvas.scatter_(-1, copies, values.gather(-1, copy_to_distinct))
 
@@ -95,10 +96,10 @@ class DistinctPixels:
 def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | None:
     """Find the covered pixels that are equal because the same face fills them.
 
-    All samples of a face must reflect the same light per albedo.
+    All samples of a face must reflect the same light, up to their albedo.
 
     Args:
-        fragments: Covered samples of a view, in P pixels.
+        fragments: Samples of a view that show the mesh, in P pixels.
         albedo: Albedo of each pixel, shape (3, P).
 
     Returns:
@@ -108,16 +109,17 @@ def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels
     pixel_count = len(fragments.pixels)
     if pixel_count < FEWEST_COPIES:
         return None
-    # Runs of samples of one face that fill a pixel.
-    runs = fragments.runs
-    filling_runs = indices_of_true(runs.sample_count == fragments.samples**2)
-    filled_pixels = runs.run_to_pixel.index_select(0, filling_runs)
-    filling_face = runs.run_to_seen_face.index_select(0, filling_runs)
-    # First of the pixels that each face fills.
+    # A group is all samples of one face in a pixel.
+    groups = fragments.groups
+    filling_groups = indices_of_true(groups.sample_count == fragments.samples**2)
+    filled_pixels = groups.group_to_pixel.index_select(0, filling_groups)
+    filling_face = groups.group_to_seen_face.index_select(0, filling_groups)
+    # For each seen face, the first of the pixels that it fills.
     face_to_first_pixel = filling_face.new_full((len(fragments.faces),), pixel_count)
     face_to_first_pixel.scatter_reduce_(0, filling_face, filled_pixels, "amin")
     first_pixels = face_to_first_pixel.index_select(0, filling_face)
-    # Indices are faster than masks here.
+    # Positions in `filled_pixels` of the pixels that are copies of another pixel. Selecting
+    # with indices is faster than with a mask.
     copying = indices_of_true(filled_pixels != first_pixels)
     copies = filled_pixels.index_select(0, copying)
     originals = first_pixels.index_select(0, copying)
@@ -138,7 +140,7 @@ def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels
 def indices_of_true(mask: Tensor) -> Tensor:
     """Return the indices of the entries of a mask that are true.
 
-    NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
+    This takes a quarter of the time of `torch.nonzero`.
 
     Args:
         mask: Mask, shape (N,).

@@ -25,11 +25,10 @@ from renderer.transport.rays import NO_FACE, Rays, Surface
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
 
-# `SparseTransfer.is_sparse`: A matrix with a smaller fraction of nonzero entries is
-# faster to multiply entry by entry than as a dense matrix.
+# A matrix with a smaller fraction of nonzero entries is faster to multiply entry by entry
+# than as a dense matrix.
 SPARSE_FRACTION = 1 / 16
-# `SparseTransfer.is_sparse`: A matrix with at most this many entries is always
-# faster to multiply as a dense matrix.
+# A matrix with at most this many entries is always faster to multiply as a dense matrix.
 SMALL_MATRIX_SIZE = 2**16
 
 
@@ -48,25 +47,26 @@ class SparseTransfer(NamedTuple):
     weight: Tensor
 
     def dense(self, pixel_count: int) -> tuple[Tensor, Tensor]:
-        """Write the entries into a dense matrix.
+        """Write the entries into a dense matrix, without rows that would only have zeros.
 
         Args:
             pixel_count: Number P of covered pixels.
 
         Returns:
             A tuple of
-            - the matrix of the L functions that have an entry, shape (C, L, P);
+            - the matrix with one row for each of the L basis functions that have an
+              entry, in C color channels, shape (C, L, P);
             - the indices of these functions, ascending, shape (L,).
         """
         functions, row_of_entry = self.function.unique(return_inverse=True)
-        # Matrix with both axes flattened into one, shape (C, L · P).
+        # For each channel, all rows of the matrix after each other.
         zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
         flat_position = row_of_entry * pixel_count + self.pixel
         flat_matrix = zeros.index_copy_(1, flat_position, self.weight.T)
         return flat_matrix.unflatten(1, (len(functions), pixel_count)), functions
 
     def is_sparse(self, pixel_count: int) -> bool:
-        """Tell whether multiplying entry by entry is faster than multiplying `dense`.
+        """Tell whether multiplying entry by entry is faster than a product with `dense`.
 
         Args:
             pixel_count: Number P of covered pixels.
@@ -88,7 +88,7 @@ class SparseTransfer(NamedTuple):
         return SparseTransfer(*(field.to(device) for field in self))
 
     def radiance(self, lights: Tensor, image: Tensor, pixel_count: int) -> Tensor:
-        """Compute the radiance of B images, each under a light of its own.
+        """Compute the radiance of B images, each with its own light.
 
         The entries must have three channels. They may belong to several views.
         The result is differentiable with respect to the lights.
@@ -101,18 +101,19 @@ class SparseTransfer(NamedTuple):
         Returns:
             Radiance, shape (B, 3, P).
         """
-        # Axes are flattened, because selecting along one axis is fastest.
+        # Row of the coefficient of each entry, if the coefficients of all images are
+        # written below each other.
         light_row = image * lights.shape[1] + self.function
         contributions = lights.flatten(0, 1).index_select(0, light_row) * self.weight
         radiance_row = image * pixel_count + self.pixel
-        # Radiance of the P pixels of all B images, shape (B · P, 3).
+        # One row for each pixel of each image, one column for each color.
         zeros = contributions.new_zeros(len(lights) * pixel_count, 3)
         radiance = zeros.index_add(0, radiance_row, contributions)
         return radiance.unflatten(0, (len(lights), pixel_count)).mT
 
 
 def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
-    """Concatenate the entries of several transfer matrices in order.
+    """Concatenate the nonzero entries of several transfer matrices, in their order.
 
     Args:
         parts: Nonzero entries of each matrix.
@@ -152,12 +153,12 @@ def local_transfer(
     """
     fragments = surface.fragments
     paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
-    # Radiance of the sample at the end of each path per unit coefficient, divided
-    # by the number of samples in a pixel.
+    # One row for each path, one column for each channel: radiance of the sample at the end
+    # of the path, per unit of the coefficient of its light.
     weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None]
     weights = weights / fragments.samples**2
-    # Paths with the same pixel and the same basis function are added up into one
-    # entry. Sorting one number for both is faster than sorting pairs.
+    # The paths of a pixel that come from the same basis function are added up to one entry.
+    # Pixel and function are combined to one number, because sorting numbers is faster.
     pixel_of_path = fragments.sample_to_pixel[paths.point]
     key_of_path = pixel_of_path * basis.size + paths.function
     keys, path_to_entry = key_of_path.unique(return_inverse=True)
@@ -193,7 +194,7 @@ def local_radiance(
         Radiance of the P pixels, times their coverage, float64, shape (3, P).
     """
     fragments = fragments or surface.fragments
-    # Irradiance in three channels at the end of each of E paths, shape (E, 3).
+    # Irradiance at the end of each path: one row for each path, one column for each color.
     irradiance = paths.irradiance[:, None] * light[paths.function]
     radiance = _reflectance(surface, albedo, paths) / fragments.samples**2 * irradiance
     pixel_of_path = fragments.sample_to_pixel[paths.point]
@@ -202,7 +203,7 @@ def local_radiance(
 
 
 def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
-    """Compute the reflected radiance per irradiance at the end of each of E light paths.
+    """Compute the reflected radiance, per irradiance, at the ends of E paths of light.
 
     Args:
         surface: Points, normals and gloss at the S samples of the view.
@@ -218,15 +219,17 @@ def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
     gloss = surface.gloss
     if gloss is None:
         return path_albedo
-    # `unit` takes the three components along the first axis.
+    # The function `unit` takes vectors with their components along the first axis.
     to_light = unit((paths.source - surface.points[sample]).T).T
     normals = surface.normals[sample]
     path_gloss = gloss.at(sample)
-    # Metals tint the `colored` part of the specular reflection with their albedo.
-    colored, white = path_gloss.reflect_beams(normals, at_samples(surface.toward, sample), to_light)
-    leaving = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
-    # Light enters the diffuse layer below the coat, and leaves it again.
-    diffuse = leaving * path_gloss.coat_transmittance((normals * to_light).sum(1))
+    to_camera = at_samples(surface.toward, sample)
+    # The reflection of metals (colored) is multiplied by the albedo. All other specular
+    # reflection (white) has the color of the light.
+    colored, white = path_gloss.reflect_beams(normals, to_camera, to_light)
+    diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
+    # The transmittance is the fraction of light that passes the coat to the diffuse layer.
+    diffuse = diffuse_factor * path_gloss.coat_transmittance((normals * to_light).sum(1))
     return path_albedo * (diffuse + colored)[:, None] + white[:, None]
 
 
@@ -238,7 +241,7 @@ def unoccluded(
     planes: Tensor,
     positions: Tensor | None = None,
 ) -> LightPaths:
-    """Find the paths from local lights to surface points that no face blocks.
+    """Find the paths from local lights to surface points that no face of the mesh blocks.
 
     A path must also arrive above the plane of the face on which the point lies.
 
@@ -255,7 +258,7 @@ def unoccluded(
         Unblocked paths.
     """
     paths = basis.connect(points, normals, positions)
-    # The test whether a path is blocked has no gradient.
+    # Whether a path is blocked has no gradient, so no operations are recorded.
     with torch.no_grad():
         plane_of_path = planes[paths.point]
         origins = points[paths.point] + rays.offset * plane_of_path
@@ -272,17 +275,18 @@ def unoccluded(
 
 
 class LocalLightView:
-    """A view of one mesh whose local lights and albedo change between renders.
+    """A view of one mesh that is rendered many times under lamps and projectors.
 
-    All computations run on the CPU, because rays are cast there. For lights that
-    stay in place, rays are cast once. For lamps that move, rays are cast in every
-    render. Derivatives hold fixed which lamps, and which pixels of a projected
-    pattern, light a sample.
+    The light and the albedo may change between the renders. All computations run
+    on the CPU, because rays are cast there. For lights that stay in place, rays
+    are cast once. For lamps that move, rays are cast in every render. Derivatives
+    hold fixed which lamps, and which pixels of a projected pattern, light a
+    sample.
 
     Args:
         rays: Rays among the faces of the mesh.
         mesh: Mesh that the view shows, with V vertices.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
         settings: Settings of the image.
         vertices: Vertex positions to use instead of `mesh.vertices`,
             shape (V, 3). None uses `mesh.vertices`.
@@ -303,12 +307,11 @@ class LocalLightView:
         self._rays = rays
         vertices = None if vertices is None else vertices.cpu()
         self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
-        # Reading these properties computes the points and normals now. They are
-        # differentiable with respect to `vertices`.
+        # `Surface` computes its properties when they are first read, which is here.
         self._points = self._surface.points
         self._normals = self._surface.normals
         self._planes = self._surface.planes
-        # Unblocked paths of lights that stay in place.
+        # For each light that stays in place, the paths that no face blocks.
         self._fixed_paths: dict[LocalBasis, LightPaths] = {}
 
     def radiance(
@@ -327,10 +330,10 @@ class LocalLightView:
         Args:
             basis: Basis of the local light.
             albedo: Linear albedo at the S samples, shape (S, 3).
-            light: Coefficients of the K basis functions, shape (K, 3).
+            light: RGB coefficients of the K basis functions, shape (K, 3).
             positions: Positions to which the L lamps have moved, shape (L, 3).
                 None uses the positions of the basis.
-            fragments: The same samples, grouped into other pixels. None uses the
+            fragments: The same samples, assigned to other pixels. None uses the
                 pixels of the view.
 
         Returns:
@@ -350,7 +353,7 @@ class LocalLightView:
         return radiance.to(light)
 
     def _find_paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
-        """Find the unblocked paths from local lights to the samples of the view.
+        """Find the paths from a local light to the samples of the view that no face blocks.
 
         Args:
             basis: Basis of the local light.
@@ -358,6 +361,6 @@ class LocalLightView:
                 the positions of the basis.
 
         Returns:
-            Unblocked paths.
+            Paths that no face blocks.
         """
         return unoccluded(self._rays, basis, self._points, self._normals, self._planes, positions)

@@ -20,13 +20,13 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# `TransferOperators` puts operators into one stack until their images have this
-# many pixels in total. Larger stacks are not faster.
-STACKED = 2**16
-# `TransferOperators` renders view by view if a stack would hold fewer operators
-# than this. A loop over the operators is then faster than a batched product.
-FEWEST = 8
-# Type of the first index of `canvas[rows]`, which selects images of a canvas.
+# Operators of small images are copied into common tensors (a stack) until their images have
+# this many pixels in total. Larger stacks are not faster.
+PIXELS_PER_STACK = 2**16
+# Views are rendered one by one if a stack would hold fewer operators than this. A loop over
+# the operators is then faster than a batched product.
+FEWEST_STACKED = 8
+# Type of an index that selects some images of a batch.
 Rows = slice | Tensor
 # Number of color channels.
 COLORS = 3
@@ -36,8 +36,8 @@ class TransferOperators(Sequence[TransferOperator]):
     """Sequence of the transfer operators of V views, which can render all views in one call.
 
     For small images, the first call of `image` copies the operators into
-    common tensors, called stacks. The stacks take about as much memory as the
-    operators.
+    common tensors (stacks), so that one batched product renders many views. The
+    stacks take about as much memory as the operators.
 
     Example:
         >>> import torch
@@ -55,7 +55,7 @@ class TransferOperators(Sequence[TransferOperator]):
     """
 
     def __init__(self, operators: Iterable[TransferOperator]):
-        """Collect operators.
+        """Create a sequence of operators, and check that they fit together.
 
         Args:
             operators: One or more operators. All operators must have the same
@@ -146,7 +146,7 @@ class TransferOperators(Sequence[TransferOperator]):
                 f"lights has shape {tuple(lights.shape)}, but light_per_view=True needs the shape "
                 f"({len(self)}, ..., {first.basis.size}, 3) for {len(self)} views"
             )
-        # Lights of each of the V views, shape (V, ..., coefficients, 3).
+        # One entry along the first axis for each view.
         view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
         size = first.settings.size
         image_shape = (*view_lights.shape[:-2], COLORS, size, size)
@@ -154,8 +154,8 @@ class TransferOperators(Sequence[TransferOperator]):
         if background_images.ndim > 3:
             background_images = _broadcast_background(background_images, image_shape)
         operators_in_stack = min(len(self), self._operators_per_stack)
-        # The gradient by the background is only available image by image.
-        if operators_in_stack < FEWEST or background_images.requires_grad:
+        # Only `_image_by_image` gives a gradient with respect to the background.
+        if operators_in_stack < FEWEST_STACKED or background_images.requires_grad:
             return self._image_by_image(view_lights, background_images)
         return self._stacked_images(view_lights, background_images, image_shape)
 
@@ -170,13 +170,16 @@ class TransferOperators(Sequence[TransferOperator]):
         """Render all V views, and compute the gradient of a loss with respect to the lights.
 
         Args:
-            lights: Coefficients of the lights, see `image`.
+            lights: Coefficients of the lights, shape (..., coefficients, 3), or
+                (V, ..., coefficients, 3) with `light_per_view`.
             loss_gradient: Function that takes the images, shape
                 (V, ..., 3, size, size), and returns the gradient of the loss
                 with respect to the images, in the same shape.
                 `torch.func.grad(loss)` makes such a function from a loss.
-            background: Background of the images, see `image`.
-            light_per_view: True if each view has its own lights, see `image`.
+            background: Gray value, color, or images in [0, 1] that broadcast to
+                (V, ..., 3, size, size).
+            light_per_view: True if each view has its own lights. False renders
+                every view under every light.
 
         Returns:
             A tuple of
@@ -204,16 +207,16 @@ class TransferOperators(Sequence[TransferOperator]):
     def _operators_per_stack(self) -> int:
         """Number of operators in a full stack. The last stack may hold fewer."""
         pixels_per_image = self._operators[0].settings.size ** 2
-        return max(1, STACKED // pixels_per_image)
+        return max(1, PIXELS_PER_STACK // pixels_per_image)
 
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
-        """All operators in stacks of at most `_operators_per_stack`, on their device."""
+        """Stacks of at most `_operators_per_stack` operators, which hold all operators."""
         device = self._operators[0].distinct_transfer.device
         stacks = []
         for start in range(0, len(self), self._operators_per_stack):
             operators = self._operators[start : start + self._operators_per_stack]
-            # In this stack, image i shows operator i.
+            # Image i of a stack shows operator i.
             operator_of_image = torch.arange(len(operators))
             stacks.append(OperatorStack(operators, operator_of_image, device))
         return stacks
@@ -252,34 +255,34 @@ class TransferOperators(Sequence[TransferOperator]):
             Images in [0, 1], shape (V, ..., 3, size, size).
         """
         encoding = self._operators[0].settings.encoding
-        # One light for each of N images, all images of the first view first,
-        # shape (N, coefficients, 3).
+        # One light for each image. All images of the first view come first.
         lights = view_lights.flatten(0, -3).to(self._operators[0].distinct_transfer.dtype)
         lights_per_view = len(lights) // len(self)
-        # Shape (1, 3, size²) for one background, or (N, 3, size²).
+        # One background for each image, or a single one. The last axis has all pixels.
         backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
         first_image = 0
         targets = []
         covered_values = []
         for stack in self._stacks:
-            # Index in the stack of the operator that each image of the stack shows.
             operator_count = len(stack.shown)
+            # For each image, the operator of the stack that it shows: 0, 0, ..., 1, 1, ...
             operator_of_image = torch.arange(operator_count).repeat_interleave(lights_per_view)
             rows = slice(first_image, first_image + len(operator_of_image))
             first_image = rows.stop
             stack_backgrounds = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
-            # torch selects from a 2-D tensor ten times as fast as from a 3-D tensor.
+            # Merge the axes of images and colors, because torch selects from two axes ten
+            # times as fast as from three.
             at_pixels = stack_backgrounds.flatten(0, 1).index_select(1, stack.pixels)
             at_pixels = at_pixels.unflatten(0, (-1, COLORS))
             coverage = stack.coverage[operator_of_image.to(background.device)].to(background)
-            # Linear background, times the part of each pixel that shows no mesh.
+            # Linear background, times the fraction of each pixel that shows no mesh.
             behind = background_term(coverage, at_pixels, encoding)
             radiance = stack.radiance(lights[rows], operator_of_image).to(background.dtype)
             targets.append((rows, stack.pixels))
             covered_values.append(encode(clamp(radiance + behind), encoding))
         canvas = backgrounds.expand(len(lights), -1, -1)
         canvas = canvas.clone(memory_format=torch.contiguous_format)
-        # The background stays in the pixels that no operator of a stack covers.
+        # All other pixels keep the background.
         return ScatterLayers.apply(canvas, targets, *covered_values).view(image_shape)
 
 
@@ -310,7 +313,7 @@ class ScatterLayers(torch.autograd.Function):
     """Overwrite pixels of a batch of images in place, differentiable in the new values.
 
     A layer is a set of new pixel values for some of the N images. Its target is
-    a pair of the images (rows of the batch) and the pixels that are overwritten.
+    a pair: the images (rows of the batch), and the pixels that are overwritten.
     """
 
     @staticmethod
@@ -331,29 +334,30 @@ class ScatterLayers(torch.autograd.Function):
         """
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, layers, strict=True):
-            # On a CPU, scatter_ takes half the time of index_copy_.
+            # On a CPU, `scatter_` takes half the time of `index_copy_`.
             images = canvas[rows].scatter_(2, pixels.expand(values.shape), values)
             if isinstance(rows, Tensor):
-                # Indexing with a tensor copies the images, so write them back.
+                # Indices give a copy of the images, not a view. Write the copy back.
                 canvas.index_copy_(0, rows, images)
         return canvas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Select the gradients of the overwritten pixels.
+        """Compute the gradients with respect to the new values of the overwritten pixels.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the images, shape (N, 3, size²).
+            upstream: Gradient with respect to the images, shape (N, 3, size²).
 
         Returns:
-            None for the canvas and for the targets, and the gradient by the
-            values of each layer, shape (B, 3, P).
+            None for the canvas and for the targets, and for each layer, the
+            gradient with respect to its values, shape (B, 3, P).
         """
         gradients = []
         for rows, pixels in ctx.targets:
-            # torch selects from a 2-D tensor ten times as fast as from a 3-D tensor.
+            # Merge the axes of images and colors, because torch selects from two axes ten
+            # times as fast as from three.
             layer_gradient = upstream[rows].flatten(0, 1).index_select(1, pixels)
             gradients.append(layer_gradient.unflatten(0, (-1, COLORS)))
         return None, None, *gradients
@@ -396,8 +400,8 @@ class OperatorStack:
         """
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
-        # Padding appends the coefficient 0 if their number is odd. The row of this
-        # coefficient in `transfer` stays zero.
+        # If the number of coefficients is odd, append coefficient 0 once more. Its additional
+        # row in `transfer` stays zero.
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
         channel_count = max(len(operator.distinct_transfer) for operator in operators)
         like = operators[0].distinct_transfer
@@ -408,7 +412,8 @@ class OperatorStack:
         sparse_parts: list[SparseTransfer] = []
         entry_counts = []
         for index, operator in enumerate(operators):
-            # Where the operator's coefficients and pixels are in the common tensors.
+            # Rows and columns of the common tensors for the coefficients and the pixels of
+            # this operator.
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
             if channel_count < COLORS:
@@ -416,8 +421,7 @@ class OperatorStack:
                 channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:
-                # The stack has three channels. `by_channel` is the transfer of this
-                # operator in three channels, already multiplied by its albedo.
+                # Three color channels, which include the albedo. The factors `albedo` stay 1.
                 transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             if operator.sparse is not None:
@@ -426,7 +430,8 @@ class OperatorStack:
             entry_counts.append(0 if operator.sparse is None else len(operator.sparse.function))
         sparse = concatenate_entries(sparse_parts)
         self._sparse = sparse and sparse.to(device)
-        # The sparse entries of operator i are _first_entry[i] to _first_entry[i + 1] - 1.
+        # Operator i has the sparse entries from `_first_entry[i]` to
+        # `_first_entry[i + 1]` - 1.
         self._first_entry = F.pad(torch.tensor(entry_counts).cumsum(0), (1, 0))
         self.shown = shown
         self.pixels = pixels.to(device)
@@ -438,42 +443,42 @@ class OperatorStack:
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
         """Compute the linear radiance of A of the N images, differentiable in their lights.
 
+        A batched product needs the same number of lights for each operator. The
+        lights are therefore written to a table with one row for each operator that
+        the images show, and one column (slot) for each of its images. Slots stay
+        empty if an operator has fewer images than another operator.
+
         Args:
-            lights: All light coefficients of each of the A images,
+            lights: Light coefficients of each of the A images,
                 shape (A, coefficients, 3).
             images: Indices of the A images, int64, shape (A,), on the CPU.
 
         Returns:
             Radiance of the P pixels, shape (A, 3, P).
         """
-        # A batched product needs the same number of lights for each operator. The
-        # lights are therefore put on a grid with one row for each operator and one
-        # slot for each of its images. Slots stay empty if an operator is shown by
-        # fewer images than another operator.
         operator_of_image = self.shown[images]
         operators, image_to_row, images_per_row = torch.unique(
             operator_of_image, return_inverse=True, return_counts=True
         )
         slot_count = max(images_per_row.tolist(), default=0)
         slot_of_image = _rank_in_row(image_to_row, images_per_row)
-        # Row-major position of each image on the grid, shape (A,).
+        # Position of each image in the table, if all rows are written after each other.
         cell = image_to_row * slot_count + slot_of_image
         has_gaps = len(cell) != len(operators) * slot_count
         is_ordered = not has_gaps and bool((cell.diff() == 1).all())
         operators = operators.to(lights.device, non_blocking=True)
         cell = cell.to(lights.device, non_blocking=True)
-        # Coefficients that the stack uses, shape (A, K, 3).
+        # Axes: image, coefficient that changes a pixel, color.
         used_lights = lights.index_select(1, self._coefficients)
-        light_grid = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
-        light_grid = light_grid.index_copy(0, cell, used_lights)
-        # Light coefficients of each slot of each operator, for the K coefficients that
-        # the stack uses, shape (shown operators, slots, K, 3).
-        light_grid = light_grid.unflatten(0, (len(operators), slot_count))
+        light_table = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
+        light_table = light_table.index_copy(0, cell, used_lights)
+        # Axes: operator, slot, coefficient, color.
+        light_table = light_table.unflatten(0, (len(operators), slot_count))
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]
         albedo = self.albedo if shows_all_operators else self.albedo[operators]
-        # Radiance of the P pixels in each slot, shape (shown operators · slots, 3, P).
-        radiance = apply_transfer(light_grid, transfer, albedo).flatten(0, 1)
+        # Axes: cell of the table, color, pixel.
+        radiance = apply_transfer(light_table, transfer, albedo).flatten(0, 1)
         if not is_ordered:
             radiance = radiance.index_select(0, cell)
         if self._sparse is None:
@@ -484,10 +489,10 @@ class OperatorStack:
     def _select_entries(
         self, sparse: SparseTransfer, operator_of_image: Tensor
     ) -> tuple[SparseTransfer, Tensor]:
-        """Select the sparse entries of the operators that A images show.
+        """Select the nonzero matrix entries of the operators that A images show.
 
         Args:
-            sparse: Sparse entries of all operators of the stack.
+            sparse: Nonzero entries of all operators of the stack.
             operator_of_image: Index of the operator of each image, int64,
                 shape (A,), on the CPU.
 
@@ -501,8 +506,8 @@ class OperatorStack:
         first_in_stack = self._first_entry[operator_of_image]
         entry_count = self._first_entry[operator_of_image + 1] - first_in_stack
         image_of_entry = torch.arange(len(operator_of_image)).repeat_interleave(entry_count)
-        # The entries of an image are consecutive in `sparse` and in the result, so
-        # the two positions of an entry differ by the same number for all of them.
+        # All entries of an image follow each other, in `sparse` and in the result. The two
+        # positions of an entry therefore differ by the same number for all entries.
         first_in_result = entry_count.cumsum(0) - entry_count
         offset_of_image = first_in_stack - first_in_result
         position_in_stack = torch.arange(len(image_of_entry)) + offset_of_image[image_of_entry]
@@ -513,7 +518,7 @@ class OperatorStack:
 
 
 def _rank_in_row(item_to_row: Tensor, items_per_row: Tensor) -> Tensor:
-    """Count, for each of A items, the earlier items in the same row.
+    """For each of A items, count the earlier items in the same row of a table.
 
     For example, items in the rows 1, 0, 1 have the ranks 0, 0, 1.
 
@@ -524,7 +529,7 @@ def _rank_in_row(item_to_row: Tensor, items_per_row: Tensor) -> Tensor:
     Returns:
         Rank of each item in its row, from 0, int64, shape (A,).
     """
-    # Sorted by row, the items of a row are next to each other, in their old order.
+    # Sort the items by row. The items of a row keep their order.
     sorted_items = item_to_row.argsort(stable=True)
     first_of_row = items_per_row.cumsum(0) - items_per_row
     sorted_ranks = torch.arange(len(item_to_row)) - first_of_row[item_to_row[sorted_items]]

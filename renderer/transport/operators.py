@@ -51,25 +51,25 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Names of the tensors that `TransferOperator.to` moves.
+# Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.
 TENSORS = ("albedo", "coverage", "pixels", "nonzero")
-# Number of pixels that `_box_filter` processes at once. The sums of so many pixels stay
-# in the cache of the processor.
+# Number of pixels that `_box_filter` processes at once. Their values fit into the cache of
+# the processor.
 BLOCK = 2**12
-# Number of products of a sample and a coefficient that `_glossy_box_filter` processes at
-# once. It limits the memory, which is several numbers for each product.
-GLOSSY = 2**20
+# The transfer of a glossy surface is computed for this many pairs of a sample and an SH
+# coefficient at once. It limits the memory.
+GLOSSY_BLOCK = 2**20
 # Number of color channels.
 COLORS = 3
 
 
 @dataclass(frozen=True)
 class TransferOperator:
-    """Transfer matrix of a view of a mesh.
+    """Transfer matrix of a view of a mesh, which maps a light to an image.
 
     The matrix maps the coefficients of a light to the linear radiance of the P
-    covered pixels, times the coverage of each pixel. All floating-point tensors
-    have the same dtype.
+    covered pixels (those that show the mesh), times the coverage of each pixel.
+    All floating-point tensors have the same dtype.
 
     Attributes:
         distinct_transfer: Radiance of the D distinct pixels per unit of each of K
@@ -144,14 +144,14 @@ class TransferOperator:
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
-            # A chain of operations of autograd also gives the gradient by the
+            # Separate operations of autograd also give the gradient with respect to the
             # background.
             images = as_background(background, self.settings.size, lights)
             coverage = self.coverage.to(lights)
             radiance = self.radiance(lights)
             return composite(radiance, coverage, self.pixels, images, self.settings.encoding)
-        # A single operation of autograd is faster, but only gives the gradient by the
-        # lights.
+        # A single operation of autograd is faster. It only gives the gradient with respect
+        # to the lights.
         return _Image.apply(lights, self, self._prepare_background(background, lights))
 
     def image_and_gradient(
@@ -236,18 +236,19 @@ class TransferOperator:
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
     ) -> Float[Tensor, "*lights coefficients 3"]:
-        """Convert the gradient of a loss by the radiance to the gradient by the lights.
+        """Convert the gradient of a loss from the radiance to the lights, without autograd.
 
-        This is a product with the transposed matrix,
-        ∂loss/∂U = T ∂loss/∂radiance, without autograd.
+        With the transfer matrix T and the lights U, the radiance is Uᵀ T. The
+        gradients are therefore ∂loss/∂U = T (∂loss/∂radiance)ᵀ.
 
         Args:
-            radiance_gradient: Gradient by the radiance of the P covered pixels,
-                shape (..., 3, P).
+            radiance_gradient: Gradient of the loss with respect to the radiance of
+                the P covered pixels, shape (..., 3, P).
 
         Returns:
-            Gradient by the lights, shape (..., coefficients, 3). It is exactly 0
-            for coefficients that reach no pixel.
+            Gradient of the loss with respect to the lights,
+            shape (..., coefficients, 3). It is exactly 0 for coefficients that do
+            not change any pixel.
 
         Raises:
             InputError: If the gradient has NaN or a wrong shape.
@@ -268,7 +269,7 @@ class TransferOperator:
     def _images(
         self, lights: Tensor, background: _PreparedBackground
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render images without autograd, and keep what the gradient needs.
+        """Render images without autograd, and return what the gradient needs.
 
         Args:
             lights: Coefficients, shape (..., coefficients, 3).
@@ -284,7 +285,7 @@ class TransferOperator:
         """
         unclamped = self._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
-        # Values at the limits 0 and 1 have a gradient, as in `renderer.image.clamp`.
+        # 1 for values in [0, 1], including the limits. Only these have a gradient.
         is_unclamped = unclamped.eq_(clamped)
         encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
         canvas = background.images
@@ -299,22 +300,25 @@ class TransferOperator:
         if self._distinct_in_image is not None:
             self._distinct_in_image.write(encoded, images)
         else:
-            # On a CPU, scatter_ takes half the time of index_copy_.
+            # On a CPU, `scatter_` takes half the time of `index_copy_`.
             images.scatter_(-1, pixel_index, encoded)
         return images.view(image_shape), is_unclamped, clamped
 
     def _gradient_of_images(
         self, image_gradient: Tensor, is_unclamped: Tensor, clamped: Tensor
     ) -> Tensor:
-        """Convert the gradient of a loss by the images of `_images` to the gradient by the lights.
+        """Convert the gradient of a loss from the images of `_images` to the lights.
 
         Args:
-            image_gradient: Gradient by the images, shape (..., 3, size, size).
-            is_unclamped: Second result of `_images`, shape (..., 3, D).
-            clamped: Third result of `_images`, shape (..., 3, D).
+            image_gradient: Gradient with respect to the images,
+                shape (..., 3, size, size).
+            is_unclamped: 1 for values of the D distinct pixels that clamping did not
+                change, and 0 for other values, shape (..., 3, D).
+            clamped: Clamped linear values of the distinct pixels,
+                shape (..., 3, D).
 
         Returns:
-            Gradient by the lights, shape (..., coefficients, 3).
+            Gradient with respect to the lights, shape (..., coefficients, 3).
         """
         flat_gradient = image_gradient.flatten(-2)
         if self._distinct_in_image is not None:
@@ -323,13 +327,13 @@ class TransferOperator:
             pixel_index = self._pixels_by_color
             if is_unclamped.ndim > 2:
                 pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
-            # gather is faster than index_select, most of all for tensors with three axes.
+            # `gather` is faster than `index_select`, most of all for three axes.
             pixel_gradient = flat_gradient.gather(-1, pixel_index)
         if not self._is_linear:
             pixel_gradient = encode_gradient(clamped, pixel_gradient, self.settings.encoding)
         gradient = self._light_gradient(pixel_gradient.mul_(is_unclamped))
-        # The few numbers of the result are checked first, which is fast. If one is not
-        # finite, `require_bounded` checks all pixels and raises the error.
+        # Checking the few numbers of the result is fast. If one is not finite,
+        # `require_bounded` checks the gradient of all pixels and raises the error.
         if not math.isfinite(gradient.sum().item()):
             require_bounded(image_gradient=pixel_gradient)
         return gradient
@@ -351,14 +355,14 @@ class TransferOperator:
                 f"lights has shape {tuple(lights.shape)}, but {self.basis} needs the shape "
                 f"(..., {self.basis.size}, 3): give lights of this basis"
             )
-        # In small images, this test takes half the time of `require_bounded`. If it
-        # fails, `require_bounded` raises the error.
+        # The sum of squares is faster to check than each value. If it is too large or NaN,
+        # `require_bounded` checks each value and raises the error.
         values = lights.detach().reshape(-1)
         if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
-        """Compute the radiance of the D distinct pixels, without autograd and without checks.
+        """Compute the radiance of the D distinct pixels, without autograd or checks of `lights`.
 
         Args:
             lights: Coefficients, shape (..., coefficients, 3).
@@ -368,9 +372,9 @@ class TransferOperator:
             shape (..., 3, D).
         """
         dtype = self.distinct_transfer.dtype
-        # The K coefficients that have columns in the matrix, shape (..., K, 3).
+        # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero)
-        # In small images, even a call of `to` that converts nothing takes notable time.
+        # A call of `to` that converts nothing takes notable time for small images.
         if lights.dtype != dtype:
             used_lights = used_lights.to(dtype)
         if self._shared is not None:
@@ -380,26 +384,29 @@ class TransferOperator:
         else:
             radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.distinct_transfer)
         if self.sparse is not None:
-            # Contribution of each entry to its pixel, shape (..., entries, 3).
             light_of_entry = lights.to(radiance.dtype).index_select(-2, self.sparse.function)
+            # Radiance that each nonzero entry of the matrix adds to its pixel: one row for
+            # each entry, one column for each color.
             contributions = light_of_entry * self.sparse.weight
             radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
         return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
     def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """Convert the gradient by the radiance of the D distinct pixels, without checks.
+        """Convert a gradient from the radiance of the D distinct pixels to the lights.
 
         Args:
-            radiance_gradient: Gradient by the radiance, shape (..., 3, D).
+            radiance_gradient: Gradient with respect to the radiance, which is not
+                checked, shape (..., 3, D).
 
         Returns:
-            Gradient by the lights, shape (..., coefficients, 3).
+            Gradient with respect to the lights, shape (..., coefficients, 3).
         """
         upstream = radiance_gradient
         dtype = self.distinct_transfer.dtype
         if upstream.dtype != dtype:
             upstream = upstream.to(dtype)
-        # Gradient by the K used coefficients, shape (..., 3, K). `linear(a, b)` is a bᵀ.
+        # Compute the gradient with respect to the K used coefficients, shape (..., 3, K). The
+        # function `linear(a, b)` of torch is a bᵀ.
         if self._shared is not None:
             used_gradient = linear(upstream * self._distinct_albedo, self._shared)
             if self._white is not None:
@@ -408,8 +415,9 @@ class TransferOperator:
             used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.distinct_transfer)
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
-            # Contribution of each entry to its coefficient, shape (..., entries, 3).
             gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
+            # Gradient that each nonzero entry of the matrix adds to its coefficient: one row
+            # for each entry, one column for each color.
             contributions = gradient_of_entry * self.sparse.weight
             gradient = gradient.index_add(-2, self.sparse.function, contributions)
         return (
@@ -419,9 +427,10 @@ class TransferOperator:
     def _prepare_background(
         self, background: float | Tensor, lights: Tensor
     ) -> _PreparedBackground:
-        """Convert a background to images, and compute its part in the covered pixels.
+        """Convert a background to images, and compute what it adds to the covered pixels.
 
-        The result for a gray value and a single light is cached for the next call,
+        In a pixel that the mesh covers partly, the background is visible, too. The
+        result for a gray value and a single light is cached for the next call,
         because optimizations call `image` many times with the same background.
 
         Args:
@@ -443,7 +452,7 @@ class TransferOperator:
         return self._background_cache["prepared"]
 
     def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
-        """Flatten background images, and compute their part in the covered pixels.
+        """Flatten background images, and compute what they add to the covered pixels.
 
         Args:
             images: Background images, shape (..., 3, size, size).
@@ -455,9 +464,9 @@ class TransferOperator:
         flat_images = images.flatten(-2)
         at_pixels = flat_images.index_select(-1, self._select_distinct(self.pixels))
         if self.settings.encoding != "linear":
-            # The last bit of a power depends on the position of a number in memory. To
-            # get the same bits as `composite`, the background is repeated for each
-            # light before it is decoded.
+            # Repeat the background for each light before it is decoded, as `composite` does.
+            # The decoding computes powers, whose last bit depends on the position of a
+            # number in memory.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
         coverage = self._select_distinct(self.coverage).to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
@@ -477,17 +486,17 @@ class TransferOperator:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        # On a GPU, the gradients of equal pixels would be added up in another order in
-        # each run, so the copy treats all pixels as distinct.
+        # The copy treats all pixels as distinct. On a GPU, the gradients of equal pixels would
+        # be added up in a random order, so that results would differ between runs.
         transfer = self.transfer.to(device)
         return replace(self, distinct_transfer=transfer, **tensors, sparse=sparse, distinct=None)
 
     @cached_property
     def transfer(self) -> Tensor:
-        """Transfer of all covered pixels, shape (C, K, P).
+        """Transfer matrix of all P covered pixels, in C channels, shape (C, K, P).
 
-        If pixels are equal, the transfer of the distinct pixels is copied to all
-        pixels when this property is first read.
+        If some pixels are equal, this property copies `distinct_transfer` to all
+        pixels when it is first read.
         """
         if self.distinct is None:
             return self.distinct_transfer
@@ -497,15 +506,15 @@ class TransferOperator:
 
     @property
     def by_channel(self) -> Tensor:
-        """Transfer in three channels, which include the albedo, shape (3, K, P)."""
+        """Transfer matrix in three color channels, which include the albedo, shape (3, K, P)."""
         if self._shared is None:
             return self.transfer
         shared, *white = self.transfer
         colored = shared * self.albedo[:, None]
         return colored + white[0] if white else colored
 
-    # These properties are cached, because in images of 32² pixels even an indexing
-    # operation or a comparison of dtypes takes notable time.
+    # The properties below are cached, because even indexing a tensor takes notable time for
+    # images of 32² pixels.
 
     @cached_property
     def _shared(self) -> Tensor | None:
@@ -524,7 +533,7 @@ class TransferOperator:
 
     @cached_property
     def _distinct_in_image(self) -> DistinctPixels | None:
-        """The same as `distinct`, with row-major indices in the image."""
+        """Groups of equal pixels as in `distinct`, with row-major indices of image pixels."""
         return None if self.distinct is None else self.distinct.at(self.pixels)
 
     def _select_distinct(self, values: Tensor) -> Tensor:
@@ -542,12 +551,12 @@ class TransferOperator:
 
     @cached_property
     def _background_cache(self) -> dict[str, Any]:
-        """Prepared background of the last gray value ("prepared"), and its arguments ("key")."""
+        """Cache for the background of the last call: its arguments ("key"), and "prepared"."""
         return {}
 
     @cached_property
     def _is_linear(self) -> bool:
-        """True if image values are linear, so that they are not encoded."""
+        """Whether images have linear values, which are not encoded as sRGB."""
         return self.settings.encoding == "linear"
 
     @cached_property
@@ -567,21 +576,21 @@ class TransferOperator:
 
     @cached_property
     def _placement(self) -> Tensor:
-        """Matrix that writes K coefficients to their places among all coefficients.
+        """Matrix that writes the K used coefficients to their places among all coefficients.
 
-        The product with the K used coefficients has exact zeros in all other
-        places. The shape is (coefficients, K).
+        All other places become exactly 0. The matrix has one row for each
+        coefficient, and one column for each used coefficient.
         """
         return torch.eye(self.basis.size).to(self.distinct_transfer)[:, self.nonzero]
 
 
 class _PreparedBackground(NamedTuple):
-    """Background of the images of an operator.
+    """Background of the images of an operator, in the form in which it is added.
 
     Attributes:
         images: Background images, shape (..., 3, size²).
-        term: Linear values to add to the radiance of the D distinct pixels,
-            shape (..., 3, D).
+        term: Linear values of the background that are added to the radiance of
+            the D distinct covered pixels, shape (..., 3, D).
     """
 
     images: Tensor
@@ -613,11 +622,11 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient by the lights.
+        """Compute the gradient with respect to the lights.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the radiance, shape (..., 3, P).
+            upstream: Gradient with respect to the radiance, shape (..., 3, P).
 
         Returns:
             Gradient, shape (..., coefficients, 3), and None for the operator.
@@ -628,15 +637,15 @@ class _Radiance(torch.autograd.Function):
 class _Image(torch.autograd.Function):
     """Images under a light, differentiable with respect to the light.
 
-    Product, background, clamping and encoding are one operation of autograd,
-    because autograd takes time for each operation.
+    The matrix product, the background, the clamping and the encoding are a single
+    operation of autograd, because autograd takes time for each operation.
     """
 
     @staticmethod
     def forward(
         ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground
     ) -> Tensor:
-        """Render the images.
+        """Render one image under each light.
 
         Args:
             ctx: Context of autograd.
@@ -655,35 +664,44 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the gradient by the lights.
+        """Compute the gradient with respect to the lights.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the images, shape (..., 3, size, size).
+            upstream: Gradient with respect to the images,
+                shape (..., 3, size, size).
 
         Returns:
             Gradient, shape (..., coefficients, 3), and None for the other two
             arguments of `forward`.
         """
-        # Gradients are recorded in this method only if the caller of autograd gave
-        # create_graph=True. Without this test, once_differentiable would take several
-        # percent of the time of an optimization step with small images.
+        # Second derivatives raise an error, which `once_differentiable` does. It takes
+        # notable time, so it is only used if the caller set create_graph=True.
         if torch.is_grad_enabled():
             return _Image._backward_once(ctx, upstream)
         return _Image._backward(ctx, upstream)
 
     @staticmethod
     def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the result of `backward`, without the error for second derivatives."""
+        """Compute the result of `backward`. Second derivatives would be wrong, without an error.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient with respect to the images,
+                shape (..., 3, size, size).
+
+        Returns:
+            The same as `backward`.
+        """
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped)
         return gradient, None, None
 
-    # `_backward` that raises an error if a second derivative is computed through it.
+    # The same function, but a second derivative through it raises an error.
     _backward_once = staticmethod(once_differentiable(_backward))
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
-    """Check that the gradient that a user's function returned has the shape of the images.
+    """Check that the result of a user's function `loss_gradient` has the shape of the images.
 
     Args:
         image_gradient: Result of the user's function `loss_gradient`.
@@ -706,25 +724,26 @@ def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
     """Compute the radiance of P pixels under B lights, with one or more transfer matrices.
 
-    The lights are the left factor of the product, which is several times faster
-    on a CPU.
+    The lights are the left factor of the matrix product, which is several times
+    faster on a CPU.
 
     Args:
         lights: The K used coefficients of each light, shape (..., B, K, 3).
-        transfer: Transfer in C = 1 to 3 channels, as in `TransferOperator`,
-            shape (..., C, K, P).
-        albedo: Factors for the shared channel, as in `TransferOperator`,
+        transfer: Transfer matrices in C channels, shape (..., C, K, P). With
+            C = 3, each color has a channel. With C = 1, all colors share a
+            channel. With C = 2, a channel of specular reflection follows the
+            shared channel.
+        albedo: Factors by which the shared channel is multiplied,
             shape (..., 3, P).
 
     Returns:
         Radiance, shape (..., B, 3, P).
     """
     if transfer.shape[-3] == COLORS:
-        # (..., 3, B, K) times (..., 3, K, P) is (..., 3, B, P).
+        # For each color, multiply the matrices (B, K) and (K, P).
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     shared, *white = transfer.unbind(-3)
-    # Rows for each pair of one of B lights and one of three colors, shape (..., B · 3, K).
-    # One matrix product then computes all lights and colors.
+    # One row for each pair of a light and a color, so that one matrix product computes all.
     light_rows = lights.mT.flatten(-3, -2)
     radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
     if white:
@@ -784,11 +803,11 @@ def build_operators(
 
 
 class _Channels(NamedTuple):
-    """Choice of the channels of a transfer matrix, and of where the albedo is multiplied.
+    """Number of channels of a transfer matrix, and the albedo with which it is computed.
 
-    If each color has a channel, the transfer includes the albedo of the S
-    samples. If all colors share a channel, the albedo of the P pixels is
-    multiplied later.
+    If each color has a channel, the matrix includes the albedo of the S samples.
+    If all colors share a channel, the matrix is computed for the albedo 1, and the
+    image is multiplied by the albedo of the P pixels later.
 
     Attributes:
         number: Number C of channels: 3 if each color has a channel, 1 if the
@@ -808,12 +827,13 @@ class _Channels(NamedTuple):
 
 
 class _DenseRows(NamedTuple):
-    """Rows of a transfer matrix, for K of the coefficients of a light.
+    """Rows of a transfer matrix for some of the coefficients of a light.
 
     Attributes:
-        transfer: Radiance of the P pixels per unit of each coefficient, in C
+        transfer: Radiance of the P pixels per unit of each of K coefficients, in C
             channels, shape (C, K, P).
-        coefficients: Indices of these coefficients in the light, shape (K,).
+        coefficients: Indices of the K coefficients among all coefficients of the
+            light, shape (K,).
     """
 
     transfer: Tensor
@@ -822,7 +842,7 @@ class _DenseRows(NamedTuple):
 
 @dataclass(frozen=True)
 class _OperatorBuilder:
-    """Computes the operators of the views of one mesh.
+    """Computes the transfer operators of the views of one mesh.
 
     Attributes:
         mesh: Mesh that the views show.
@@ -849,7 +869,7 @@ class _OperatorBuilder:
         """Compute the operator of one view.
 
         Args:
-            fragments: The S covered samples of the view, in P pixels.
+            fragments: The S samples of the view that show the mesh, in P pixels.
 
         Returns:
             Operator of the view.
@@ -860,15 +880,15 @@ class _OperatorBuilder:
         distinct = None
         if self._is_uniform_on_faces(surface, channels):
             distinct = find_distinct_pixels(fragments, albedo)
-        # Rows of the matrix as dense tensors, and as lists of nonzero entries.
+        # Rows of the matrix: as dense tensors, or as lists of nonzero entries.
         dense = []
         sparse = []
-        for part in self.basis.local_lights:
-            entries = self._local_entries(part, surface, channels)
+        for local_light in self.basis.local_lights:
+            entries = self._local_entries(local_light, surface, channels)
             if entries.is_sparse(len(fragments.pixels)):
-                sparse.append(self._sparse_rows(part, entries, channels))
+                sparse.append(self._sparse_rows(local_light, entries, channels))
             else:
-                dense.append(self._local_rows(part, entries, surface))
+                dense.append(self._local_rows(local_light, entries, surface))
         if self.basis.environment is not None:
             dense.append(
                 self._environment_rows(self.basis.environment, surface, channels, distinct)
@@ -887,33 +907,35 @@ class _OperatorBuilder:
         )
 
     def _is_uniform_on_faces(self, surface: Surface, channels: _Channels) -> bool:
-        """Tell whether all pixels that are filled by the same face have the same transfer.
+        """Tell whether two pixels that the same face fills have the same rows of the matrix.
 
-        This needs flat normals, no gloss, no shadows, and no local lights.
+        This needs flat normals, a matte surface in which all colors share a
+        channel, no shadows, no lamps and no projectors.
 
         Args:
             surface: Points and gloss at the samples of the view.
-            channels: Channels of the transfer.
+            channels: Channels and albedo of the transfer matrix.
         """
         is_matte = surface.gloss is None and channels.is_shared
         has_open_sky = self.transport is None and not self.basis.local_lights
         return is_matte and has_open_sky and self.settings.normals == "flat"
 
     def _channels(self, surface: Surface) -> _Channels:
-        """Choose as few channels as possible, without an error of the radiance.
+        """Choose how many channels the transfer matrix of a view needs.
+
+        If all samples of each pixel have the same albedo, the three colors can
+        share one channel: the matrix is computed for the albedo 1, and the images
+        are multiplied by the albedo of the pixels.
 
         Args:
             surface: Points and gloss at the S samples of the view.
 
         Returns:
-            Channels and albedo of the transfer.
+            Channels and albedo of the transfer matrix.
         """
         fragments = surface.fragments
         pixel_count = len(fragments.pixels)
         is_glossy = surface.gloss is not None
-        # If all samples of each pixel have the same albedo, the three colors can share one
-        # channel: the transfer is computed for the albedo 1, and the images are multiplied
-        # by the albedo of the pixels.
         pixel_albedo = None
         sample_albedo = None
         if self._needs_three_channels(is_glossy):
@@ -926,8 +948,9 @@ class _OperatorBuilder:
                 sample_albedo = self._surface_albedo(fragments)
                 pixel_albedo = _pixel_albedo(fragments, sample_albedo, self.dtype)
         if pixel_albedo is None:
-            # Three channels contain the albedo of the samples. The pixels get the albedo 1.
             assert sample_albedo is not None
+            # The three channels include the albedo of the samples, so the image is multiplied
+            # by 1 instead of the albedo of the pixels.
             return _Channels(
                 number=COLORS,
                 is_shared=False,
@@ -943,11 +966,12 @@ class _OperatorBuilder:
         )
 
     def _needs_three_channels(self, is_glossy: bool) -> bool:
-        """Tell whether the colors of the radiance cannot be expressed by a factor per pixel.
+        """Tell whether each color needs its own channel of the transfer matrix.
 
-        This is the case if bounced light is colored. It is also the case for a
-        glossy mesh with shadows or local lights, because `Transport.change` and
-        `local_transfer` add specular reflection to the channels with the albedo.
+        Otherwise, all colors share a channel, which is multiplied by the albedo of
+        the pixels. This is not possible if bounced light is colored. It is also
+        not possible for a glossy mesh with shadows or local lights, because they
+        add specular reflection, which has no albedo, to the same channel.
 
         Args:
             is_glossy: True if the mesh reflects specularly.
@@ -962,23 +986,26 @@ class _OperatorBuilder:
 
     def _environment_rows(
         self,
-        part: EnvironmentPart,
+        environment: EnvironmentPart,
         surface: Surface,
         channels: _Channels,
         distinct: DistinctPixels | None,
     ) -> _DenseRows:
-        """Compute the rows of the coefficients of environment light, with shadows and bounces.
+        """Compute the rows of the transfer matrix for environment light.
+
+        The rows contain shadows and bounces.
 
         Args:
-            part: Environment light of the basis.
+            environment: Environment light of the basis.
             surface: Points, normals and gloss at the samples of the view.
-            channels: Channels and albedo of the transfer.
-            distinct: Distinct pixels, or None.
+            channels: Channels and albedo of the transfer matrix.
+            distinct: Pixels that differ from each other, and their copies. None
+                computes all pixels.
 
         Returns:
             Rows of the matrix, for the distinct pixels if `distinct` is given.
         """
-        harmonics_basis = part.basis
+        harmonics_basis = environment.basis
         all_coefficients = torch.arange(harmonics_basis.size)
         if surface.gloss is None:
             weights = None if channels.is_shared else channels.sample_albedo
@@ -994,55 +1021,60 @@ class _OperatorBuilder:
         if self.transport is not None:
             change = self.transport.change(surface, channels.sample_albedo)
         if change is not None:
-            # The change has a row for each coefficient.
+            # Unlike `transfer`, the change has a row for every SH coefficient.
             transfer = change.index_add_(1, coefficients, transfer.double())
             coefficients = all_coefficients
-        return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
+        return _DenseRows(transfer.to(self.dtype), environment.rows.start + coefficients)
 
     def _local_entries(
-        self, part: LocalPart, surface: Surface, channels: _Channels
+        self, local_light: LocalPart, surface: Surface, channels: _Channels
     ) -> SparseTransfer:
-        """Compute the nonzero entries of the rows of a local light.
+        """Compute the nonzero entries of the transfer matrix for a lamp or a projector.
 
         Args:
-            part: Local light of the basis.
+            local_light: Local light of the basis.
             surface: Points, normals and gloss at the samples of the view.
-            channels: Channels and albedo of the transfer.
+            channels: Channels and albedo of the transfer matrix.
 
         Returns:
-            Nonzero entries, with indices of the functions of this light.
+            Nonzero entries. Their basis functions are counted from the first
+            function of this light.
         """
-        return local_transfer(self.rays, surface, channels.sample_albedo, part.basis)
+        return local_transfer(self.rays, surface, channels.sample_albedo, local_light.basis)
 
-    def _local_rows(self, part: LocalPart, entries: SparseTransfer, surface: Surface) -> _DenseRows:
-        """Write the entries of a local light into dense rows.
+    def _local_rows(
+        self, local_light: LocalPart, entries: SparseTransfer, surface: Surface
+    ) -> _DenseRows:
+        """Write the nonzero entries of a local light into dense rows of the matrix.
 
         Args:
-            part: Local light of the basis.
-            entries: Nonzero entries, with indices of the functions of this light.
+            local_light: Local light of the basis.
+            entries: Nonzero entries. Their basis functions are counted from the
+                first function of this light.
             surface: Samples of the view.
 
         Returns:
-            Rows of the functions that reach a pixel.
+            Rows of the basis functions that reach a pixel.
         """
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
-        return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
+        return _DenseRows(transfer.to(self.dtype), local_light.rows.start + coefficients)
 
     def _sparse_rows(
-        self, part: LocalPart, entries: SparseTransfer, channels: _Channels
+        self, local_light: LocalPart, entries: SparseTransfer, channels: _Channels
     ) -> SparseTransfer:
-        """Convert the entries of a local light to three channels that include the albedo.
+        """Convert the nonzero entries of a local light to three channels with the albedo.
 
         Args:
-            part: Local light of the basis.
-            entries: Nonzero entries, with indices of the functions of this light.
-            channels: Channels and albedo of the transfer.
+            local_light: Local light of the basis.
+            entries: Nonzero entries. Their basis functions are counted from the
+                first function of this light.
+            channels: Channels and albedo of the transfer matrix.
 
         Returns:
-            Entries with indices of the coefficients of the whole basis.
+            Entries whose basis functions are counted among all coefficients.
         """
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
-        return SparseTransfer(part.rows.start + entries.function, entries.pixel, weight)
+        return SparseTransfer(local_light.rows.start + entries.function, entries.pixel, weight)
 
     def _concatenate(
         self, parts: list[_DenseRows], channel_count: int, pixel_count: int
@@ -1051,14 +1083,14 @@ class _OperatorBuilder:
 
         Args:
             parts: Rows of each light.
-            channel_count: Number C of channels, for a result without rows.
-            pixel_count: Number P of pixels, for a result without rows.
+            channel_count: Number of channels. It is needed if there are no rows.
+            pixel_count: Number of pixels. It is needed if there are no rows.
 
         Returns:
             Rows of all lights.
         """
         if len(parts) == 1:
-            # Concatenating a single part would copy it.
+            # The rows of a single light are returned as they are, because `cat` copies them.
             return parts[0]
         empty = torch.empty(channel_count, 0, pixel_count, dtype=self.dtype)
         ordered = sorted(parts, key=_first_coefficient)
@@ -1068,7 +1100,7 @@ class _OperatorBuilder:
 
 
 def _first_coefficient(rows: _DenseRows) -> int:
-    """Return the index of the first coefficient of some rows, or 0 if there are no rows."""
+    """Return the index of the coefficient of the first row, or 0 if there are no rows."""
     return int(rows.coefficients[0]) if len(rows.coefficients) else 0
 
 
@@ -1076,20 +1108,20 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     """Return the albedo of each pixel if all samples of each pixel have the same albedo.
 
     Args:
-        fragments: The S covered samples of a view, in P pixels.
+        fragments: The S samples of a view that show the mesh, in P pixels.
         albedo: Linear albedo of the samples, shape (S, 3).
         dtype: Data type whose rounding errors are ignored in the comparison.
 
     Returns:
-        Linear albedo, shape (P, 3). None if two samples of a pixel differ.
+        Linear albedo of the pixels, shape (P, 3). None if two samples of a pixel
+        differ.
     """
-    # Shape (3, S), with contiguous rows.
     sample_albedo = albedo.T
     zeros = sample_albedo.new_zeros(COLORS, len(fragments.pixels))
-    # The albedo of one sample stands for the pixel. The comparison below shows whether the
-    # other samples of the pixel have the same albedo.
+    # Each pixel gets the albedo of one of its samples. The comparison below shows whether
+    # its other samples have the same albedo.
     pixel_albedo = zeros.index_copy(1, fragments.sample_to_pixel, sample_albedo)
-    # In float64, gather takes a third of the time of index_select.
+    # In float64, `gather` takes a third of the time of `index_select`.
     sample_to_pixel = fragments.sample_to_pixel.expand(COLORS, -1)
     difference = (sample_albedo - pixel_albedo.gather(1, sample_to_pixel)).abs_()
     is_equal = difference <= torch.finfo(dtype).eps * sample_albedo
@@ -1103,12 +1135,12 @@ def _box_filter(
     dtype: torch.dtype,
     distinct: DistinctPixels | None = None,
 ) -> Tensor:
-    """Compute the transfer of a matte surface under an open sky.
+    """Compute the transfer matrix of a matte surface under an open sky, without shadows.
 
-    For each pixel, this is the mean of albedo · A_l Y_lm(n) over its samples,
-    which is called the box filter. A_l are the factors of
-    `harmonics.lambertian_factors`, Y_lm the harmonics, and n the normals. Sums
-    are computed in float64.
+    An entry for a pixel and an SH coefficient is the mean of albedo · A_l Y_lm(n)
+    over the samples of the pixel (box filter). A_l is the factor of the coefficient
+    in the irradiance (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the
+    normal of a sample. Sums are computed in float64.
 
     Args:
         surface: Normals at the S samples of a view, in P pixels.
@@ -1116,8 +1148,8 @@ def _box_filter(
             in a single channel.
         basis: SH basis, in which K functions change the irradiance.
         dtype: Data type of the result.
-        distinct: Distinct pixels, for flat normals and an albedo of 1. None
-            computes all pixels.
+        distinct: The D pixels that differ from each other, and their copies. This
+            needs flat normals and an albedo of 1. None computes all pixels.
 
     Returns:
         Radiance per unit of each of the K coefficients, shape (C, K, P), or
@@ -1127,14 +1159,14 @@ def _box_filter(
     pixel_count = len(fragments.pixels)
     is_flat = surface.settings.normals == "flat"
     if is_flat:
-        # A_l Y_lm(n) of each seen face, shape (G, K).
+        # Values A_l Y_lm(n): one row for each seen face, one column for each harmonic.
         face_values = basis.irradiance(surface.face_planes)
         if albedo is None and _are_pixels_mostly_filled(fragments):
             return _copy_from_faces(fragments, face_values, dtype, distinct)
-        # Each entry of a pixel's sum is a run of samples that show one face.
-        entry_to_pixel, entry_to_face, weights = _run_weights(fragments, albedo)
+        # A pixel is a sum over entries. Here, an entry is all samples of one face in a pixel.
+        entry_to_pixel, entry_to_face, weights = _group_weights(fragments, albedo)
     else:
-        # Each entry of a pixel's sum is a sample.
+        # A pixel is a sum over entries. With smooth normals, an entry is a sample.
         entry_to_pixel = fragments.sample_to_pixel
         weights = _sample_weights(fragments, albedo)
     transfer = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
@@ -1157,7 +1189,7 @@ def _box_filter(
 
 def _are_pixels_mostly_filled(fragments: Fragments) -> bool:
     """Tell whether more than half of the covered pixels show a single face in all samples."""
-    is_filled = fragments.runs.sample_count == fragments.samples**2
+    is_filled = fragments.groups.sample_count == fragments.samples**2
     return 2 * int(is_filled.sum()) > len(fragments.pixels)
 
 
@@ -1167,40 +1199,43 @@ def _copy_from_faces(
     dtype: torch.dtype,
     distinct: DistinctPixels | None,
 ) -> Tensor:
-    """Compute `_box_filter` for flat normals and an albedo of 1.
+    """Compute `_box_filter` for flat normals and an albedo of 1, by copying values of faces.
 
-    A pixel that a single face fills has the transfer of this face, which is
-    copied. Only the other pixels need sums over several faces.
+    A pixel that a single face fills has the values of this face. Only the other
+    pixels need sums over several faces.
 
     Args:
-        fragments: Covered samples of a view, in P pixels, which show G faces.
-        face_values: Transfer of each seen face, A_l Y_lm(n) for K functions,
-            shape (G, K).
+        fragments: Samples of a view that show the mesh, in P pixels. They show G
+            faces.
+        face_values: Irradiance A_l Y_lm(n) of each of the G faces from each of K
+            harmonics, shape (G, K).
         dtype: Data type of the result.
-        distinct: The D distinct pixels. None computes all pixels.
+        distinct: The D pixels that differ from each other, and their copies. None
+            computes all pixels.
 
     Returns:
-        Transfer, shape (1, K, P) or (1, K, D).
+        Transfer matrix, shape (1, K, P) or (1, K, D).
     """
-    run_to_pixel, run_to_face, sample_count = fragments.runs
-    runs_per_pixel = torch.bincount(run_to_pixel, minlength=len(fragments.pixels))
-    first_run = _row_starts(runs_per_pixel)[:-1]
+    # A group is all samples of one face in a pixel.
+    group_to_pixel, group_to_face, sample_count = fragments.groups
+    groups_per_pixel = torch.bincount(group_to_pixel, minlength=len(fragments.pixels))
+    first_group = _row_starts(groups_per_pixel)[:-1]
     if distinct is not None:
-        runs_per_pixel = runs_per_pixel.index_select(0, distinct.distinct)
-        first_run = first_run.index_select(0, distinct.distinct)
-    # A value that is copied from one face may be -0.0, but a sum that starts at 0.0 is never
-    # -0.0. Adding 0.0 turns -0.0 into 0.0, so that copies and sums have the same bits.
+        groups_per_pixel = groups_per_pixel.index_select(0, distinct.distinct)
+        first_group = first_group.index_select(0, distinct.distinct)
+    # Adding 0.0 turns -0.0 into 0.0. The copied values then have the same bits as sums, which
+    # start at 0.0 and are never -0.0.
     values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
-    # First give each pixel the values of the face in its first run, shape (K, pixels).
-    transfer = values_by_function.index_select(1, run_to_face.index_select(0, first_run))
-    # Then replace the pixels with several runs, or with uncovered samples.
-    is_partial_run = sample_count < fragments.samples**2
-    partial_runs = indices_of_true(is_partial_run)
-    partial_to_face = run_to_face.index_select(0, partial_runs)
-    partial_sample_count = sample_count.index_select(0, partial_runs)
+    # First give each pixel (column) the values of the face of its first group.
+    transfer = values_by_function.index_select(1, group_to_face.index_select(0, first_group))
+    # Then replace the pixels that no single face fills. Their groups are called partial.
+    is_partial_group = sample_count < fragments.samples**2
+    partial_groups = indices_of_true(is_partial_group)
+    partial_to_face = group_to_face.index_select(0, partial_groups)
+    partial_sample_count = sample_count.index_select(0, partial_groups)
     partial_weights = partial_sample_count.double() / fragments.samples**2
-    partial_pixels = indices_of_true(is_partial_run.index_select(0, first_run))
-    entry_starts = _row_starts(runs_per_pixel.index_select(0, partial_pixels))
+    partial_pixels = indices_of_true(is_partial_group.index_select(0, first_group))
+    entry_starts = _row_starts(groups_per_pixel.index_select(0, partial_pixels))
     for first in range(0, len(partial_pixels), BLOCK):
         block_starts = entry_starts[first : first + BLOCK + 1]
         entries = slice(int(block_starts[0]), int(block_starts[-1]))
@@ -1213,7 +1248,7 @@ def _copy_from_faces(
 
 
 def _row_starts(counts: Tensor) -> Tensor:
-    """Compute where the entries of each row begin, if the entries of all rows are concatenated.
+    """Compute where each row begins in a list of the entries of all rows.
 
     For example, rows with 2 and 3 entries give 0, 2, 5.
 
@@ -1233,20 +1268,22 @@ def _weighted_row_sums(
 ) -> Tensor:
     """Compute N weighted sums of rows of a matrix.
 
-    Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1. An
-    entry is a weight and a row of the matrix.
+    Each sum has several entries, and an entry is a weight and a row of the matrix.
+    Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1.
 
     Args:
         weights: Weight of each of E entries, shape (E,).
         entry_to_value: Index of the row of `values` of each entry, shape (E,).
-        entry_starts: First entry of each sum, and the end of the last sum,
-            shape (N + 1,). They may start at another number than 0.
+        entry_starts: Number of the first entry of each sum, and of the entry after
+            the last sum, shape (N + 1,). The first entry in `weights` has the
+            number `entry_starts[0]`.
         values: Matrix, shape (M, K).
 
     Returns:
         Sums, shape (N, K).
     """
-    # The weights are a sparse matrix (N, M), in compressed rows.
+    # The weights become a sparse matrix with one row for each sum and one column for each
+    # row of `values`, in the compressed format of SciPy.
     columns = entry_to_value.int().numpy()
     starts = (entry_starts - entry_starts[0]).int().numpy()
     shape = (len(entry_starts) - 1, len(values))
@@ -1254,30 +1291,35 @@ def _weighted_row_sums(
     return torch.from_numpy(weight_matrix @ values.numpy())
 
 
-def _run_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the weight of each run of samples, which show the same face, in its pixel.
+def _group_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute how much each face that a pixel shows contributes to the mean of the pixel.
+
+    A group is all samples of one face in a pixel.
 
     Args:
-        fragments: The S covered samples of a view, which form R runs.
+        fragments: The S samples of a view that show the mesh. They form R groups.
         albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
             in a single channel.
 
     Returns:
-        For each run, its pixel, shape (R,), its seen face, shape (R,), and its
-        weight, shape (R, C).
+        A tuple of
+        - the index into `fragments.pixels` of each group, shape (R,);
+        - the index into `fragments.faces` of each group, shape (R,);
+        - the sum of the albedo of the group, divided by the number of samples of a
+          pixel, shape (R, C).
     """
     if albedo is not None:
         return fragments.merge(albedo)
-    runs = fragments.runs
-    weights = runs.sample_count.double() / fragments.samples**2
-    return runs.run_to_pixel, runs.run_to_seen_face, weights[:, None]
+    groups = fragments.groups
+    weights = groups.sample_count.double() / fragments.samples**2
+    return groups.group_to_pixel, groups.group_to_seen_face, weights[:, None]
 
 
 def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
-    """Compute the weight of each sample in the mean of its pixel.
+    """Compute how much each sample contributes to the mean of its pixel.
 
     Args:
-        fragments: The S covered samples of a view.
+        fragments: The S samples of a view that show the mesh.
         albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
             in a single channel.
 
@@ -1292,7 +1334,7 @@ def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
 ) -> Tensor:
-    """Compute the transfer of a glossy surface under an open sky.
+    """Compute the transfer matrix of a glossy surface under an open sky, without shadows.
 
     Args:
         surface: Normals at the S samples of a view, in P pixels.
@@ -1304,27 +1346,30 @@ def _glossy_box_filter(
 
     Returns:
         Radiance per unit of each of the K coefficients, shape (3, K, P), or
-        (2, K, P) if all colors share a channel. The second channel is then
-        specular reflection with the color of the light, such as that of
-        dielectrics. With 3 channels, this reflection is added to each channel.
+        (2, K, P) if all colors share a channel. The second channel is then the
+        specular reflection with the color of the light, as dielectrics have it.
+        With 3 channels, this reflection is added to each channel.
     """
     fragments = surface.fragments
     color_count = albedo.shape[1]
     channel_count = 2 if color_count == 1 else color_count
     transfer = torch.zeros(channel_count, basis.size, len(fragments.pixels), dtype=dtype)
-    # Channels to which reflection with the color of the light is added.
+    # Index of the channels to which reflection with the color of the light is added: the
+    # second one if colors share a channel, and otherwise all.
     white_channels = 1 if color_count == 1 else slice(None)
     weights = albedo / fragments.samples**2
     diffuse_degree = min(basis.degree, harmonics.DIFFUSE_DEGREE)
-    pixels_per_block = max(1, GLOSSY // (basis.size * fragments.samples**2))
+    pixels_per_block = max(1, GLOSSY_BLOCK // (basis.size * fragments.samples**2))
     for block in _blocks(fragments.sample_to_pixel, transfer, pixels_per_block):
         normals = surface.normals[block.samples]
         to_camera = at_samples(surface.toward, block.samples)
         block_gloss = gloss.at(block.samples)
-        # Metals multiply the `colored` reflection by the albedo.
+        # The reflection of metals (colored) is multiplied by the albedo. All other specular
+        # reflection (white) has the color of the light.
         colored, white, frame = block_gloss.specular_transfer(normals, to_camera, basis.degree)
         diffuse = _diffuse_transfer(block_gloss, normals, to_camera, diffuse_degree)
-        # If all colors share a channel, zip stops before the second channel.
+        # If all colors share a channel, there is one weight, so the loop leaves out the
+        # second channel.
         for channel, weight in zip(block.transfer, weights[block.samples].T, strict=False):
             channel[: diffuse.shape[1]] = block.sum_by_pixel(diffuse * weight[:, None]).to(dtype)
             if colored is not None:
@@ -1337,12 +1382,13 @@ def _glossy_box_filter(
 def _diffuse_transfer(
     gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int
 ) -> Tensor:
-    """Compute the diffuse radiance of S samples below a coat, for an albedo of 1.
+    """Compute the diffuse radiance of S samples with a transparent coat, for an albedo of 1.
 
-    The light passes the coat when it enters the diffuse layer, and when it leaves.
+    The light passes the coat on its way to the diffuse layer below, and on its way
+    back.
 
     Args:
-        gloss: Gloss at the samples.
+        gloss: Specular material (gloss) at the samples.
         normals: Unit normals, shape (S, 3).
         to_camera: Unit vectors to the camera, shape (S, 3) or (1, 3).
         degree: Degree of the light, which has K coefficients.
@@ -1350,20 +1396,21 @@ def _diffuse_transfer(
     Returns:
         Radiance per unit of each coefficient, shape (S, K).
     """
-    # Irradiance below the coat, shape (S, K).
-    entering = harmonics.basis(normals, degree) * gloss.factors_below_coat(degree).T
-    return entering * gloss.diffuse_factor(normals, to_camera)[:, None]
+    # Irradiance below the coat: one row for each sample, one column for each coefficient.
+    irradiance = harmonics.basis(normals, degree) * gloss.factors_below_coat(degree).T
+    return irradiance * gloss.diffuse_factor(normals, to_camera)[:, None]
 
 
 class _Block(NamedTuple):
-    """B neighboring pixels of a view, with their S samples.
+    """B successive pixels of a view, with their S samples.
 
     Attributes:
-        samples: Slice of the samples of the view that lie in these pixels.
+        samples: Slice that selects these samples from all samples of the view.
         sample_to_pixel: Pixel of each of these samples, counted from the first
             pixel of the block, shape (S,).
-        transfer: View of the part of the transfer that belongs to these pixels,
-            in C channels for K coefficients, shape (C, K, B).
+        transfer: Columns of the transfer matrix that belong to these pixels, in C
+            channels for K coefficients, shape (C, K, B). Writing to this tensor
+            fills the matrix.
     """
 
     samples: slice
@@ -1371,7 +1418,7 @@ class _Block(NamedTuple):
     transfer: Tensor
 
     def sum_by_pixel(self, rows: Tensor) -> Tensor:
-        """Add up the values of the samples of each pixel.
+        """Add up values over the samples of each pixel.
 
         Args:
             rows: K values for each of the S samples of this block, shape (S, K).
@@ -1384,17 +1431,18 @@ class _Block(NamedTuple):
 
 
 def _blocks(sample_to_pixel: Tensor, transfer: Tensor, size: int) -> Iterator[_Block]:
-    """Split the P pixels of a view into blocks of neighboring pixels.
+    """Split the P pixels of a view into blocks of successive pixels.
 
     Args:
         sample_to_pixel: Pixel of each of the S samples of the view, ascending,
             shape (S,).
-        transfer: Transfer of the view, in C channels for K coefficients,
-            shape (C, K, P).
+        transfer: Transfer matrix of the view in C channels, with one row for each
+            of K coefficients and one column for each pixel, shape (C, K, P).
         size: Number of pixels of a block.
 
     Yields:
-        Next block, with a view of its part of the transfer.
+        Blocks in the order of the pixels. Writing to `_Block.transfer` fills
+        `transfer`.
     """
     first_sample = 0
     for first_pixel in range(0, transfer.shape[-1], size):

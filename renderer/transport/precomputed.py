@@ -47,11 +47,11 @@ from renderer.visibility.fragments import Fragments
 
 # Number of ray directions from each patch. They cover the whole sphere.
 PATCH_DIRECTIONS = 2**9
-# `Patches` divides a mesh into patches of about 1 / PATCHES of its area.
+# For light that bounces, the surface of a mesh is divided into about this many patches.
 PATCHES = 2**11
-# Corners (x, y) of a triangle that surrounds the center of an image. `Patches`
-# pretends that each piece of the mesh covers this triangle in the image, so that
-# the sample at the image center shows the center of the piece.
+# Image positions (x, y) of the corners of a triangle around the image center. In the
+# artificial view `Patches.view`, each piece of the mesh covers this triangle. A sample at
+# the image center then shows the center of the piece.
 AROUND_CENTER = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]
 # Values of `Fragments.facing` for the front and the back of a face.
 FRONT = 1.0
@@ -86,7 +86,7 @@ class Patches:
 
     @staticmethod
     def from_mesh(mesh: Mesh) -> "Patches":
-        """Divide a mesh into patches.
+        """Divide the surface of a mesh into patches of about the same area.
 
         Args:
             mesh: Mesh to divide.
@@ -98,12 +98,13 @@ class Patches:
         pieces = refine(mesh, patch_area)
         piece_count = len(pieces.faces)
         sides = [FRONT] if pieces.closed else [FRONT, BACK]
-        # The fronts of all pieces come first, and then the backs of all pieces.
+        # One entry for each side: the fronts of all pieces first, then all backs.
         facing = np.repeat(sides, piece_count)[:, None]
         piece_of_side = np.tile(np.arange(piece_count), len(sides))
         cell_width = math.sqrt(patch_area)
         patch_of_side = _group_sides(pieces, piece_of_side, facing, cell_width)
-        # `Fragments` needs the samples of a pixel next to each other.
+        # Each side becomes a sample. Sort them by patch, because `Fragments` needs the
+        # samples of a pixel (here, a patch) next to each other.
         sample_to_side = np.argsort(patch_of_side, kind="stable")
         sample_to_patch = torch.from_numpy(patch_of_side[sample_to_side])
         sample_to_piece = torch.from_numpy(piece_of_side[sample_to_side])
@@ -120,25 +121,26 @@ class Patches:
             facing=torch.from_numpy(facing[sample_to_side]),
             outlines=areas.new_tensor(AROUND_CENTER).expand(len(sample_to_piece), 3, 2),
             sample_to_pixel=sample_to_patch,
-            # `faces` has one entry per sample, so sample i shows entry i.
+            # The tensor `faces` has one entry for each sample, so sample i shows entry i.
             sample_to_seen_face=torch.arange(len(sample_to_piece)),
-            # All samples lie at the only sample position of the image.
+            # The artificial image has a single sample position, where all samples lie.
             sample_numbers=torch.zeros_like(sample_to_piece),
         )
         smallest = torch.finfo(areas.dtype).tiny
         fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
-        # `expand` gives the backs of a closed mesh, which rays never hit, the
-        # patches of the fronts. Otherwise there are two rows already.
+        # One row for the fronts of all pieces, one for the backs. Rays never hit the backs
+        # of a closed mesh. For them, `expand` repeats the row of the fronts.
         patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
         return Patches(
             pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
         )
 
     def mean(self, values: Tensor) -> Tensor:
-        """Average values of the S samples of `view` over each of the N patches.
+        """Average values of the S sides of pieces over each of the N patches.
 
         Args:
-            values: D values for each sample, shape (S, D).
+            values: D values for each side, in the order of the samples of `view`,
+                shape (S, D).
 
         Returns:
             Means that are weighted with the areas of the pieces, shape (N, D).
@@ -147,26 +149,26 @@ class Patches:
         return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
 
     def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
-        """Add up the weights of the rays of each pixel that hit the same patch.
+        """Add up the weights of the rays from a pixel that hit the same patch.
 
         Args:
-            hits: Faces that rays from B pixels hit in D directions. The faces
-                are indices into `pieces`.
+            hits: Pieces that rays from B pixels hit in D directions, as indices
+                into `pieces`.
             directions: Unit directions of the rays, shape (D, 3).
             weights: Weight of each ray, shape (B, D).
 
         Returns:
-            Sum of the weights for each pixel and each of the N patches, sparse,
-            shape (B, N).
+            Sum of the weights for each pixel and each of the N patches, as a sparse
+            matrix, shape (B, N).
         """
         is_hit = hits.face_of_ray != rays.NO_FACE
-        # Pixel and direction of each ray that hits a piece and has a weight.
+        # Pixel and direction of each ray that hits a piece and has a nonzero weight.
         pixel, direction = torch.nonzero(weights * is_hit, as_tuple=True)
         piece = hits.face_of_ray[pixel, direction]
-        # A ray hits the back of a piece if it runs along the outer normal.
+        # A ray hits the back of a piece if its direction is on the side of the outer normal.
         is_back = (self._normals[piece] * directions[direction]).sum(1) > 0
         patch = self.patch_of_side[is_back.long(), piece]
-        # csr_matrix adds up entries that have the same pixel and patch.
+        # `csr_matrix` adds up entries with the same pixel and patch.
         entries = (weights[pixel, direction].numpy(), (pixel.numpy(), patch.numpy()))
         return csr_matrix(entries, (len(weights), len(self.view.pixels)))
 
@@ -179,11 +181,12 @@ class Patches:
 def _group_sides(
     pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell_width: float
 ) -> np.ndarray:
-    """Group the S sides of pieces of a mesh into patches.
+    """Group the S sides (fronts and backs) of the faces of a mesh into patches.
 
-    Two sides share a patch if the centers of their pieces lie in the same cell
-    of a cubic grid, if the piece normals are equal after each component is
-    rounded to -1, 0 or 1, and if both sides are fronts or both are backs.
+    The faces of the mesh are small and called pieces. Two sides belong to the same
+    patch if the centers of their pieces lie in the same cell of a cubic grid, if
+    the normals are equal after each component is rounded to -1, 0 or 1, and if
+    both sides are fronts or both are backs.
 
     Args:
         pieces: Mesh of the pieces.
@@ -196,22 +199,24 @@ def _group_sides(
     """
     centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
     normals = pieces.face_normals()[piece_of_side]
-    # Sides with equal rows share a patch: cell (3), rounded normal (3), facing (1).
+    # Columns: three numbers of the grid cell, three of the rounded normal, front or back.
+    # Sides with equal rows belong to the same patch.
     keys = np.hstack([np.floor(centers / cell_width), np.rint(normals), facing])
     _, patch_of_side = np.unique(keys, axis=0, return_inverse=True)
-    # NumPy 2.0.0 returns the inverse with shape (S, 1).
+    # NumPy 2.0.0 returns the inverse with the shape (S, 1), which `ravel` mends.
     return patch_of_side.ravel()
 
 
 class Transport:
-    """Change of a mesh's images by the shadows on it and by light that bounces within it.
+    """Computes how shadows and bounced light change the images of a mesh.
 
-    The change is linear in the light. It is stored for each of the K
-    coefficients of an SH basis.
+    The mesh casts shadows on itself, and light bounces between its faces. The
+    change of an image is linear in the light, so it is computed for each of the K
+    SH coefficients of environment light.
 
     Attributes:
-        has_colored_light: True if bounced light is colored. The change of the transfer
-            then differs between the three color channels.
+        has_colored_light: True if bounced light is colored. The change then differs
+            between the three color channels.
         rays: Rays among the faces of the mesh.
 
     Args:
@@ -223,28 +228,28 @@ class Transport:
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
-        """Compute the light that the patches of the mesh send, if light bounces."""
-        # Only bounces need patches. With patches, rays hit the pieces of the mesh.
+        """Divide the mesh into patches, and compute the light that they send, if light bounces."""
+        # Patches are only needed for bounces. Rays then hit the pieces of the patches.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         self._directions = sphere(rays.DIRECTIONS)
-        # Radiance from each of D directions per unit of each of K coefficients,
-        # shape (D, K).
+        # Radiance of the sky: one row for each ray direction, one column for each SH
+        # coefficient.
         self._sky = basis.radiance(self._directions)
         self.has_colored_light = False
         if self._patches:
-            # Radiance that the N patches send, shape (N, K, 3), or (N, K, 1) if
-            # the three channels are equal.
+            # Radiance that the patches send, with the axes: patch, SH coefficient, color. The
+            # last axis has the size 1 if the three colors are equal.
             self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
             self.has_colored_light = self._sent.shape[2] > 1
 
     def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
-        """Compute how shadows and bounces change the transfer of a view.
+        """Compute how shadows and bounces change the transfer matrix of a view.
 
         Args:
             surface: Points, normals and gloss at the S samples of the view.
-            albedo: Linear albedo at the samples, shape (S, C). C is 3 if
-                `colors` is true, and 1 or 3 otherwise.
+            albedo: Linear albedo at the samples, shape (S, C) for C color channels.
+                C is 3 if `has_colored_light` is true, and 1 or 3 otherwise.
 
         Returns:
             Change of the radiance of the P pixels per unit of each of the K
@@ -254,7 +259,8 @@ class Transport:
         change = None
         fragments = surface.fragments
         gloss = surface.gloss
-        # A pixel averages over the square of `samples`. Shape (C, S).
+        # Albedo divided by the number of samples of a pixel: one row for each channel, one
+        # column for each sample.
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
@@ -269,21 +275,22 @@ class Transport:
                 change = self._sky.new_zeros(shape)
             sample_of_ray = hits.sample_of_ray
             if gloss is not None:
-                # Specular reflection of each ray, and the fraction of its light
-                # that enters the diffuse layer below the coat, shape (B, D).
-                colored, white = self._lobes(gloss, surface, sample_of_ray)
+                # Specular reflectance along each ray: one row for each pixel, one column for
+                # each direction.
+                colored, white = self._reflect_rays(gloss, surface, sample_of_ray)
                 cosine = self._cosines(surface, sample_of_ray)
-                entering = gloss.at(sample_of_ray).coat_transmittance(cosine)
+                # Fraction of the light that passes the coat to the diffuse layer below it.
+                transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
             for channel, channel_change in enumerate(change):
-                # Reflected radiance per irradiance along each ray, shape (B, D).
+                # Reflected radiance per irradiance, for light along each ray.
                 reflectance = diffuse_albedo[channel][sample_of_ray]
                 if gloss is not None:
-                    tinted = albedo_by_channel[channel][sample_of_ray] * colored
-                    specular = tinted + white / fragments.samples**2
-                    reflectance = reflectance * entering + specular
+                    metal = albedo_by_channel[channel][sample_of_ray] * colored
+                    specular = metal + white / fragments.samples**2
+                    reflectance = reflectance * transmittance + specular
                 blocked = hits.weight * reflectance
-                # Change of the radiance of B pixels because the mesh blocks light from the sky,
-                # per unit of each of K coefficients, shape (K, B).
+                # Subtract the light of the sky that the mesh blocks: one row for each SH
+                # coefficient, one column for each pixel.
                 channel_change[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
                     received = self._received(self._patches, hits, blocked, channel)
@@ -291,20 +298,21 @@ class Transport:
         return change
 
     def _received(self, patches: Patches, hits: RayHits, blocked: Tensor, channel: int) -> Tensor:
-        """Compute the radiance of B pixels that is due to light from patches, in one channel.
+        """Compute how much light from patches B pixels reflect, in one color channel.
 
         Args:
-            patches: The N patches.
-            hits: Faces that rays from the pixels hit in D directions.
-            blocked: Radiance of each pixel per unit radiance that arrives from
-                each direction, shape (B, D).
+            patches: The N patches of the mesh.
+            hits: Pieces of patches that rays from the pixels hit in D directions.
+            blocked: Reflected radiance of each pixel per unit radiance that arrives
+                from each direction, shape (B, D). It is 0 in directions of the sky.
             channel: Index of the color channel.
 
         Returns:
             Radiance of the pixels per unit of each of the K coefficients of the
             light, shape (K, B).
         """
-        # Radiance that the patches send, shape (N, K).
+        # Radiance that the patches send: one row for each patch, one column for each SH
+        # coefficient.
         sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
         received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
         return torch.from_numpy(received).T
@@ -323,13 +331,13 @@ class Transport:
         normals = surface.normals[sample_of_ray]
         return torch.einsum("bdi,di->bd", normals, self._directions)
 
-    def _lobes(
+    def _reflect_rays(
         self, gloss: SampleGloss, surface: Surface, sample_of_ray: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Compute the specular reflectance for light along the rays of B pixels.
+        """Compute the specular reflectance of B pixels for light along their rays.
 
-        A specular lobe may be narrower than the angle between two of the D
-        directions. The reflectances of a pixel are therefore scaled so that
+        The specular reflection may be narrower than the angle between two of the
+        D ray directions. The reflectances of a pixel are therefore scaled so that
         their sum over the directions is exact for uniform light.
 
         Args:
@@ -348,9 +356,8 @@ class Transport:
         normals = surface.normals[sample_of_ray]
         colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, self._directions)
         cosine = self._cosines(surface, sample_of_ray).clamp(min=0)
-        # Uniform light of irradiance 1 has the radiance 1/π. Each of D directions
-        # has the solid angle 4π / D. The sum over the directions is therefore
-        # 4 times the mean.
+        # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
+        # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
         sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
         exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
         if exact_colored is not None:
@@ -360,10 +367,10 @@ class Transport:
         return colored * scale, white * scale
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
-        """Compute how shadows and bounces change the radiance of a view in one light.
+        """Compute how shadows and bounces change the radiance of a view under one light.
 
-        The result is differentiable with respect to the light, but not to the
-        albedo.
+        The result is differentiable with respect to the light, but not with
+        respect to the albedo.
 
         Args:
             surface: Points, normals and gloss at the S samples of the view.
@@ -378,17 +385,17 @@ class Transport:
             change = self.change(surface, albedo.detach().cpu().double())
         if change is None:
             return light.new_zeros(3, len(surface.fragments.pixels))
-        # The change has the shape (3, K, P), or channels c, coefficients k, pixels p.
+        # Sum over the coefficients k of the light, for each channel c and pixel p.
         return torch.einsum("ckp,kc->cp", change.to(light), light)
 
 
 def build_transport(
     mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis
 ) -> Transport | None:
-    """Compute the shadows and bounces of environment light.
+    """Prepare the computation of shadows and bounces of environment light.
 
-    Local lights, which are lamps and projectors, are not included. Their
-    shadows are computed in `renderer.transport.lamp_paths`.
+    The shadows of lamps and projectors are not included. They are computed in
+    `renderer.transport.lamp_paths`.
 
     Args:
         mesh: Mesh that casts shadows on itself.
@@ -398,8 +405,8 @@ def build_transport(
         basis: Basis of the light.
 
     Returns:
-        Shadows and bounces. None if the settings turn off shadows and bounces,
-        or if the basis has no environment light.
+        Object that computes them for a view. None if the settings turn off shadows
+        and bounces, or if the basis has no environment light.
 
     Raises:
         InputError: If the basis has local lights and `settings.bounces` is not
@@ -419,9 +426,12 @@ def build_transport(
 def _radiosity(
     patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
 ) -> Tensor:
-    """Compute the radiance that N patches send after `settings.bounces` bounces.
+    """Compute the radiance that N patches send after `settings.bounces` bounces (radiosity).
 
-    This is B in the docstring of the module.
+    After one bounce, patch i with albedo ρ_i sends the radiance
+    B_i = ρ_i / π S_i, where S_i is its irradiance from the sky. After each further
+    bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij is the irradiance of patch i
+    per unit radiance of patch j.
 
     Args:
         patches: Patches of the mesh.
@@ -435,16 +445,16 @@ def _radiosity(
         all patches are gray.
     """
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
-    # Mean albedo of each patch, shape (N, 3).
+    # Mean albedo: one row for each patch, one column for each color.
     patch_albedo = patches.mean(sample_albedo) * albedo_scale
     has_colors = bool((patch_albedo != patch_albedo[:, :1]).any())
     channel_count = 3 if has_colors else 1
-    # Sent radiance per irradiance, shape (N, 1, channels).
+    # Sent radiance per irradiance ρ_i / π. Axes: patch, one of size 1, color.
     reflectance = patch_albedo[:, None, :channel_count] / math.pi
     links = _PatchLinks.trace(patches, rays, basis)
     sent = links.from_sky * reflectance
     for _ in range(settings.bounces - 1):
-        # Irradiance of the M patches that see other patches, shape (M, K, channels).
+        # Irradiance from other patches. Axes: patch that sees others, SH coefficient, color.
         from_patches = torch.from_numpy(links.factors @ sent.flatten(1).numpy())
         from_patches = from_patches.view(-1, *sent.shape[1:])
         from_sky = links.from_sky.expand_as(sent)
@@ -454,14 +464,14 @@ def _radiosity(
 
 @dataclass(frozen=True)
 class _PatchLinks:
-    """Irradiance that N patches receive from the sky and from each other.
+    """How strongly the sky and other patches light each of N patches.
 
     Attributes:
-        from_sky: Irradiance S from the visible part of the sky, per unit of each
-            of the K SH coefficients, shape (N, K, 1).
+        from_sky: Irradiance from the visible part of the sky, per unit of each of
+            the K SH coefficients, shape (N, K, 1).
         receiving: Indices of the M patches that see other patches, shape (M,).
-        factors: Irradiance F of each of these M patches per unit radiance of
-            each of the N patches, sparse, shape (M, N).
+        factors: Irradiance of each of these M patches per unit radiance of each
+            of the N patches, as a sparse matrix, shape (M, N).
     """
 
     from_sky: Tensor
@@ -470,7 +480,7 @@ class _PatchLinks:
 
     @staticmethod
     def trace(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
-        """Cast rays from all patches to find which sky and which patches they see.
+        """Cast rays from all patches to find which parts of the sky and which patches they see.
 
         Args:
             patches: The N patches.
@@ -481,8 +491,8 @@ class _PatchLinks:
             Irradiance of the patches from the sky and from each other.
         """
         surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
-        # First the irradiance from the whole sky, shape (N, K). Blocked
-        # directions are subtracted in the loop.
+        # One row for each patch, one column for each SH coefficient: the irradiance from the
+        # whole sky. The loop below subtracts the directions that the mesh blocks.
         from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
         from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
         directions = sphere(PATCH_DIRECTIONS)
@@ -490,9 +500,8 @@ class _PatchLinks:
         receiving = []
         factors = []
         for hits in rays.hits(surface, directions):
-            # `hits.weight` makes the few rays of each sample stand for all
-            # directions. The samples of a patch are averaged with the areas of
-            # their pieces as weights.
+            # The rays of a patch start at the centers of its pieces. Each piece counts by its
+            # fraction of the area of the patch.
             weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
             from_sky[hits.pixels] -= weights @ sky_radiance
             receiving.append(hits.pixels)

@@ -34,40 +34,39 @@ from renderer.visibility.fragments import Fragments
 # Number of ray directions, which cover the whole sphere. A pixel of a flat surface
 # casts rays in about half of them, because the surface blocks the other half.
 DIRECTIONS = 512
-# Distance of the start of a ray from the surface, as a fraction of the largest
-# vertex coordinate. Embree computes in float32, so a ray that starts on the
-# surface could hit the surface itself.
+# Rays start at this distance above the surface, as a fraction of the largest vertex
+# coordinate. Otherwise, a ray could hit the surface on which it starts, because Embree
+# computes in float32.
 OFFSET = 1e-5
-# Largest number of pairs of a seen face and a vertex that `Rays._pixels_to_cast`
-# compares, which takes about a second. With more pairs, all pixels cast rays.
-COMPARISONS = 2**30
-# With smooth shading, the face of a sample may block light that would reach the
-# interpolated normal. `Rays._pixels_to_cast` ignores this if the face blocks at
-# most this fraction of uniform environment light.
-BENT = 1 / 1024
+# To find the pixels that need rays, faces are compared with vertices. This is the largest
+# number of comparisons, which takes about a second. With more, all pixels cast rays.
+MAX_COMPARISONS = 2**30
+# With smooth shading, the plane of a face may block light that would reach the interpolated
+# normal. This is ignored if at most this fraction of uniform environment light is blocked.
+MAX_IGNORED_LIGHT = 1 / 1024
 # Number of pairs of a pixel and a ray direction that `Rays.hits` processes at
 # once. It limits the memory.
 BLOCK = 2**17
-# Face index of a ray that hits no face.
+# Stands for the index of the face that a ray hits if it hits no face.
 NO_FACE = -1
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Points, normals and gloss at the S covered samples of a view.
+    """Points, normals and gloss at the S samples of a view that show the mesh.
 
     Each property is computed when it is first read. Points and normals are
     float64, and differentiable with respect to `moved`.
 
     Attributes:
         mesh: Mesh that the view shows, with V vertices.
-        fragments: Covered samples of the view.
+        fragments: Samples of the view that show the mesh.
         settings: Settings of the image. `settings.normals` chooses smooth or
             flat normals.
         moved: Vertex positions to use instead of `mesh.vertices`, shape (V, 3).
             None uses `mesh.vertices`.
-        given_gloss: Gloss to use instead of the gloss of the mesh. None uses
-            the gloss of the mesh.
+        given_gloss: Specular material (gloss) to use instead of the material of
+            the mesh. None uses the material of the mesh.
     """
 
     mesh: Mesh
@@ -78,7 +77,7 @@ class Surface:
 
     @cached_property
     def vertices(self) -> Tensor:
-        """Vertex positions of the V vertices, float64, shape (V, 3)."""
+        """Positions of the V vertices in world axes, float64, shape (V, 3)."""
         if self.moved is None:
             return torch.from_numpy(self.mesh.vertices)
         return self.moved.double()
@@ -94,7 +93,7 @@ class Surface:
 
     @cached_property
     def face_planes(self) -> Tensor:
-        """Unit normal of each of the G seen faces, shape (G, 3).
+        """Unit normal of each of the G faces that samples show, shape (G, 3).
 
         The normal points to the side of the face that the camera sees.
         """
@@ -115,26 +114,26 @@ class Surface:
         else:
             faces = torch.from_numpy(self.mesh.faces)
             vertex_normals = normals_in_sight(self.fragments, self.vertices, faces)
-        # `unit` takes the three components along the first axis.
+        # The function `unit` takes vectors with their components along the first axis.
         return unit(smooth_normals(self.fragments, vertex_normals).T).T
 
     @cached_property
     def points(self) -> Tensor:
         """Position in world axes of each of the S samples, shape (S, 3)."""
-        # Corners of the G seen faces, shape (G, 3 corners, 3 coordinates).
+        # Axes: seen face, corner, coordinate.
         corner_positions = self.vertices[self.fragments.corners]
         return self.fragments.interpolate(corner_positions)
 
     @cached_property
     def gloss(self) -> SampleGloss | None:
-        """Gloss at the samples, or None for a matte surface."""
+        """Specular material (gloss) at the samples, or None for a matte surface."""
         return sample_gloss(self.mesh, self.fragments, self.given_gloss)
 
     @cached_property
     def toward(self) -> Tensor:
         """Unit vectors from the S samples to the camera, shape (S, 3).
 
-        Without perspective, all samples share one vector, and the shape is
+        Without perspective, all samples have the same vector, and the shape is
         (1, 3).
         """
         return toward_camera(self.fragments, self.vertices)
@@ -147,16 +146,15 @@ class RayHits(NamedTuple):
         pixels: Index of each pixel in `Fragments.pixels`, shape (B,).
         sample_of_ray: Index of the sample from which each ray starts,
             shape (B, D).
-        weight: Weight of the radiance from each direction in the irradiance of
-            the pixel, shape (B, D). It is the solid angle of the direction,
-            times the cosine to the shading normal, times the number n of
-            samples of the pixel, because each sample casts only D / n of the
-            rays. It is 0 if the sky is visible in the direction.
+        weight: Weight of the radiance from each direction in the irradiance that
+            the mesh blocks, shape (B, D). It is 0 if the sky is visible in the
+            direction. Otherwise, it is the solid angle of the direction, times the
+            cosine to the shading normal, times the number n of samples of the
+            pixel, because each sample casts only D / n of the rays.
         face_of_ray: Index in the mesh of the first face that each ray hits, or
-            `NO_FACE`, shape (B, D). It is also `NO_FACE` for directions below
-            the plane of the sample's face. Such a direction has a positive
-            weight if it lies above the plane of the shading normal, since the
-            face of the sample then blocks the light.
+            `NO_FACE`, shape (B, D). No ray is cast in directions below the plane
+            of the face on which the sample lies. They have `NO_FACE`, and a
+            positive weight if the angle to the shading normal is less than 90°.
     """
 
     pixels: Tensor
@@ -166,7 +164,7 @@ class RayHits(NamedTuple):
 
 
 class Rays:
-    """Rays among the faces of one mesh.
+    """Casts rays from the surface of a mesh, and finds the faces of this mesh that they hit.
 
     The first ray raises `InputError` if Embree is not installed.
 
@@ -184,11 +182,11 @@ class Rays:
         return OFFSET * largest_coordinate
 
     def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
-        """Cast rays in D directions from all pixels that may see another surface.
+        """Cast rays in D directions from all pixels that may see another face of the mesh.
 
         Each ray starts at one sample of its pixel. The face of this sample
-        blocks all light from below its plane, as in a solid that is bounded by
-        a closed mesh.
+        blocks all light from below its plane, as if the mesh were the surface of a
+        solid.
 
         Args:
             surface: Points and normals at the S samples of the view.
@@ -203,29 +201,29 @@ class Rays:
         if not len(pixels):
             return
         plane_normals = surface.planes
-        # The samples of a pixel follow each other.
+        # Number of samples of each pixel. The samples of a pixel follow each other.
         sample_count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
         first_sample = sample_count.cumsum(0) - sample_count
         solid_angle = 4 * math.pi / len(directions)
         pixels_per_block = max(1, BLOCK // len(directions))
         for block in pixels.split(pixels_per_block):
-            # Tensors of rays have the shape (B, D): B pixels, D directions.
+            # Number of samples of each pixel of the block. The second axis is for directions.
             samples_in_pixel = sample_count[block, None]
-            # A pixel with n samples starts every n-th ray, in shuffled order,
-            # at the same sample. Adding the pixel index makes neighboring pixels
-            # use different samples for one direction.
+            # Deal the directions, in shuffled order, to the samples of the pixel. Adding the
+            # index of the pixel varies the sample for a direction between neighbors.
             rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
             sample_of_ray = first_sample[block, None] + rank_in_pixel
             cosine = _dot(surface.normals[sample_of_ray], directions).clamp(min=0)
             height = _dot(plane_normals[sample_of_ray], directions)
-            # Only directions above both planes need a ray.
+            # Pairs of a pixel and a direction that need a ray: the direction is above the
+            # face, and in front of the shading normal.
             cast = torch.nonzero((cosine > 0) & (height > 0), as_tuple=True)
             start_sample = sample_of_ray[cast]
             _, cast_direction = cast
             origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
             hit_face = self.first_hit(origins, directions[cast_direction])
             face_of_ray = torch.full_like(sample_of_ray, NO_FACE).index_put_(cast, hit_face)
-            # Directions below the plane of the face are blocked without a ray.
+            # In directions below the plane of the face (height < 0), no sky is visible.
             is_sky = (face_of_ray == NO_FACE) & (height >= 0)
             weight = (cosine * samples_in_pixel * solid_angle).masked_fill(is_sky, 0)
             yield RayHits(
@@ -249,18 +247,18 @@ class Rays:
             ) from error
         scene = EmbreeScene(robust=True)
         vertices = self._mesh.vertices.astype(np.float32)
-        # The constructor adds the triangles to the scene.
+        # The constructor of `TriangleMesh` adds the triangles to the scene.
         TriangleMesh(scene, vertices, self._mesh.faces.astype(np.int32))
         return scene
 
     @cached_property
     def _outermost(self) -> Tensor:
-        """Vertices on the convex hull of the mesh, float64, shape (H, 3) for H vertices.
+        """Positions of the H vertices on the convex hull of the mesh, float64, shape (H, 3).
 
         If all vertices lie in a plane, there is no hull, and all vertices are
         returned.
         """
-        # scipy.spatial is imported here because the import takes long.
+        # This import stands here because it takes long.
         from scipy.spatial import ConvexHull, QhullError
 
         vertices = self._mesh.vertices[np.unique(self._mesh.faces)]
@@ -269,38 +267,38 @@ class Rays:
         return torch.from_numpy(vertices).double()
 
     def _pixels_to_cast(self, surface: Surface) -> Tensor:
-        """Find the pixels from which a ray may hit another face, or is blocked by its own face.
+        """Find the pixels for which the mesh may block light.
 
         A pixel is returned if one of its samples fulfills one of two conditions.
-        First, a vertex of the mesh lies above the plane of the sample's face.
-        Second, the plane of the face blocks light that would reach the shading
-        normal. If the two normals form the angle a, the face blocks the fraction
-        (1 - cos a) / 2 of uniform light, which must exceed `BENT`.
+        First, a vertex of the mesh lies above the plane of the face on which the
+        sample lies. Second, the shading normal differs from the normal of the face
+        by an angle a, so that the plane of the face blocks the fraction
+        (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
 
         Args:
             surface: Points and normals at the S samples of the view.
 
         Returns:
             Indices in `Fragments.pixels`, ascending. These are all pixels if the
-            test would need more than `COMPARISONS` comparisons and would take
+            test would need more than `MAX_COMPARISONS` comparisons and would take
             longer than the rays.
         """
         fragments = surface.fragments
         plane_normals = surface.face_planes
         hull_vertices = self._outermost
-        if len(plane_normals) * len(hull_vertices) > COMPARISONS:
+        if len(plane_normals) * len(hull_vertices) > MAX_COMPARISONS:
             return torch.arange(len(fragments.pixels))
-        # Largest height of a hull vertex along the normal of each seen face,
-        # shape (G,).
-        parts = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
-        highest = torch.cat([(part @ hull_vertices.T).amax(1) for part in parts])
+        # The normals are processed in blocks to limit the memory.
+        blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
+        # For each seen face, the largest coordinate of a hull vertex along its normal.
+        highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
         first_corner = surface.vertices[fragments.corners[:, 0]]
         height_of_face = (plane_normals * first_corner).sum(1)
         is_below_a_vertex = highest - height_of_face > self.offset
         cosine_of_normals = (surface.normals * surface.planes).sum(1)
-        is_bent = cosine_of_normals < 1 - 2 * BENT
+        blocks_light = cosine_of_normals < 1 - 2 * MAX_IGNORED_LIGHT
         sample_to_seen_face = fragments.sample_to_seen_face
-        casts_rays = is_below_a_vertex[sample_to_seen_face] | is_bent
+        casts_rays = is_below_a_vertex[sample_to_seen_face] | blocks_light
         sample_to_pixel = fragments.sample_to_pixel
         return sample_to_pixel[casts_rays].unique()
 
@@ -327,7 +325,7 @@ class Rays:
 
 
 def _dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Compute the scalar products of the vectors of B pixels with D directions.
+    """Compute scalar products of vectors, one for each pixel and direction, with directions.
 
     Args:
         vectors: A vector for each pixel and direction, shape (B, D, 3).
@@ -361,9 +359,8 @@ def sphere(count: int) -> Tensor:
 def _shuffled(count: int) -> Tensor:
     """Return a random permutation of 0 to count - 1, which is the same in every call.
 
-    `sphere` sorts its directions by z. `Rays.hits` deals the directions to the
-    samples of a pixel in this shuffled order, so that each sample gets
-    directions from all over the sphere.
+    The directions of `sphere` are sorted by z. In this shuffled order, each sample
+    of a pixel gets ray directions from all over the sphere.
 
     Args:
         count: Number of ray directions.

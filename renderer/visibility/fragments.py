@@ -33,21 +33,21 @@ BLOCK = 2**14
 _WEIGHTS = "barycentric"
 
 
-class Runs(NamedTuple):
-    """Groups (runs) of successive samples that show the same face in the same pixel.
+class PixelGroups(NamedTuple):
+    """Groups of successive samples that show the same face in the same pixel.
 
-    There are R runs, in the order of their samples.
+    There are R groups, in the order of their samples.
 
     Attributes:
-        run_to_pixel: Index into `Fragments.pixels` of each run, ascending, int64,
+        group_to_pixel: Index into `Fragments.pixels` of each group, ascending, int64,
             shape (R,).
-        run_to_seen_face: Index into `Fragments.faces` of each run, int64,
+        group_to_seen_face: Index into `Fragments.faces` of each group, int64,
             shape (R,).
-        sample_count: Number of samples in each run, int64, shape (R,).
+        sample_count: Number of samples in each group, int64, shape (R,).
     """
 
-    run_to_pixel: Tensor
-    run_to_seen_face: Tensor
+    group_to_pixel: Tensor
+    group_to_seen_face: Tensor
     sample_count: Tensor
 
 
@@ -151,6 +151,8 @@ class Fragments:
             # Position of the sample relative to the first corner.
             x = position[0] - x0
             y = position[1] - y0
+            # The weight of a corner is the area of the triangle of the sample and the two
+            # other corners, divided by the area of the face.
             weight[1] = x * cy - y * cx
             weight[2] = y * bx - x * by
             weight[0] = 1 - weight[1] - weight[2]
@@ -319,36 +321,36 @@ class Fragments:
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Add up the albedo of the samples of a pixel that show the same face.
 
-        Such a group of samples is called a run. With flat normals, the samples
-        of a run have the same normal, so they can be shaded together.
+        With flat normals, the samples of such a group have the same normal, so they
+        can be shaded together.
 
         Args:
             albedo: C channels of albedo at each of the S samples, shape (S, C).
 
         Returns:
             A tuple of
-            - the index into `pixels` of each of R runs, shape (R,);
-            - the index into `faces` of each run, shape (R,);
-            - the albedo summed over the samples of each run and divided by the
+            - the index into `pixels` of each of R groups, shape (R,);
+            - the index into `faces` of each group, shape (R,);
+            - the albedo summed over the samples of each group and divided by the
               number of samples in a pixel, shape (R, C). It is differentiable
               with respect to `albedo`.
         """
         if self.samples == 1 or len(self.sample_to_pixel) == 0:
             # With one sample per pixel, each sample is a group of its own.
             return self.sample_to_pixel, self.sample_to_seen_face, albedo
-        runs = self.runs
-        samples_per_run = runs.sample_count.cpu().numpy()
+        groups = self.groups
+        samples_per_group = groups.sample_count.cpu().numpy()
         # `np.repeat` takes a quarter of the time of the function of torch.
-        sample_to_run = np.repeat(np.arange(len(samples_per_run)), samples_per_run)
+        sample_to_group = np.repeat(np.arange(len(samples_per_group)), samples_per_group)
         scaled_albedo = albedo.T / self.samples**2
-        zeros = albedo.new_zeros(albedo.shape[1], len(samples_per_run))
-        albedo_of_runs = zeros.index_add(
-            1, torch.from_numpy(sample_to_run).to(albedo.device), scaled_albedo
+        zeros = albedo.new_zeros(albedo.shape[1], len(samples_per_group))
+        albedo_of_groups = zeros.index_add(
+            1, torch.from_numpy(sample_to_group).to(albedo.device), scaled_albedo
         )
-        return runs.run_to_pixel, runs.run_to_seen_face, albedo_of_runs.T
+        return groups.group_to_pixel, groups.group_to_seen_face, albedo_of_groups.T
 
     @cached_property
-    def runs(self) -> Runs:
+    def groups(self) -> PixelGroups:
         """Groups of successive samples that show the same face in the same pixel."""
         pixel = self.sample_to_pixel
         seen_face = self.sample_to_seen_face
@@ -360,9 +362,9 @@ class Fragments:
         # `np.flatnonzero` takes a quarter of the time of `torch.nonzero`.
         start_indices = np.flatnonzero(is_start.cpu().numpy())
         starts = torch.from_numpy(start_indices).to(pixel.device)
-        return Runs(
-            run_to_pixel=pixel.index_select(0, starts[:-1]),
-            run_to_seen_face=seen_face.index_select(0, starts[:-1]),
+        return PixelGroups(
+            group_to_pixel=pixel.index_select(0, starts[:-1]),
+            group_to_seen_face=seen_face.index_select(0, starts[:-1]),
             sample_count=starts.diff(),
         )
 

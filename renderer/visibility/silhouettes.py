@@ -567,7 +567,7 @@ class _Silhouettes:
         # surface.
         from_farther = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         kept = np.flatnonzero(is_visible)
-        # Sort the cuts by the pair of samples around them, and then by this number.
+        # Sort the cuts by the pair of samples around them, and then by `from_farther`.
         kept = kept[np.lexsort([from_farther[kept], after[kept]])]
         # Keep only the first cut between each pair of samples.
         kept = kept[np.diff(after[kept], prepend=-1) != 0]
@@ -690,9 +690,9 @@ def _cut_edges(
     Returns:
         Cuts in ascending order of the edge and then of the line.
     """
-    # An edge crosses the lines from `first_line` to `end_line` - 1.
     lower = np.minimum(start_across, end_across)
     upper = np.maximum(start_across, end_across)
+    # Each edge crosses the lines from `first_line` to `end_line` - 1.
     first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
     end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
     cuts_per_edge = end_line - first_line

@@ -285,6 +285,7 @@ def _edges(triangles: np.ndarray) -> _EdgeLines:
     # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
     # right again.
     downward = _sort((y << 32) + x)
+    # The low 32 bits, as a number with a sign, are x. The rest is y.
     x = ((downward + 2**31) & (2**32 - 1)) - 2**31
     y = (downward - x) >> 32
     # Indices of the sorted corners (0 top, 1 middle, 2 bottom) at both ends of the edges.

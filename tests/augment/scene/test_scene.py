@@ -245,7 +245,7 @@ def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized)
     assert rasterized == [4, 4]
 
 
-STACK_SIZES = {"one stack": relighting.STACKED, "a stack per view": 1}
+STACK_SIZES = {"one stack": relighting.PIXELS_PER_STACK, "a stack per view": 1}
 
 
 @pytest.fixture(scope="module", params=STACK_SIZES.values(), ids=STACK_SIZES)
@@ -267,7 +267,7 @@ def several(request) -> Iterator[Scene]:
     names = ("plate", "cup")
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in names]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(relighting, "STACKED", request.param)
+        patch.setattr(relighting, "PIXELS_PER_STACK", request.param)
         yield Scene(objects, examples, backgrounds, lights, SETTINGS, RASTERIZER)
 
 
