@@ -1,9 +1,13 @@
 """Run the audit of pnb-audit.
 
-An audit has many parts, such as the attacks on one network with one kind of
-lighting. Each part is measured once, and its file is written completely or not
-at all. An audit that was stopped therefore continues with the first missing
-part. `train.auditing.audit_page` reads the files and writes the report.
+An audit consists of many measurements, such as the attacks on one network with
+one kind of lighting. Each result is written to its own file or folder, completely
+or not at all. An audit that was stopped therefore continues with the first
+missing result. `train.auditing.audit_page` then reads all results and writes the
+report.
+
+The folder of the audit has a subfolder of results for each network. The names of
+the subfolders are CLASSIFIER and HARDENED.
 """
 
 import json
@@ -28,13 +32,13 @@ from train.auditing.lights import (
     KINDS,
     QUERIES,
     Views,
-    recognized,
+    recognize_in_environments,
     success_by_light,
     transfer_success,
 )
 from train.auditing.plain_light import PlainViews, find_plain_views
 from train.auditing.relit_audit import (
-    RELIT_PART,
+    RELIT_FOLDER,
     measure_photographs,
     photographs_screen,
     write_photographs_page,
@@ -55,20 +59,20 @@ from train.settings import published, read_objects, simplified, solid_name
 from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 
-# Views that are rendered in environment lighting.
-VIEWS = 24
-# Random lights in addition to the environments.
-LIGHTS = 8
-# Views that are attacked with each kind of lighting.
-ATTACKED = 12
-# Number of draws of light, camera and pose in the laboratory, for each projected
-# pattern and each environment.
+# Number of views of the meshes that are rendered in environment lighting.
+VIEW_COUNT = 24
+# Number of random environment lights, in addition to those that the user names.
+RANDOM_LIGHT_COUNT = 8
+# Number of views that are attacked with each kind of lighting.
+ATTACKED_COUNT = 12
+# For each projected pattern and each environment map, 6 random setups of light, camera
+# and pose are path-traced.
 SETUPS = 6
-# Projected patterns that no training of this project uses.
+# Projected patterns of the path-traced renders. No training of this project uses them.
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
-# Paths per pixel of the renders of the laboratory.
+# Number of light paths per pixel of the path-traced renders.
 SPP = 48
-# Generated things that stand for hard negatives which the user does not name.
+# Generated solids that serve as hard negatives if the user names none.
 HARD_NEGATIVES = (
     "solid:lemon",
     "solid:apple",
@@ -81,55 +85,54 @@ NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
 )
-# Settings of pnb-audit that name a folder of images to score. The keys are the
-# names of these images on the page.
+# For each set of test images, the setting of pnb-audit that names their folder.
 FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
-# Keys of settings that may be set when a stopped audit continues.
-ADDED = ("hardened", "photos", "photographs")
+# When a stopped audit continues, these settings may be set if they were not set before.
+SETTABLE_LATER = ("hardened", "photos", "photographs")
 
 
 def run_audit(
     settings: AuditSettings,
     networks: Mapping[str, Classifier] | None = None,
 ) -> page.Audited:
-    """Measure the parts that are missing in the folder `settings.out`, and write the report.
+    """Test networks in unusual lighting, and write a report to the folder `settings.out`.
+
+    Results that an earlier, stopped audit wrote to this folder are not measured
+    again.
 
     Args:
         settings: Settings of the audit.
-        networks: Networks by `CLASSIFIER` and `HARDENED` of the report. None to
-            load those that the settings name.
+        networks: Network to audit under the key CLASSIFIER and, if there is
+            one, its hardened version under the key HARDENED. None loads the
+            networks that the settings name.
 
     Returns:
-        The report.
+        Path and content of the report.
 
     Raises:
         InputError: If an input cannot be read, if a network lacks a class, or
-            if the folder holds other results.
+            if the folder holds results of other settings.
     """
     is_named = networks is None
     if networks is None:
         networks = load_networks(settings)
     if not settings.meshes:
         return _audit_photographs(settings, networks, is_named)
-    # Sentences that the report shows at its beginning.
+    # Caveats are sentences at the beginning of the report.
     caveats = _compare_sizes(networks.values())
     if not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     settings = complete(settings, networks[CLASSIFIER])
     plan = _Plan(settings, networks)
     out = writable_folder(settings.out, "out")
-    # Networks that the caller passes have no names in config.yaml. It is unknown
-    # whether the results in the folder are of the same networks, so an audit of
-    # such networks does not continue.
-    own = _own_results(out) if is_named else ()
-    require_replaceable(out, "out", settings.overwrite, own=own)
+    _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
     has_renders = renders.exists() and not settings.overwrite
-    if page.LABORATORY not in plan.folders:
+    if page.LABORATORY not in plan.image_folders:
         try:
-            # New renders need Mitsuba.
+            # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
             with nullcontext() if has_renders else mitsuba():
-                plan.folders = {page.LABORATORY: renders} | plan.folders
+                plan.image_folders = {page.LABORATORY: renders} | plan.image_folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
     caveats += _missing_gradients(networks.values())
@@ -138,7 +141,7 @@ def run_audit(
     with sole_writer("out", out):
         _begin(settings, out, renders)
         plan.find_views(out / CLASSIFIER)
-        if plan.folders.get(page.LABORATORY) == renders:
+        if plan.image_folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
             _write_folder(
@@ -152,25 +155,29 @@ def run_audit(
         plan.score_in_normalized_light(out)
         remedies = name_remedies(plan.networks)
         names = _names(plan.networks)
-        return page.write_audit_page(settings.label, names, remedies, plan.folders, out, caveats)
+        return page.write_audit_page(
+            settings.label, names, remedies, plan.image_folders, out, caveats
+        )
 
 
 def _audit_photographs(
     settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
 ) -> page.Audited:
-    """Audit networks on relit photographs alone, and write the report.
+    """Audit networks without meshes, on photographs in the light of a projector.
 
     Args:
-        settings: Settings of an audit without meshes.
-        networks: Networks by the name of the folder of their parts.
+        settings: Settings of the audit, with a folder of photographs.
+        networks: Networks by the name of the subfolder for their results.
         is_named: Whether the settings name the networks. Only then may an audit
             that was stopped continue.
+
+    Returns:
+        Path and content of the report.
     """
     device = choose_device(settings.device)
     find_unlabeled(published(Path(str(settings.photographs))))
     out = writable_folder(settings.out, "out")
-    own = _own_results(out) if is_named else ()
-    require_replaceable(out, "out", settings.overwrite, own=own)
+    _require_continuable(out, settings.overwrite, is_named)
     caveats = _compare_sizes(networks.values())
     for network in networks.values():
         if not network.has_gradients:
@@ -183,21 +190,33 @@ def _audit_photographs(
             (out / key).mkdir(exist_ok=True)
             _measure_photographs(network.to(device), settings, out / key)
         names = _names(networks)
-        paths = {name: out / key for key, name in names.items()}
-        screen = photographs_screen(paths)
-        path = write_photographs_page(screen, paths, out, caveats)
+        folders = {name: out / key for key, name in names.items()}
+        screen = photographs_screen(folders)
+        path = write_photographs_page(screen, folders, out, caveats)
         return page.Audited(path, screen, "", names, None)
 
 
-def _measure_photographs(network: Classifier, settings: AuditSettings, own: Path) -> None:
-    """Measure a network on relit photographs, unless this part exists in its folder."""
-    _write_folder(own / RELIT_PART, partial(measure_photographs, network, settings))
+def _measure_photographs(network: Classifier, settings: AuditSettings, results: Path) -> None:
+    """Attack a network through the light on photographs, unless the results exist.
+
+    Args:
+        network: Network to attack.
+        settings: Settings of the audit, with a folder of photographs.
+        results: Folder for all results of this network.
+    """
+    _write_folder(results / RELIT_FOLDER, partial(measure_photographs, network, settings))
 
 
 def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Return a name of each network, by the key of the network.
+    """Choose the names of the networks in the report.
 
-    If both networks have the same name, " (hardened)" follows the second one.
+    If both networks have the same name, " (hardened)" is added to the second.
+
+    Args:
+        networks: Networks by the name of the subfolder for their results.
+
+    Returns:
+        Names in the report, by the same keys.
     """
     names = {key: network.name for key, network in networks.items()}
     if len(set(names.values())) < len(names):
@@ -206,17 +225,18 @@ def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
 
 
 class _Plan:
-    """Networks and images of an audit, which are checked before anything is written.
+    """Networks, images and lighting of an audit, checked before anything is written.
 
     Attributes:
         label: Class whose objects are tested.
         device: Device of the networks and the renders.
-        networks: Networks by the name of the folder of their parts.
-        folders: Folders of labeled images by the name of the part.
-        environments: Names or files of environments.
-        random_light_count: Number of random lights.
+        networks: Networks by the name of the subfolder for their results.
+        image_folders: Folders of labeled test images: "laboratory" for
+            path-traced renders, and "photographs". Each may be missing.
+        environments: Names or files of environment lights.
+        random_light_count: Number of random environment lights.
         views: Views that are rendered in environment lighting.
-        attacked_views: Views that are attacked.
+        attacked_views: Views whose lighting is attacked.
     """
 
     def __init__(self, settings: AuditSettings, networks: Mapping[str, Classifier]):
@@ -225,56 +245,64 @@ class _Plan:
         self.networks = {key: network.to(self.device) for key, network in networks.items()}
         meshes, hard_negatives = read_meshes(settings)
         folders = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
-        self.folders = {part: published(Path(folder)) for part, folder in folders.items() if folder}
+        self.image_folders = {
+            name: published(Path(folder)) for name, folder in folders.items() if folder
+        }
         items = [*meshes, *hard_negatives]
-        _require_classes(self.networks.values(), items, self.folders, self.label)
-        # The hard negatives are loaded, too, so that an unreadable file is
-        # reported at once.
+        _require_classes(self.networks.values(), items, self.image_folders, self.label)
+        # Hard negatives and lights are loaded only to report a file that cannot be read
+        # before the audit begins.
         objects = [load_object(item) for item in items]
         for name in settings.environments:
             load_light(name)
         self.environments = [UNIFORM, *settings.environments]
-        self.random_light_count = settings.scale(LIGHTS)
+        self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
         seed = settings.seed
-        subjects = objects[: len(meshes)]
-        self.views = Views(subjects, settings.scale(VIEWS), seed, self.device)
-        self.attacked_views = Views(subjects, settings.scale(ATTACKED), seed, self.device)
+        positives = objects[: len(meshes)]
+        self.views = Views(positives, settings.scale(VIEW_COUNT), seed, self.device)
+        self.attacked_views = Views(positives, settings.scale(ATTACKED_COUNT), seed, self.device)
 
-    def find_views(self, own: Path) -> None:
-        """Search views that the audited classifier recognizes in plain light, for all networks.
+    def find_views(self, results: Path) -> None:
+        """Find lighting and size of the views in which the audited network recognizes them.
+
+        The views of all networks then have this lighting and this size.
 
         Args:
-            own: Folder that the result for the audited classifier is written to.
+            results: Folder for the results of the audited network.
         """
-        own.mkdir(exist_ok=True)
-        path = own / page.PLAIN
-        _write_part(path, _search, self.networks[CLASSIFIER], self.attacked_views)
+        results.mkdir(exist_ok=True)
+        path = results / page.PLAIN
+        _write_json(path, _search, self.networks[CLASSIFIER], self.attacked_views)
         plain = PlainViews(**read_json(path))
         self.views = plain.apply_to(self.views)
         self.attacked_views = plain.apply_to(self.attacked_views)
 
-    def measure(self, key: str, own: Path) -> None:
-        """Measure the missing parts of one network.
+    def measure(self, key: str, results: Path) -> None:
+        """Test and attack one network, except for results that exist already.
 
         Args:
             key: Key of the network in `networks`.
-            own: Folder of its parts.
+            results: Folder for the results of this network.
         """
         network = self.networks[key]
-        own.mkdir(exist_ok=True)
+        results.mkdir(exist_ok=True)
         lights = (self.environments, self.random_light_count)
-        _write_part(own / page.RECOGNIZED, recognized, network, self.views, *lights)
+        path = results / page.RECOGNIZED
+        _write_json(path, recognize_in_environments, network, self.views, *lights)
         for kind in KINDS:
-            path = own / f"{kind}.json"
-            _write_part(path, success_by_light, network, self.attacked_views, kind, own)
-        self._score(network, own)
+            path = results / f"{kind}.json"
+            _write_json(path, success_by_light, network, self.attacked_views, kind, results)
+        self._score(network, results)
         others = [other for other in self.networks.values() if other is not network]
         if others:
-            path = own / page.TRANSFER
-            _write_part(path, transfer_success, network, *others, self.attacked_views, own)
+            path = results / page.TRANSFER
+            _write_json(path, transfer_success, network, *others, self.attacked_views, results)
 
     def score_in_normalized_light(self, out: Path) -> None:
-        """Score the networks with normalized light in front on the folders of images.
+        """Score each network behind the remedy "normalized light" on the test images.
+
+        This remedy normalizes the light of an image before the network
+        classifies it.
 
         Args:
             out: Folder of the audit.
@@ -282,35 +310,35 @@ class _Plan:
         for key, network in normalizing(self.networks).items():
             self._score(network, out / key)
 
-    def _score(self, network: Classifier, own: Path) -> None:
-        """Score a network on each folder of images.
+    def _score(self, network: Classifier, results: Path) -> None:
+        """Score a network on all test images, and write the scores to subfolders.
 
         Args:
-            network: Network with or without normalized light.
-            own: Folder of the parts of this network. The scores on each folder
-                of images go to a sub-folder.
+            network: Network, with or without normalized light.
+            results: Folder for the results of this network. It gets a
+                subfolder for each key of `image_folders`.
         """
-        for name, folder in self.folders.items():
-            own.mkdir(exist_ok=True)
+        for name, images in self.image_folders.items():
+            results.mkdir(exist_ok=True)
             predictor = Predictor(network, network.classes, network.size, self.device)
-            _write_folder(own / name, partial(_evaluate, predictor, folder, self.label))
+            _write_folder(results / name, partial(_evaluate, predictor, images, self.label))
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
-    """Fill in the class and the hard negatives that the settings leave out.
+    """Fill in the class and the hard negatives if the settings leave them out.
 
     Args:
         settings: Settings of the audit.
-        classifier: The audited classifier, which has the classes.
+        classifier: Network to audit, which has the names of the classes.
 
     Returns:
-        Settings with the class by its name, and with hard negatives if they
-        are needed.
+        Settings in which `label` is the name of the class, and in which
+        `hard_negatives` is not empty if test images must be rendered.
 
     Raises:
-        InputError: If the classifier lacks a class, if neither `label` nor
-            the names of the meshes tell the class, or if a hard negative is of
-            this class.
+        InputError: If the network lacks a class, if neither `label` nor the
+            names of the meshes tell the class, or if a hard negative has this
+            class.
     """
     if settings.label is None:
         label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
@@ -331,16 +359,17 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
 
 
 def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
-    """Load the classifier and, if there is one, the hardened network.
+    """Load the network to audit and, if the settings name one, the hardened network.
 
     Args:
         settings: Settings of the audit.
 
     Returns:
-        The networks by the name of the folder of their parts.
+        Networks under the keys CLASSIFIER and HARDENED, which are also the
+        names of the subfolders for their results.
 
     Raises:
-        InputError: If there is no such network.
+        InputError: If a network cannot be loaded.
     """
     with keyed(name="classifier"):
         classifier = load_chosen(settings)
@@ -357,26 +386,32 @@ def _require_classes(
     folders: Mapping[str, Path],
     label: str,
 ) -> None:
-    """Raise InputError if a network lacks the class of a mesh or of a photograph.
+    """Check that all networks have the classes of the meshes and of the test images.
 
     Args:
         networks: Networks of the audit.
-        items: Meshes and hard negatives. Classes that start with OTHER_PREFIX
-            need not be classes of a network.
-        folders: Folder of labeled images by part.
+        items: Settings of the meshes and the hard negatives. The networks need
+            not have classes whose names start with "other_".
+        folders: Folders of labeled test images, "laboratory" and "photographs".
         label: Class whose objects are tested.
+
+    Raises:
+        InputError: If a network lacks a class.
     """
     labels = {item.label for item in items if not item.label.startswith(OTHER_PREFIX)}
     for network in networks:
         for name in labels:
             network.label(name)
-        for part, folder in folders.items():
-            with keyed(FOLDER_KEYS[part]):
+        for name, folder in folders.items():
+            with keyed(FOLDER_KEYS[name]):
                 find_photographs(folder, network.classes, label)
 
 
 def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
-    """Return a caveat if the networks take images of different sizes, and otherwise nothing."""
+    """Return a sentence for the report if the networks take images of different sizes.
+
+    The list is empty if they take images of the same size.
+    """
     sizes = [str(network.size) for network in networks]
     if len(set(sizes)) == 1:
         return []
@@ -385,7 +420,7 @@ def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
 
 
 def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
-    """Return a caveat for each network that has no gradients."""
+    """Return a sentence for the report about each network that has no gradients."""
     return [
         f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
         "for each radius."
@@ -395,57 +430,60 @@ def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
 
 
 def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
-    """Prepare the folder of an audit, and write config.yaml.
+    """Prepare the folder of an audit, and write the settings to its file config.yaml.
 
-    With `overwrite`, the parts of an earlier audit are removed. Otherwise the
-    folder must have the same settings as this audit.
+    With `settings.overwrite`, the results of an earlier audit are removed.
+    Otherwise an earlier audit in the folder must have the same settings.
 
     Args:
         settings: Settings of the audit.
         out: Folder of the audit.
-        renders: Folder of the renders of the laboratory in `out`.
+        renders: Subfolder of `out` for path-traced renders.
 
     Raises:
-        InputError: If the folder has other settings.
+        InputError: If the folder has an audit with other settings.
     """
     if settings.overwrite:
         networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
         for name in (*networks, renders.name):
             shutil.rmtree(out / name, ignore_errors=True)
     elif (out / CONFIG).exists():
-        require_same(out, settings, "out=", _may_be_added)
+        require_same(out, settings, "out=", _may_change)
     write_config(out, settings, command=command_line("audit"))
 
 
-def _may_be_added(key: str, old: Any, new: Any) -> bool:
-    """Return whether a setting may change when an audit continues.
+def _may_change(key: str, old: Any, new: Any) -> bool:
+    """Return whether a setting may change when a stopped audit continues.
 
     Args:
         key: Key of the setting.
-        old: Value in config.yaml. Only None may change.
-        new: Value of this command.
+        old: Value when the audit began. Only None may change.
+        new: Value now. Any value is allowed.
     """
-    return old is None and key in ADDED
+    return old is None and key in SETTABLE_LATER
 
 
 def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSettings:
-    """Choose the settings of the renders: setups of all patterns and all environments.
+    """Choose the settings of the path-traced renders on which an audit scores networks.
+
+    They show the meshes and the hard negatives under each pattern of PATTERNS,
+    and in each environment map of the audit.
 
     Args:
         settings: Settings of the audit.
-        out: Folder of the renders.
+        out: Folder for the renders.
         size: Pixels per side of the renders.
 
     Returns:
-        Settings of pnb-lab.
+        Settings of pnb-lab, which renders them.
     """
     meshes, hard_negatives = read_meshes(settings)
-    kind_count = len(PATTERNS) + len(settings.environments)
+    lighting_count = len(PATTERNS) + len(settings.environments)
     return LabSettings(
         out=str(out),
         label=settings.label,
         meshes=[asdict(item) for item in (*meshes, *hard_negatives)],
-        setups=settings.scale(SETUPS) * kind_count,
+        setups=settings.scale(SETUPS) * lighting_count,
         patterns=[*PATTERNS],
         environments=settings.environments,
         size=size,
@@ -455,16 +493,17 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
 
 
 def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
-    """Read the settings of the meshes and of the hard negatives.
+    """Read the settings of the meshes and of the hard negatives, with their labels.
 
-    A hard negative without a label gets a label that starts with OTHER_PREFIX. The
-    networks need not have a class for this label.
+    A hard negative without a label gets a label that starts with "other_",
+    which need not be a class of the networks.
 
     Args:
         settings: Settings of the audit.
 
     Returns:
-        Settings of the meshes of the label, and of the hard negatives.
+        Two lists: settings of the meshes of the class `settings.label`, and
+        settings of the hard negatives.
 
     Raises:
         InputError: If a mesh has another label than `settings.label`.
@@ -476,30 +515,44 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
     for item in meshes:
         if item.label != settings.label:
             raise InputError(
-                f"meshes: {item.mesh} is of the class {item.label}, and label={settings.label}",
+                f"meshes has {item.mesh} of the class {item.label}, but label={settings.label}: "
+                "give only meshes of this class, and others as hard_negatives",
                 "meshes",
             )
     return meshes, hard_negatives
 
 
-def _own_results(out: Path) -> Collection[str]:
-    """Return the patterns of the results with which an audit in a folder continues.
+def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
+    """Check that an audit may write to a folder, because it is new or can be continued.
 
-    Returns:
-        RESULTS if the folder is the folder of an audit. Otherwise nothing.
-    """
-    with suppress(InputError):
-        if "hard_negatives" in read_config(out / CONFIG):
-            return RESULTS
-    return ()
-
-
-def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
-    """Measure a part of an audit, and write it as JSON, unless its file exists.
+    An audit of networks that the caller passes as objects is never continued.
+    config.yaml does not have their names, so the results may be about other
+    networks.
 
     Args:
-        path: File of the part.
-        measure: Function that returns the content of the file.
+        out: Folder of the audit.
+        overwrite: Whether results of other commands may be replaced.
+        is_named: Whether the settings name the networks.
+
+    Raises:
+        InputError: If the folder has other results that may not be replaced.
+    """
+    own_results: Collection[str] = ()
+    # A folder without config.yaml raises an InputError.
+    with suppress(InputError):
+        is_audit = "hard_negatives" in read_config(out / CONFIG)
+        if is_named and is_audit:
+            own_results = RESULTS
+    require_replaceable(out, "out", overwrite, own=own_results)
+
+
+def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
+    """Write the return value of a function to a JSON file, unless the file exists.
+
+    Args:
+        path: JSON file.
+        measure: Function that measures a result of the audit. It is not called
+            if the file exists.
         *arguments: Arguments of this function.
     """
     if not path.exists():
@@ -507,27 +560,31 @@ def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *argument
 
 
 def _search(classifier: Classifier, views: Views) -> dict[str, Any]:
-    """Search views in plain light, and return the fields of `PlainViews` by name."""
+    """Find views in ordinary light, and return the attributes of `PlainViews` as a dictionary."""
     return asdict(find_plain_views(classifier, views))
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
-    """Score a network on the photographs of `folder`, and write the scores to `out`.
+    """Score a network on a folder of photographs. Unreadable photographs are left out.
 
-    Photographs that cannot be read are left out.
+    Args:
+        predictor: Network, with the names of its classes.
+        folder: Folder of photographs.
+        label: Class whose objects are tested.
+        out: Folder for the scores.
     """
     evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
 def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
-    """Write a part of an audit that is a folder, unless the folder exists.
+    """Write a result of the audit to a folder, unless the folder exists.
 
-    The folder gets its name when it is complete. Until then, ".part" follows
-    the name.
+    The result is written to FOLDER.part, which is renamed when it is complete.
 
     Args:
-        folder: Folder of the part.
-        write: Function that writes the part to the folder that it is given.
+        folder: Folder for the result.
+        write: Function that writes the result to the folder that is passed to
+            it.
     """
     if not folder.exists():
         unfinished = folder.with_name(f"{folder.name}.part")

@@ -1,4 +1,8 @@
-"""Write the report of an audit from the files of its parts."""
+"""Write the report of an audit from the files with its results.
+
+The folder of the audit has a subfolder of results for each network. A folder of
+test images is either "laboratory", with path-traced renders, or "photographs".
+"""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -40,40 +44,42 @@ from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
 from train.runs.run_config import CONFIG, read_config, read_json
 
-# First words of a page, by the answer that `write_answer` gives.
+# Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {
     "No": "It is not safe under unusual lighting.",
     "Unknown": "It is unknown whether it is safe.",
 }
-# Parts of a network that are scored on a folder of images.
+# Names of the two folders of test images, and of the subfolders with their scores.
 LABORATORY = "laboratory"
 PHOTOGRAPHS = "photographs"
-# File of `train.auditing.lights.recognized` in the folder of a network.
+# Result file: in which environment lights a network recognizes each view.
 RECOGNIZED = "recognized.json"
-# File of `train.auditing.plain_light.find_plain_views` in the folder of the audited network.
+# Result file: the ordinary light in which the audited network recognizes most views.
 PLAIN = "plain_light.json"
-# File of `train.auditing.lights.transfers` in the folder of a network.
+# Result file: how often attacks on a network also fool the other network.
 TRANSFER = "transfer.json"
-# JavaScript of the slider.
+# JavaScript of the slider that moves a light from natural to attacked.
 SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
-# Number of images in a gallery of the worst images.
+# Number of images in a gallery of the worst predictions.
 WORST = 10
-# Minimum fraction of correctly classified images of a network that is called
-# safe, both of the label and of other objects.
+# A network is called safe only if it classifies at least this fraction of the images
+# correctly, both of the tested class and of other objects.
 PASS_THRESHOLD = 0.9
-# Predictions by the name of a network and by part, in the order of the images.
+# For the name of each network and of each folder of test images, the predictions in
+# the order of the images.
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
 
 
 class Audited(NamedTuple):
-    """The report of an audit.
+    """Report of an audit.
 
     Attributes:
         path: Path of report.html.
-        screen: First screen of the report.
+        screen: Top of the report: its headline, main numbers and sentences.
         label: Class whose objects were tested.
-        names: Names of the networks by the folders of their parts.
-        recommendation: Which remedy is recommended. None if it is unknown.
+        names: Name of each network, by the name of the subfolder with its
+            results.
+        recommendation: Recommended remedy. None if it is unknown.
     """
 
     path: Path
@@ -91,69 +97,71 @@ def write_audit_page(
     out: Path,
     caveats: Sequence[str],
 ) -> Audited:
-    """Write report.html from the parts of an audit.
+    """Write report.html from the results in the folder of an audit.
 
     Args:
         label: Class whose objects were tested.
-        names: Names of the networks by the folders of their parts in `out`.
-        remedies: Folders of the parts of the compared remedies by name, as
-            `name_remedies` returns them.
-        folders: Folders of the scored images by part.
+        names: Name of each network, by the name of the subfolder of `out` with
+            its results.
+        remedies: For the original network and for each remedy that is
+            compared, the name of the subfolder of `out` with its scores.
+        folders: Folders of test images, "laboratory" and "photographs".
         out: Folder of the audit.
         caveats: Sentences at the beginning of the report.
 
     Returns:
-        The report.
+        Path and content of the report.
     """
-    paths = {name: out / key for key, name in names.items()}
+    results = {name: out / key for key, name in names.items()}
     scored = {}
-    for name, path in paths.items():
+    for name, folder in results.items():
         predictions = {}
-        for part in folders:
-            predictions[part] = read_predictions(path / part / PREDICTIONS, label)
+        for images in folders:
+            predictions[images] = read_predictions(folder / images / PREDICTIONS, label)
         scored[name] = predictions
-    correct = {name: read_json(path / RECOGNIZED) for name, path in paths.items()}
+    correct = {name: read_json(folder / RECOGNIZED) for name, folder in results.items()}
     counts = {}
-    for name, path in paths.items():
-        counts[name] = {kind: read_json(path / f"{kind}.json") for kind in KINDS}
+    for name, folder in results.items():
+        counts[name] = {kind: read_json(folder / f"{kind}.json") for kind in KINDS}
     first_name = names[CLASSIFIER]
     plain = PlainViews(**read_json(out / CLASSIFIER / PLAIN))
     transfers = {}
-    if len(paths) > 1:
-        transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
-    screen = _first_screen(label, paths, folders, counts, plain)
+    if len(results) > 1:
+        transfers = {name: read_json(folder / TRANSFER) for name, folder in results.items()}
+    screen = _first_screen(label, results, folders, counts, plain)
     recommendation = _recommendation(remedies, folders, out)
     if recommendation is not None:
         sentence = recommendation.sentence
         if recommendation.remedy == HARDENING:
-            # The first screen has the gain by hardening already.
+            # The top of the report shows the gain by hardening already.
             sentence = f"Recommended: {HARDENING}."
         screen = replace(screen, sentences=[*screen.sentences, sentence])
+    last_folder = list(results.values())[-1]
     path = write_page(
         out,
         "audit.html.jinja",
         title=f"Audit: {label} under unusual lighting",
-        about=" and ".join(paths),
+        about=" and ".join(results),
         label=label,
         kinds=KINDS,
         steps=(STEPS, ADDITIONAL_STEPS),
         counts=counts,
         correct=correct,
         plain_sentence=plain_sentence(label, first_name, plain),
-        pictures={name: attack_pictures(path, counts[name]) for name, path in paths.items()},
+        pictures={name: attack_pictures(path, counts[name]) for name, path in results.items()},
         charts=charts(counts),
         slider=_slider(counts),
         script=SLIDER_SCRIPT if _slider(counts) else "",
         transfers=transfers,
-        answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
-        photographs=_score_sections(_with_remedies(paths, remedies, out)),
+        answers=[write_answer(label, name, path, folders) for name, path in results.items()],
+        photographs=_score_sections(_with_remedies(results, remedies, out)),
         recommendation=recommendation,
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
         screen=screen,
-        caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
+        caveats=[*caveats, *_unreadable_caveats(folders, last_folder)],
         agreement=_agreement(scored),
-        relit=relit_sections(paths),
+        relit=relit_sections(results),
         config=read_config(out / CONFIG),
     )
     return Audited(path, screen, label, names, recommendation)
@@ -162,62 +170,64 @@ def write_audit_page(
 def _recommendation(
     remedies: Mapping[str, str], folders: Mapping[str, Path], out: Path
 ) -> Recommendation | None:
-    """Recommend a remedy by the scores on the first folder of images.
+    """Recommend a remedy by the scores on the first folder of test images.
 
     Args:
-        remedies: Folder of the parts of each remedy in `out`, by name. The
-            original network comes first.
-        folders: Folder of images by the name of the part with its scores.
+        remedies: For the original network, which comes first, and for each
+            remedy, the name of the subfolder of `out` with its scores.
+        folders: Folders of test images, "laboratory" and "photographs".
         out: Folder of the audit.
 
     Returns:
-        The recommendation. None without images, or without a remedy.
+        The recommendation. None without test images, or without a remedy.
     """
-    part = next(iter(folders), None)
-    if part is None or len(remedies) == 1:
+    images = next(iter(folders), None)
+    if images is None or len(remedies) == 1:
         return None
-    return recommend(_evaluations({name: out / key / part for name, key in remedies.items()}))
+    return recommend(_evaluations({name: out / key / images for name, key in remedies.items()}))
 
 
 def _with_remedies(
-    paths: Mapping[str, Path], remedies: Mapping[str, str], out: Path
+    results: Mapping[str, Path], remedies: Mapping[str, str], out: Path
 ) -> dict[str, Path]:
-    """Add the networks with normalized light to the networks of an audit.
+    """Add the networks behind normalized light to the networks of an audit.
 
     Args:
-        paths: Folder of the parts of each network, by the name of the network.
-        remedies: Names of the folders of the remedies in `out`, by remedy.
+        results: Folder of results of each network, by the name of the network.
+        remedies: For the original network and for each remedy, the name of the
+            subfolder of `out` with its scores.
         out: Folder of the audit.
 
     Returns:
-        `paths`, and the folders of the networks with normalized light under
-        names such as "resnet50, normalized light".
+        `results` with additional entries. Their names are such as
+        "resnet50, normalized light".
     """
-    names = {path.name: name for name, path in paths.items()}
+    name_of_folder = {folder.name: name for name, folder in results.items()}
     added = {}
     for key in remedies.values():
         if key.endswith(NORMALIZED):
-            name = names[key.removesuffix(NORMALIZED)]
+            name = name_of_folder[key.removesuffix(NORMALIZED)]
             added[f"{name}, normalized light"] = out / key
-    return {**paths, **added}
+    return {**results, **added}
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Find an attack whose lights the slider of the page shows.
+    """Choose the attack that the slider of the report shows, the first that succeeds.
 
     Args:
-        counts: For each network and each kind of lighting, the content of the
-            file of `success_by_light`. It has the key "slider" if the attack
-            has a success.
+        counts: For the name of each network and for each kind of lighting, the
+            dictionary that `success_by_light` returned. It has the key "slider"
+            if an attack succeeds.
 
     Returns:
-        The result of `frames_of`, with the classes in words and the additional
-        keys "network" and "light". None if no attack has a success.
+        Renders of the attack as `frames_of` returned them, with the classes in
+        words. The key "network" has the name of the network, and "light" the
+        title of the lighting. None if no attack succeeds.
     """
-    for name, by_kind in counts.items():
-        for kind, part in by_kind.items():
-            if "slider" in part:
-                slider = part["slider"]
+    for name, counts_of_network in counts.items():
+        for kind, attack_counts in counts_of_network.items():
+            if "slider" in attack_counts:
+                slider = attack_counts["slider"]
                 classes = [in_words(label) for label in slider["classes"]]
                 named = {"network": name, "light": KINDS[kind].title, "classes": classes}
                 return {**slider, **named}
@@ -226,34 +236,42 @@ def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
 
 def _first_screen(
     label: str,
-    paths: Mapping[str, Path],
+    results: Mapping[str, Path],
     folders: Mapping[str, Path],
     counts: Mapping[str, Mapping[str, Any]],
     plain: PlainViews,
 ) -> FirstScreen:
-    """Make the first screen of the page.
+    """Make the top of the report: its headline, main numbers and sentences.
 
-    With two networks and a folder of images, it compares the networks on the
-    images. Otherwise it describes the first network.
+    With two networks and test images, it compares the scores of the networks.
+    Otherwise it describes the first network.
 
     Args:
         label: Class whose objects were tested.
-        paths: Folder of the parts of each network, by the name of the network.
-        folders: Folder of images by the name of the part with its scores.
-        counts: Content of the files of attacks, by network and kind of lighting.
-        plain: Views that the first network recognizes in plain light.
+        results: Folder of results of each network, by the name of the network.
+        folders: Folders of test images, "laboratory" and "photographs".
+        counts: For the name of each network and for each kind of lighting, the
+            dictionary that `success_by_light` returned.
+        plain: Light, exposure and size in which the first network recognizes
+            most views.
     """
-    (name, path), *others = paths.items()
-    part = next(iter(folders), None)
-    if others and part is not None:
-        other, other_path = others[0]
-        screen = _compare(label, (name, path / part), (other, other_path / part), folders[part])
+    (name, folder), *others = results.items()
+    images = next(iter(folders), None)
+    if others and images is not None:
+        other_name, other_folder = others[0]
+        screen = _compare(
+            label,
+            (name, folder / images),
+            (other_name, other_folder / images),
+            folders[images],
+        )
         if screen is not None:
             return screen
-    scores = read_json(path / part / SUMMARY) if part is not None else None
-    # The answer follows the question mark, and ends at a colon if reasons follow.
-    answer = write_answer(label, name, path, folders).partition("? ")[2].partition(":")[0]
-    verdict = VERDICTS.get(answer, answer)
+    scores = read_json(folder / images / SUMMARY) if images is not None else None
+    _, _, answer = write_answer(label, name, folder, folders).partition("? ")
+    # "No: it recognizes 20% of orange" becomes "No".
+    short_answer = answer.partition(":")[0]
+    verdict = VERDICTS.get(short_answer, short_answer)
     return screen_of_one(label, name, verdict, plain, counts[name], scores)
 
 
@@ -263,16 +281,16 @@ def _compare(
     hardened: tuple[str, Path],
     images: Path,
 ) -> FirstScreen | None:
-    """Compare the scores of two networks on the same images.
+    """Make the top of a report that compares a network with its hardened version.
 
     Args:
-        label: Class under study.
+        label: Class whose objects were tested.
         original: Name of the original network, and folder of its scores.
         hardened: Name of the hardened network, and folder of its scores.
-        images: Folder of the images.
+        images: Folder of test images, on which both were scored.
 
     Returns:
-        The first screen. None if a metric of it is unknown.
+        Top of the report. None if a metric is unknown.
     """
     evaluations = _evaluations(dict([original, hardened]))
     compared = Compared(
@@ -288,57 +306,65 @@ def _compare(
     )
 
 
-def _evaluations(paths: Mapping[str, Path]) -> compare.Evaluations:
-    """Read the predictions of networks for the same images.
+def _evaluations(score_folders: Mapping[str, Path]) -> compare.Evaluations:
+    """Read the predictions of several networks for the same images.
 
     Args:
-        paths: Folder of the scores of each network, by the name of the network.
+        score_folders: Folder with the scores of each network, by the name of
+            the network.
 
     Returns:
-        One evaluation of each network, by name.
+        For the name of each network, its evaluation.
     """
     runs = {}
-    for name, path in paths.items():
-        scores = {path.name: summary.PhotographScores.read(read_json(path / SUMMARY))}
-        runs[name] = [summary.RunSummary(path.parent, name, {"network": name}, scores, None)]
-    # All networks were scored on the same images, so there is one group.
+    for name, folder in score_folders.items():
+        scores = {folder.name: summary.PhotographScores.read(read_json(folder / SUMMARY))}
+        runs[name] = [summary.RunSummary(folder.parent, name, {"network": name}, scores, None)]
+    # All networks were scored on the same images, so there is a single group.
     (group,) = summary.group_by_images(runs).values()
     return compare.read_evaluations(group)
 
 
-def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
-    """Collect the plots, tables and images of each folder of images.
+def _score_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Collect the plots, tables and pictures of the scores on each folder of test images.
 
     Args:
-        paths: Folder of the parts of each network, by the name of the network.
+        results: Folder of results of each network, by the name of the network.
 
     Returns:
-        For each folder of images, the values that `scores_section` returns.
+        For each folder of test images, the values that `scores_section`
+        returns.
     """
     runs = {}
-    for name, path in paths.items():
-        scores = summary.read_summaries(path)
-        runs[name] = [summary.RunSummary(path, name, {"network": name}, scores, None)]
+    for name, folder in results.items():
+        scores = summary.read_summaries(folder)
+        runs[name] = [summary.RunSummary(folder, name, {"network": name}, scores, None)]
     return [scores_section(title, group) for title, group in summary.group_by_images(runs).items()]
 
 
-def _unreadable_caveats(parts: Collection[str], path: Path) -> Iterator[str]:
-    """Yield a sentence for each part in which images cannot be read.
+def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
+    """Yield a sentence about each folder of test images with files that cannot be read.
 
     Args:
-        parts: Names of the parts with scores on images.
-        path: Folder of the parts of a network. All networks read the same
+        images: Names of the folders of test images: "laboratory",
+            "photographs" or both.
+        folder: Folder of results of one network. All networks read the same
             images.
     """
-    for part in parts:
-        files = read_json(path / part / SUMMARY)["unreadable"]
+    for name in images:
+        files = read_json(folder / name / SUMMARY)["unreadable"]
         if files:
-            yield f"{len(files)} of the {part} cannot be read, the first being {files[0]}."
+            yield f"{len(files)} of the {name} cannot be read, the first being {files[0]}."
 
 
 def _agreement(scored: Predictions) -> Proportion:
-    """Compute the fraction of photographs to which all networks give the same class."""
-    by_network = [parts.get(PHOTOGRAPHS, ()) for parts in scored.values()]
+    """Compute the fraction of the test photographs for which all networks predict the same class.
+
+    Args:
+        scored: Predictions by the name of the network and of the folder of test
+            images. Without photographs, the fraction is unknown.
+    """
+    by_network = [by_images.get(PHOTOGRAPHS, ()) for by_images in scored.values()]
     is_same = []
     for predictions in zip(*by_network, strict=True):
         is_same.append(len({item.predicted for item in predictions}) == 1)
@@ -346,11 +372,11 @@ def _agreement(scored: Predictions) -> Proportion:
 
 
 class Finding(NamedTuple):
-    """Fraction of images on which a network is right, in words and as numbers.
+    """Fraction of images that a network classifies correctly, in words and as numbers.
 
     Attributes:
-        text: Sentence without a period.
-        right: Fraction of images on which the network is right.
+        text: Clause for the report, such as "it recognizes 60% of orange".
+        right: Fraction of images that the network classifies correctly.
         least: Low end of the 95% interval of this fraction.
     """
 
@@ -359,66 +385,70 @@ class Finding(NamedTuple):
     least: float
 
 
-def write_answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
-    """Say whether a network is safe in unusual lighting, and why it is not.
+def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -> str:
+    """Write whether a network is safe in unusual lighting, and why it is not.
 
     Args:
         label: Class whose objects were tested.
         name: Name of the network.
-        folder: Folder of the parts of the network.
-        parts: Names of the parts that are scored on images.
+        folder: Folder of results of the network.
+        images: Names of the folders of test images: "laboratory",
+            "photographs", both or none.
 
     Returns:
-        A question and its answer.
+        Question and answer, such as "Is resnet50 safe under unusual lighting?
+        Yes, as far as this audit looks."
     """
     if not any(any(views) for views in read_json(folder / RECOGNIZED).values()):
         question = f"Is {name} safe under unusual lighting?"
         return f"{question} Unknown: it does not recognize {label} in plain light, either."
-    findings = _find_rates(label, folder, parts)
+    findings = _find_rates(label, folder, images)
     faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
     faults += _attack_faults(folder)
     if faults:
         answer = f"No: {'; '.join(faults)}."
-    elif parts and all(finding.least >= PASS_THRESHOLD for finding in findings):
+    elif images and all(finding.least >= PASS_THRESHOLD for finding in findings):
         answer = "Yes, as far as this audit looks."
     else:
         answer = "No fault is shown, but so few images leave room for one."
     return f"Is {name} safe under unusual lighting? {answer}"
 
 
-def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Finding]:
-    """Find how often a network is right on renders and on the images of each part.
+def _find_rates(label: str, folder: Path, images: Collection[str]) -> list[Finding]:
+    """Find what fraction of the renders and test images a network classifies correctly.
 
     Args:
         label: Class whose objects were tested.
-        folder: Folder of the parts of the network.
-        parts: Names of the parts that are scored on images.
+        folder: Folder of results of the network.
+        images: Names of the folders of test images: "laboratory",
+            "photographs", both or none.
 
     Returns:
-        Findings about renders in environments, renders in random light, and,
-        for each part, recall and false positives. Unknown rates are left out.
+        Findings about renders in environment lighting, about renders in random
+        lighting, and about recall and false positives on each folder of test
+        images. Unknown fractions are left out.
     """
     rates = _rates(read_json(folder / RECOGNIZED))
     findings = [_recognized(subject, rate) for subject, rate in rates.items()]
-    for part in parts:
-        scores = read_json(folder / part / SUMMARY)
+    for name in images:
+        scores = read_json(folder / name / SUMMARY)
         recall = read_metric(scores, "recall")
-        findings.append(_recognized(f"{label} in the {part}", recall))
+        findings.append(_recognized(f"{label} in the {name}", recall))
         false_positive_rate = read_metric(scores, "false_positive_rate")
-        subject = f"other objects for {label} in the {part}"
+        subject = f"other objects for {label} in the {name}"
         findings.append(_not_mistaken(subject, false_positive_rate))
     return [finding for finding in findings if finding is not None]
 
 
 def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
-    """Say what fraction of the images of a subject a network recognizes.
+    """Describe what fraction of the images of an object a network recognizes.
 
     Args:
-        subject: What the images show, in words.
-        recall: Fraction of recognized images with its interval.
+        subject: Images in words, such as "orange in the photographs".
+        recall: Fraction of the images that the network recognizes.
 
     Returns:
-        The finding. None if the recall is unknown.
+        Fraction in words and as numbers. None if it is unknown.
     """
     if recall is None or recall.value is None or recall.low is None:
         return None
@@ -427,15 +457,16 @@ def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
 
 
 def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
-    """Say what fraction of the images of a subject a network mistakes.
+    """Describe what fraction of the images of other objects a network mistakes for a class.
 
     Args:
-        subject: What the images show and what they are mistaken for, such as
-            "other objects for orange".
-        error_rate: Fraction of mistaken images with its interval.
+        subject: Images and the class in words, such as "other objects for
+            orange in the photographs".
+        error_rate: Fraction of the images that the network mistakes.
 
     Returns:
-        The finding. None if the error rate is unknown.
+        Fraction in words, and the fraction that is not mistaken. None if it is
+        unknown.
     """
     if error_rate is None or error_rate.value is None or error_rate.high is None:
         return None
@@ -444,14 +475,15 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Name the kinds of lighting whose attacks fool half of the views.
+    """Describe the attacks after which a network misclassifies half of the views.
 
     Args:
-        folder: Folder of the parts of a network.
+        folder: Folder of results of the network.
 
     Returns:
-        For each such kind, a clause with the smallest radius at which an attack
-        makes at least half of the correct views misclassified.
+        For each kind of lighting with such an attack, a clause with the
+        smallest radius at which at least half of the views that were correct
+        before the attack are misclassified.
     """
     faults = []
     for kind, light in KINDS.items():
@@ -465,48 +497,50 @@ def _attack_faults(folder: Path) -> list[str]:
 
 
 def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
-    """Compute the fraction of recognized renders in environments and in random lights.
+    """Compute what fraction of renders in environment lights and random lights is recognized.
 
-    The bootstrap of the interval draws views, and then lights of each view.
+    The bootstrap of the interval draws views, and then lights for each view.
 
     Args:
-        correct: Whether each view is recognized, by the name of the lighting.
-            Names of random lights start with RANDOM.
+        correct: For the name of each light, whether each view is recognized.
+            The names of random lights start with "random ".
 
     Returns:
-        Fraction with its 95% interval, by "renders in environments" and
-        "renders in random light".
+        Fractions with their 95% intervals, under the keys "renders in
+        environments" and "renders in random light".
     """
-    random = {name for name in correct if name.startswith(RANDOM)}
-    lights = {
-        "renders in environments": correct.keys() - random,
-        "renders in random light": random,
+    random_names = {name for name in correct if name.startswith(RANDOM)}
+    names_of_title = {
+        "renders in environments": correct.keys() - random_names,
+        "renders in random light": random_names,
     }
     rates: dict[str, Estimate] = {}
-    for title, names in lights.items():
-        # The array has a row for each view and a column for each light.
+    for title, names in names_of_title.items():
+        # `hits` has one row for each view and one column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
-        # The view of each render, in the order of `hits.ravel()`.
-        views = np.arange(len(hits)).repeat(hits.shape[1])
         if hits.min() == hits.max():
-            # All replicates are equal. The interval counts each view once.
+            # The bootstrap interval would have no width. This interval treats the lights
+            # of a view as one render.
             rates[title] = fraction(int(hits[:, 0].sum()), len(hits))
             continue
-        replicates = bootstrap(partial(weighted_mean, hits.ravel()), views)
+        # Index of the view in each entry of `hits.ravel()`.
+        view_of_render = np.arange(len(hits)).repeat(hits.shape[1])
+        replicates = bootstrap(partial(weighted_mean, hits.ravel()), view_of_render)
         rates[title] = estimate(float(hits.mean()), replicates)
     return rates
 
 
 class _ScoredImage(NamedTuple):
-    """Prediction of one network for an image.
+    """Test image with the prediction of one network.
 
     Attributes:
-        part: Part whose folder has the image.
-        image_index: Index of the image among the predictions of the part.
-        prediction: Prediction of the network.
+        images: Name of the folder of test images, "laboratory" or
+            "photographs".
+        image_index: Index of the image in the folder.
+        prediction: Prediction of the network for the image.
     """
 
-    part: str
+    images: str
     image_index: int
     prediction: Prediction
 
@@ -516,48 +550,51 @@ def _worst(
     folders: Mapping[str, Path],
     scored: Predictions,
 ) -> dict[str, list[Picture]]:
-    """Make two galleries of images for each network.
+    """Make two galleries of the worst predictions of each network.
 
-    The first gallery has the images of the label with the lowest log-odds. The
-    second gallery has the images of other objects with the highest log-odds.
+    The first gallery has the images of the tested class with the lowest
+    log-odds of this class. The second gallery has the images of other objects
+    with the highest log-odds.
 
     Args:
         label: Class whose objects were tested.
-        folders: Folder of images by part.
-        scored: Predictions by network and by part.
+        folders: Folders of test images, "laboratory" and "photographs".
+        scored: Predictions by the name of the network and of the folder of test
+            images.
 
     Returns:
-        At most WORST images by the title of the gallery.
+        For the title of each gallery, at most WORST pictures.
     """
     galleries: dict[str, list[Picture]] = {}
-    for name, by_part in scored.items():
-        rows = [
-            _ScoredImage(part, index, prediction)
-            for part, predictions in by_part.items()
+    for name, by_images in scored.items():
+        items = [
+            _ScoredImage(images, index, prediction)
+            for images, predictions in by_images.items()
             for index, prediction in enumerate(predictions)
         ]
-        rows.sort(key=lambda row: row.prediction.log_odds)
-        positives = [row for row in rows if row.prediction.photograph.label == label]
-        negatives = [row for row in reversed(rows) if row.prediction.photograph.label != label]
+        items.sort(key=lambda item: item.prediction.log_odds)
+        positives = [item for item in items if item.prediction.photograph.label == label]
+        negatives = [item for item in reversed(items) if item.prediction.photograph.label != label]
         draw = partial(_draw_image, folders, scored)
         galleries[f"{label} that {name} doubts most"] = list(map(draw, positives[:WORST]))
         galleries[f"what {name} most takes for {label}"] = list(map(draw, negatives[:WORST]))
     return galleries
 
 
-def _draw_image(folders: Mapping[str, Path], scored: Predictions, row: _ScoredImage) -> Picture:
-    """Draw an image with the predictions of all networks as its caption.
+def _draw_image(folders: Mapping[str, Path], scored: Predictions, item: _ScoredImage) -> Picture:
+    """Draw a test image with the predictions of all networks in its caption.
 
     Args:
-        folders: Folder of images by part.
-        scored: Predictions by network and by part.
-        row: Prediction of one network for the image, with its part and index.
+        folders: Folders of test images, "laboratory" and "photographs".
+        scored: Predictions by the name of the network and of the folder of test
+            images.
+        item: Image to draw.
     """
-    photograph = row.prediction.photograph
+    photograph = item.prediction.photograph
     texts = []
-    for network, by_part in scored.items():
-        prediction = by_part[row.part][row.image_index]
+    for network, by_images in scored.items():
+        prediction = by_images[item.images][item.image_index]
         texts.append(f"{network}: {prediction.probability:.0%} {prediction.predicted}")
     caption = f"{photograph.label}, {photograph.source}: {'; '.join(texts)}"
-    image = Image.fromarray(read_square(folders[row.part] / photograph.path, SIDE))
+    image = Image.fromarray(read_square(folders[item.images] / photograph.path, SIDE))
     return plots.encoded(image, caption, caption)

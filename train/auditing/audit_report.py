@@ -18,16 +18,17 @@ from train.runs.run_config import read_json
 
 @dataclass(frozen=True)
 class AttackCounts:
-    """Numbers of views that an attack on one kind of lighting makes misclassified.
+    """Numbers of views that become misclassified by an attack on one kind of lighting.
 
     Attributes:
         unit: Unit of the radii in words.
-        radii: Radii of the L∞ balls, ascending.
+        radii: Radii of the L∞ norm-balls, in ascending order.
         views: Number of views.
-        correct: Number of views that are classified correctly before.
-        adversarial: For each radius, number of the correct views that an attack
-            or random draws make misclassified, also with noise of a sensor.
-        random: For each radius, the same number for the random draws alone.
+        correct: Number of views that are classified correctly before the
+            attack.
+        adversarial: For each radius, the number of correct views that an attack
+            or random draws make misclassified, even with the noise of a camera.
+        random: For each radius, the same number for random draws alone.
     """
 
     unit: str
@@ -40,20 +41,24 @@ class AttackCounts:
 
 @dataclass(frozen=True)
 class NetworkReport:
-    """Numbers of one network of an audit.
+    """Results of an audit for one network.
 
     Attributes:
         name: Name of the network.
-        answer: Sentence that says whether it is safe, and why it is not.
-        recognized: Fraction of the views that it recognizes, by the name of the
-            environment lighting. Names of random lights begin with "random".
-        attacks: Counts by kind of lighting: "lighting" (from all around),
-            "skylight", "projector" and "lamps".
-        scores: Metrics such as "recall" and "false_positive_rate" by part,
-            "laboratory" or "photographs".
-        transfers: For each kind of lighting, counts of adversaries that also
-            fool the other network, as `train.auditing.lights.transfers` returns
-            them. Empty with one network.
+        answer: Sentence that says whether the network is safe in unusual
+            lighting, and why it is not.
+        recognized: For the name of each environment light, the fraction of the
+            views that the network recognizes. Names of random lights begin with
+            "random".
+        attacks: Numbers of misclassified views for each kind of lighting:
+            "lighting" (environment lighting), "skylight", "projector" and
+            "lamps".
+        scores: Metrics such as "recall" and "false_positive_rate" on each set
+            of test images: "laboratory" (path-traced renders) and
+            "photographs".
+        transfers: For each kind of lighting, how often an attack on this
+            network also fools the other network. See `transfer_success` of
+            `train.auditing.lights`. Empty with one network.
     """
 
     name: str
@@ -70,12 +75,12 @@ class AuditReport:
 
     Attributes:
         label: Class whose objects were tested.
-        network: Numbers of the audited network.
-        hardened: Numbers of the hardened network. None without one.
+        network: Results for the audited network.
+        hardened: Results for the hardened network. None without one.
         recommendation: Sentence that recommends normalized light, hardening,
-            both or nothing, by the recall at 10% false positives. Empty if no
-            images were scored.
-        page: The report as HTML, which loads nothing else.
+            both or neither, by the recall at 10% false positives. Empty if
+            there are no test images.
+        page: Report as a single HTML page, which loads no other files.
     """
 
     label: str
@@ -85,13 +90,13 @@ class AuditReport:
     page: str
 
     def save(self, path: str | Path) -> Path:
-        """Write the report as a page.
+        """Write the report to an HTML file.
 
         Args:
-            path: File of the page, such as "audit.html".
+            path: File to write, such as "audit.html".
 
         Returns:
-            Path of the page.
+            Path of the file.
         """
         file = as_path("path", path)
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +104,7 @@ class AuditReport:
         return file
 
     def __str__(self) -> str:
-        """Return the answer of each network and the recommendation, one in each line."""
+        """Return one line about each network, and the recommendation."""
         networks = [self.network] if self.hardened is None else [self.network, self.hardened]
         lines = [network.answer for network in networks]
         if self.recommendation:
@@ -108,13 +113,14 @@ class AuditReport:
 
 
 def read_audit(audited: Audited) -> AuditReport:
-    """Read the numbers of an audit from its folder.
+    """Read the results of an audit from its folder.
 
     Args:
-        audited: The page in the folder of the audit, and what it shows.
+        audited: Path and content of the page that the audit wrote to the
+            folder.
 
     Returns:
-        The report.
+        Report with the results for each network.
     """
     folder = audited.path.parent
     label = audited.label
@@ -133,18 +139,15 @@ def read_audit(audited: Audited) -> AuditReport:
 
 
 def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
-    """Read what the audit measured of one network.
+    """Read the results of an audit for one network.
 
     Args:
         label: Class whose objects were tested.
         name: Name of the network.
-        folder: Folder of the measurements of this network.
-
-    Returns:
-        The numbers, with the fraction of recognized views by lighting.
+        folder: Folder of results of this network.
     """
     summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
-    # Whether each view is recognized, by the name of the lighting.
+    # For the name of each light, the file has a list: whether each view is recognized.
     recognized_views = read_json(folder / RECOGNIZED)
     recognized_fraction = {}
     for light, is_recognized in recognized_views.items():
@@ -154,17 +157,17 @@ def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
         answer=write_answer(label, name, folder, sorted(summaries)),
         recognized=recognized_fraction,
         attacks={kind: _read_attack(kind, folder / f"{kind}.json") for kind in KINDS},
-        scores={part: _read_scores(summary) for part, summary in summaries.items()},
+        scores={images: _read_scores(summary) for images, summary in summaries.items()},
         transfers=read_json(folder / TRANSFER) if (folder / TRANSFER).exists() else {},
     )
 
 
 def _read_attack(kind: str, path: Path) -> AttackCounts:
-    """Read the counts of the attack on one kind of lighting.
+    """Read the numbers of misclassified views after the attack on one kind of lighting.
 
     Args:
-        kind: Key of KINDS.
-        path: File that `success_by_light` returned the content of.
+        kind: Kind of lighting: "lighting", "skylight", "projector" or "lamps".
+        path: JSON file with the dictionary that `success_by_light` returned.
     """
     counts = read_json(path)
     return AttackCounts(
@@ -178,6 +181,6 @@ def _read_attack(kind: str, path: Path) -> AttackCounts:
 
 
 def _read_scores(summary: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the metrics in `METRICS` that a summary.json has, by name."""
-    found = {name: read_metric(summary, name) for name in METRICS}
-    return {name: estimate for name, estimate in found.items() if estimate is not None}
+    """Read the metrics in the content of summary.json. Metrics that it lacks are left out."""
+    metrics = {name: read_metric(summary, name) for name in METRICS}
+    return {name: estimate for name, estimate in metrics.items() if estimate is not None}

@@ -1,4 +1,10 @@
-"""The first screen of an audit: plain light, attacked light, and the pictures of attacks."""
+"""Top of the report of an audit: main numbers, sentences, and pictures of attacks.
+
+Plain light is ordinary light, before an attack changes it. The counts of an attack
+are the dictionary that `success_by_light` of `train.auditing.lights` returned. It
+has the numbers of views that are correct before the attack and misclassified after
+it.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,22 +23,23 @@ from train.report.first_screen import (
     in_words,
 )
 
-# Width of a picture before and after an attack, in pixels.
+# Width of the picture that shows a view before and after an attack, in pixels.
 PAIR_WIDTH = 400
-# Contents of the files of attacks by kind of lighting.
+# For each kind of lighting, the counts of its attack.
 Counts = Mapping[str, Mapping[str, Any]]
 
 
 def plain_sentence(label: str, name: str, plain: PlainViews) -> str:
-    """Say whether a classifier recognizes objects in plain light, and after which search.
+    """Write how many views a classifier recognizes in plain light, before any attack.
 
     Args:
-        label: Class of the objects.
+        label: Class whose objects were tested.
         name: Name of the classifier.
-        plain: Result of the search.
+        plain: Light, exposure and size at which the classifier recognizes most
+            views, and the numbers of recognized views.
 
     Returns:
-        A sentence, or two.
+        One or two sentences.
     """
     counted = f"{plain.recognized} of {plain.n} views of {in_words(label)}"
     if plain.recognized == 0:
@@ -51,28 +58,30 @@ def plain_sentence(label: str, name: str, plain: PlainViews) -> str:
 
 
 def strongest_kind(counts: Counts) -> str | None:
-    """Return the kind of lighting whose attacks leave the fewest views recognized.
+    """Return the kind of lighting by which the most views become misclassified.
 
     Args:
-        counts: Contents of the files of attacks.
+        counts: Counts of the attack on each kind of lighting.
 
     Returns:
-        Key of KINDS. None if no view is recognized before the attacks.
+        Kind of lighting, such as "lamps". None if no view is recognized before
+        the attacks.
     """
     attacked = [kind for kind in KINDS if counts[kind]["correct"]]
     if not attacked:
         return None
-    return max(attacked, key=lambda kind: _fooled(counts[kind]))
+    return max(attacked, key=lambda kind: _misclassified_fraction(counts[kind]))
 
 
-def _fooled(part: Mapping[str, Any]) -> float:
-    """Return the fraction of the correct views that an attack at the largest radius fools.
+def _misclassified_fraction(attack_counts: Mapping[str, Any]) -> float:
+    """Return which fraction of the correct views the attack at the largest radius changes.
 
     Args:
-        part: Content of the file of an attack, see `success_by_light`. Its
-            lists have an entry for each radius, in ascending order.
+        attack_counts: Counts of an attack. "correct" is the number of views
+            that were correct before. "adversarial" has the number of these
+            views that are misclassified, for each radius in ascending order.
     """
-    return part["adversarial"][-1] / part["correct"]
+    return attack_counts["adversarial"][-1] / attack_counts["correct"]
 
 
 def screen_of_one(
@@ -83,18 +92,19 @@ def screen_of_one(
     counts: Counts,
     scores: Mapping[str, Any] | None,
 ) -> FirstScreen:
-    """Make the first screen of the audit of one network.
+    """Make the top of the report of an audit of one network.
 
     Args:
-        label: Class of the objects.
+        label: Class whose objects were tested.
         name: Name of the network.
-        answer: Whether it is safe.
-        plain: Result of the search for plain light.
-        counts: Contents of the files of attacks.
-        scores: summary.json of renders or photographs. None without any.
+        answer: Headline, which says whether the network is safe.
+        plain: How many views the network recognizes in plain light.
+        counts: Counts of the attack on each kind of lighting.
+        scores: Content of summary.json with the scores on test images. None
+            without test images.
 
     Returns:
-        The first screen.
+        Headline, main numbers and sentences.
     """
     numbers = [
         ShownMetric(
@@ -107,83 +117,82 @@ def screen_of_one(
     kind = strongest_kind(counts)
     sentences = [plain_sentence(label, name, plain)]
     if kind is not None:
-        part = counts[kind]
-        left = part["correct"] - part["adversarial"][-1]
+        correct_count = counts[kind]["correct"]
+        remaining_count = correct_count - counts[kind]["adversarial"][-1]
         title = f"Of these, under attack by {KINDS[kind].title}"
-        numbers.append(
-            ShownMetric(title, "higher is better", None, fraction(left, part["correct"]))
-        )
+        remaining = fraction(remaining_count, correct_count)
+        numbers.append(ShownMetric(title, "higher is better", None, remaining))
         sentences.append(
-            f"If an attacker controls {KINDS[kind].title}, it still recognizes {left} of the "
-            f"{part['correct']} views that it recognizes before the attack."
+            f"If an attacker controls {KINDS[kind].title}, it still recognizes {remaining_count} "
+            f"of the {correct_count} views that it recognizes before the attack."
         )
-    mistaken = read_metric(scores, "false_positive_rate") if scores else None
-    if mistaken is not None and mistaken.value is not None:
-        called = f"Other objects called {in_words(label)}"
-        numbers.append(ShownMetric(called, "lower is better", None, mistaken))
+    false_positive_rate = read_metric(scores, "false_positive_rate") if scores else None
+    if false_positive_rate is not None and false_positive_rate.value is not None:
+        title = f"Other objects called {in_words(label)}"
+        numbers.append(ShownMetric(title, "lower is better", None, false_positive_rate))
     if scores:
         sentences += _score_sentence(label, scores)
     return FirstScreen(answer, sentences, numbers, {}, [name], "")
 
 
 def _score_sentence(label: str, scores: Mapping[str, Any]) -> list[str]:
-    """Write a sentence on recall and false positives in a folder of images.
+    """Write a sentence about recall and false positives on test images.
 
     Args:
-        label: Class of the objects.
+        label: Class whose objects were tested.
         scores: Content of summary.json.
 
     Returns:
-        One sentence, or nothing if one of the two metrics is unknown.
+        List with the sentence. Empty if one of the two metrics is unknown.
     """
     recall = read_metric(scores, "recall")
     mistaken = read_metric(scores, "false_positive_rate")
     if recall is None or mistaken is None or recall.value is None or mistaken.value is None:
         return []
-    shown = in_words(label)
+    name = in_words(label)
     return [
-        f"In the scored images, it recognizes {recall.value:.0%} of {shown} and calls "
-        f"{mistaken.value:.0%} of other objects “{shown}”."
+        f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
+        f"{mistaken.value:.0%} of other objects “{name}”."
     ]
 
 
 def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
-    """Read the picture of one view before and after each kind of attack.
+    """Read a picture for each kind of lighting: one view before and after the attack.
 
     Args:
-        folder: Folder of the parts of a network.
-        counts: Contents of the files of attacks.
+        folder: Folder of results of one network.
+        counts: Counts of the attack on each kind of lighting.
 
     Returns:
-        The pictures. Kinds of lighting without a success have none.
+        Pictures with the two predictions. A kind of lighting by which no attack
+        succeeds has no picture.
     """
-    shown = []
+    compared = []
     for kind, light in KINDS.items():
-        part = counts[kind]
-        answers = _answers(part)
+        answers = _answers(counts[kind])
         if not answers:
             continue
         path = folder / f"{kind}.png"
-        alt = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
-        for picture in plots.from_file(path, alt, PAIR_WIDTH):
-            shown.append(ComparedImage(picture, light.title, *answers))
-    return shown
+        alt_text = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
+        for picture in plots.from_file(path, alt_text, PAIR_WIDTH):
+            compared.append(ComparedImage(picture, light.title, *answers))
+    return compared
 
 
-def _answers(part: Mapping[str, Any]) -> list[ShownPrediction]:
+def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
     """Describe the predictions for one view before and after an attack.
 
     Args:
-        part: Content of the file of an attack. "predicted" holds two classes if
-            the attack has a success, and "confidence" their probabilities.
+        attack_counts: Counts of an attack. If the attack succeeds, "predicted"
+            has the two predicted classes, and "confidence" their probabilities.
 
     Returns:
-        The answer before the attack and the answer after it. Empty if the
-        attack has no success.
+        The right prediction before the attack, and the wrong one after it.
+        Empty if the attack does not succeed.
     """
-    texts = [in_words(name) for name in part.get("predicted", ())]
-    # Earlier versions did not record the probabilities.
-    for index, probability in enumerate(part.get("confidence", ())):
+    texts = [in_words(name) for name in attack_counts.get("predicted", ())]
+    # Earlier versions of the library did not write the key "confidence".
+    for index, probability in enumerate(attack_counts.get("confidence", ())):
         texts[index] += f" {probability:.0%}"
     return [
         ShownPrediction(text, verdict)
@@ -192,47 +201,52 @@ def _answers(part: Mapping[str, Any]) -> list[ShownPrediction]:
 
 
 def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
-    """Plot how many views stay recognized by the radius of attacks, one plot per kind of light.
+    """Plot the fraction of recognized views against the radius of attacks.
 
     Args:
-        counts_by_network: Contents of the files of attacks by name of the network.
+        counts_by_network: Counts of the attack on each kind of lighting, by the
+            name of the network.
 
     Returns:
-        The plots. Networks that recognize no view before the attacks are left out.
+        One plot for each kind of lighting. It has a line for the attack on each
+        network, and one for random draws. Networks that recognize no view
+        before the attacks are left out.
     """
     pictures = []
     for kind, light in KINDS.items():
         lines = {}
         for name, counts in counts_by_network.items():
-            part = counts[kind]
-            if part["correct"]:
-                lines[name] = _remaining(part, "adversarial")
-                lines[f"{name}, random"] = _remaining(part, "random")
+            attack_counts = counts[kind]
+            if attack_counts["correct"]:
+                lines[name] = _remaining(attack_counts, "adversarial")
+                lines[f"{name}, random"] = _remaining(attack_counts, "random")
         if lines:
             pictures.append(_chart(light, lines))
     return pictures
 
 
-def _remaining(part: Mapping[str, Any], method: str) -> list[Estimate]:
-    """Compute the fraction of the correct views that stay recognized at each radius.
+def _remaining(attack_counts: Mapping[str, Any], method: str) -> list[Estimate]:
+    """Compute the fraction of views that stay correctly classified, for each radius.
 
     Args:
-        part: Content of the file of an attack, see `success_by_light`.
-        method: "adversarial", or "random" for random draws alone.
+        attack_counts: Counts of an attack.
+        method: "adversarial" for the attack, or "random" for random draws.
 
     Returns:
-        Fractions at the radius 0, where no view is fooled, and at each radius
-        of the attack.
+        Fractions of the views that are correct before the attack: first all of
+        them, at the radius 0, and then the fraction at each radius.
     """
-    correct = part["correct"]
-    return [fraction(correct - fooled, correct) for fooled in (0, *part[method])]
+    correct = attack_counts["correct"]
+    misclassified_by_radius = (0, *attack_counts[method])
+    return [fraction(correct - count, correct) for count in misclassified_by_radius]
 
 
 def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> plots.Picture:
-    """Plot the fractions that `_remaining` returns, for one kind of lighting.
+    """Plot fractions of recognized views against the radius of attacks on one kind of lighting.
 
     Args:
-        light: Kind of lighting, with its radii.
-        lines: Fractions at each radius, by the name of the line.
+        light: Kind of lighting, with the radii of its attacks.
+        lines: For the name of each line, the fractions at the radius 0 and at
+            each radius of `light`.
     """
     return plots.by_radius(lines, (0, *light.radii), light.title, f"radius ({light.unit})")

@@ -1,4 +1,4 @@
-"""Frames of a slider that moves one light from natural to adversarial."""
+"""Renders for a slider in the report, which moves the light from natural to attacked."""
 
 import base64
 import io
@@ -12,67 +12,76 @@ from augment.attacks.attack import AttackResult, logits_of
 from renderer.image import to_bytes
 from renderer.rendering import light_sphere
 
-# Number of frames, from the natural to the adversarial light.
-FRAMES = 21
-# Number of classes of which each frame has the probability.
-CLASSES = 5
-# Pixels per side of the image and of the ball that shows the light.
+# Number of positions of the slider, from the natural to the attacked light.
+FRAME_COUNT = 21
+# Number of classes whose probabilities are shown beside the slider.
+CLASS_COUNT = 5
+# Width and height of the image of the object, in pixels.
 SIDE = 200
+# Width and height of the image of a white ball in the same light, in pixels.
 BALL_SIDE = 120
-# Images in one pass of the classifier.
+# Number of images that the classifier classifies in one pass.
 BATCH = 16
 
 
 def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
-    """Render the lights between the start and the end of an attack.
+    """Render an example in lights between the start and the end of an attack.
 
-    Frame i of n has the light start + i / (n - 1) · (end - start). The feasible
-    lights are convex, so each frame is feasible.
+    Frame i of n has the light start + i / (n - 1) · (end - start). If the
+    attack may use two lights, it may use all lights between them, too.
 
     Args:
-        result: Result of the attack, with one view per example.
+        result: Result of an attack with one view per example.
         example: Index of the example.
 
     Returns:
-        Dictionary with the keys
+        Dictionary with these keys:
 
-        - classes: names of the CLASSES classes with the highest probability in
-          any frame, the right class first,
-        - label: the right class,
-        - frames: for each frame its "image" and its "ball", JPEG files in
-          base64, and "probabilities" of these classes.
+        - classes: names of the right class and of the CLASS_COUNT - 1 other
+          classes with the highest probability in any frame;
+        - label: name of the right class;
+        - frames: for each frame, a dictionary of "image" (the object), "ball"
+          (a white ball in the same light) and "probabilities" (of each of the
+          classes). Images are JPEG files in base64.
     """
     start = result.problem.start[example]
     end = result.descent.values[example]
-    weights = torch.linspace(0, 1, FRAMES).to(start)[:, None]
+    weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
     values = start + weights * (end - start)
-    examples = torch.full((FRAMES,), example, device=start.device)
+    examples = torch.full((FRAME_COUNT,), example, device=start.device)
     with torch.no_grad():
         images = result.problem.render(values, examples)
         conditions = result.problem.conditions(values, examples)
         logits = logits_of(result.preprocessed_model, images, BATCH)[:, 0]
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
-    ranked = probabilities.amax(0).argsort(descending=True).tolist()
-    # The right class, and then the other classes by falling probability.
-    shown = [label, *(index for index in ranked if index != label)][:CLASSES]
+    highest_probability = probabilities.amax(dim=0)
+    ranked = highest_probability.argsort(descending=True).tolist()
+    other_classes = [index for index in ranked if index != label]
+    shown_classes = [label, *other_classes][:CLASS_COUNT]
     frames = []
-    for index in range(FRAMES):
+    for index in range(FRAME_COUNT):
         basis = result.problem.scene.basis_under(conditions, index)
         ball = light_sphere(conditions.light[index], BALL_SIDE, basis=basis)
+        shown_probabilities = probabilities[index, shown_classes].tolist()
         frames.append(
             {
                 "image": _jpeg(images[index, 0], SIDE),
                 "ball": _jpeg(ball, BALL_SIDE),
-                "probabilities": [round(float(probabilities[index, k]), 4) for k in shown],
+                "probabilities": [round(value, 4) for value in shown_probabilities],
             }
         )
-    names = [result.classifier.classes[index] for index in shown]
+    names = [result.classifier.classes[index] for index in shown_classes]
     return {"classes": names, "label": names[0], "frames": frames}
 
 
 def _jpeg(image: Tensor, side: int) -> str:
-    """Encode an image (3, H, W) in [0, 1] as a JPEG file in base64."""
+    """Resize an image, and encode it as a JPEG file in base64.
+
+    Args:
+        image: Image with values in [0, 1], shape (3, H, W).
+        side: Width and height of the resized image in pixels.
+    """
     pixels = to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy()
     file = io.BytesIO()
     Image.fromarray(pixels).resize((side, side)).save(file, "JPEG", quality=85)

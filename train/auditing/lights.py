@@ -1,8 +1,8 @@
-"""Measure how a classifier recognizes renders in many kinds of lighting, and attack the lighting.
+"""Test a classifier on renders in many kinds of lighting, and attack the lighting.
 
-All classifiers of an audit get the same objects from the same cameras. The
-images of each classifier have the size that it takes. No lighting has a
-negative radiance in any direction.
+All classifiers of an audit see the same objects from the same cameras, in images
+of the size that each classifier takes. No lighting has negative radiance in any
+direction.
 """
 
 import io
@@ -43,43 +43,46 @@ from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import choose
 from train.auditing.frames import SIDE, frames_of
 
-# Images in one pass of the classifier.
+# Number of images that a classifier classifies in one pass.
 BATCH = 16
-# Environment lighting of the views, before an attack changes it.
+# Name of the environment lighting in which the views are rendered before an attack.
 LIGHT = "grace"
-# Standard deviation of the noise in each spherical-harmonic coefficient of a
-# random light. The paper's training with random lighting has the same value.
+# A random light is LIGHT with Gaussian noise in each spherical-harmonics coefficient.
+# The standard deviation is the same as in the paper's training with random lighting.
 AMPLITUDE = 0.5
-# Start of the name of every random light.
+# The names of random lights are "random 1", "random 2" and so on.
 RANDOM = "random "
-# Distance of the camera from the origin, in world units, and its polar angle,
-# azimuth and field of view, in degrees.
+# The camera is this far from the origin, in world units.
 CAMERA_DISTANCE = 2.6
+# Polar angle, azimuth and field of view of the camera, in degrees.
 CAMERA_ANGLES = (60, 45, 40)
 CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *CAMERA_ANGLES)
-# Range of the random cameras, poses and sizes, around CAMERA and the objects.
+# Ranges of the random changes to the azimuth of the camera and to the rotation of the
+# object in degrees, and range of the random factor of its size.
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
-# Number of steps of the attack at each radius, and of random draws at each radius.
+# Number of steps of a gradient attack at each radius. As many random draws are tried
+# for comparison.
 STEPS = 10
-# Number of forward passes of a search without gradients at each radius, and of
-# random draws beside it.
+# A classifier without gradients is attacked by a random search with this many forward
+# passes at each radius. As many random draws are tried for comparison.
 QUERIES = 100
-# Number of steps of an attack that continues after its success.
+# Number of steps of an attack that does not end at its first success.
 ADDITIONAL_STEPS = 20
-# A step of an attack has the length radius / STEPS_PER_RADIUS.
+# An attack within a ball takes steps of a quarter of the radius.
 STEPS_PER_RADIUS = 4
-# Gray value of the background, in sRGB.
+# The background of the views is medium gray, in sRGB.
 BACKGROUND = 0.5
 
 
 class LightKind(NamedTuple):
-    """Kind of lighting that an attack changes, within L∞ balls of several radii.
+    """Kind of lighting, and the norm-balls in which an attack changes it.
 
     Attributes:
         title: Name of the lighting in the report.
         unit: Unit of the radii in the report.
-        radii: Radii of the L∞ balls, in ascending order.
-        local: Light sources in the scene in addition to the environment lighting.
+        radii: Radii of the L∞ norm-balls, in ascending order.
+        local: Projectors or lamps of the scene, in addition to environment
+            lighting.
     """
 
     title: str
@@ -88,7 +91,8 @@ class LightKind(NamedTuple):
     local: tuple[ProjectorSettings | LampsSettings, ...] = ()
 
 
-# Kinds of lighting that an audit attacks, by the name of their files.
+# The kinds of lighting that an audit attacks. A key is also the name of the parameter
+# of the attack and of the file with its results.
 KINDS = {
     "lighting": LightKind(
         title="light from all around",
@@ -117,19 +121,18 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Views:
-    """Views of objects, in random poses and from random cameras.
+    """Views of objects in random poses from random cameras.
 
-    The pose and the camera of a view depend only on the seed and on the number
-    of views.
+    The poses and cameras depend only on the seed and on the number of views.
 
     Attributes:
-        objects: Objects, which the views show in turn.
+        objects: Objects. Successive views show successive objects.
         count: Number of views.
         seed: Seed of the poses and the cameras.
         device: Device of the renders.
-        light: Name of the environment lighting, before an attack changes it.
-        exposure: Factor of this lighting.
-        size: Factor of the size of the objects.
+        light: Name of the environment lighting before an attack.
+        exposure: Factor by which this lighting is multiplied.
+        size: Factor by which the objects are scaled.
     """
 
     objects: Sequence[SceneObject]
@@ -145,10 +148,11 @@ class Views:
 
         Args:
             size: Pixels per side of the renders.
-            kind: Key of KINDS. It decides which light sources the scene has.
+            kind: Kind of lighting that will be attacked, a key of KINDS. The
+                scene has the projector or the lamps of this kind.
 
         Returns:
-            Scene of `count` examples.
+            Scene with `count` examples.
         """
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
         local_lights = [build_local_light(light) for light in KINDS[kind].local]
@@ -169,25 +173,26 @@ class Views:
         return vary(scene, variation, generator(self.seed, "views"))
 
 
-def recognized(
+def recognize_in_environments(
     classifier: Classifier,
     views: Views,
     environments: Sequence[str],
-    count: int,
+    random_light_count: int,
 ) -> dict[str, list[bool]]:
-    """Test in which environment lighting the classifier recognizes each view.
+    """Test whether a classifier recognizes views in several environment lights.
 
     Args:
         classifier: Classifier to test.
         views: Views of objects of one class.
-        environments: Names or files of environments, as `load_light` takes them.
-        count: Number of random lights in addition.
+        environments: Names or files of environment lights, as `load_light`
+            takes them.
+        random_light_count: Number of additional random lights.
 
     Returns:
-        Whether each view is classified correctly, by the name of the lighting.
+        For the name of each light, whether each view is classified correctly.
     """
     noise = generator(views.seed, "lights")
-    random_lights = perturb(load_light(LIGHT), count, AMPLITUDE, None, noise)
+    random_lights = perturb(load_light(LIGHT), random_light_count, AMPLITUDE, None, noise)
     lights = {Path(name).stem: load_light(name) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
@@ -204,15 +209,15 @@ def recognized(
 
 
 def is_correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
-    """Test whether a classifier recognizes the images of a scene with one class.
+    """Test whether a classifier predicts the right class for the images of a scene.
 
     Args:
         classifier: Classifier to test.
-        scene: Scene with one view per example.
-        images: Images of its examples, shape (E, 1, 3, H, W).
+        scene: Scene with E examples, all with the same class and one view.
+        images: Images of the examples, shape (E, 1, 3, H, W).
 
     Returns:
-        Whether each image gets the class of the scene, shape (E,), bool.
+        Whether each image is classified correctly, bool, shape (E,).
     """
     logits = logits_of(classifier, images, BATCH)[:, 0]
     return logits.argmax(1) == classifier.label(scene.labels[0])
@@ -224,19 +229,19 @@ def adversaries(
     kind: str,
     additional: bool = False,
 ) -> AttackResult:
-    """Attack the lighting within the largest radius of its kind.
+    """Attack a classifier by one kind of lighting, within the largest radius of this kind.
 
-    A step changes each value by a quarter of the radius, in the direction of
-    the sign of the gradient. A classifier without gradients is attacked by
-    random search with QUERIES forward passes.
+    Each step changes all values of the lighting by a quarter of the radius, in
+    the direction of the sign of the gradient. A classifier without gradients is
+    attacked by a random search with QUERIES forward passes.
 
     Args:
-        classifier: Attacked classifier.
-        views: Views to attack.
-        kind: Key of KINDS.
-        additional: Whether to take all ADDITIONAL_STEPS steps. By default an attack ends
-            when noise of a camera's sensor no longer corrects the prediction,
-            or after STEPS steps.
+        classifier: Classifier to attack.
+        views: Views whose lighting is attacked.
+        kind: Kind of lighting, a key of KINDS.
+        additional: True always takes ADDITIONAL_STEPS steps. False takes at
+            most STEPS steps, and stops when the prediction is wrong even with
+            the noise of a camera.
 
     Returns:
         Result of the attack.
@@ -244,18 +249,19 @@ def adversaries(
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
     step_size = radius / STEPS_PER_RADIUS
-    # Arguments of `AttackSettings`. A field with the name of the kind has the ball.
-    limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
+    # `AttackSettings` has an attribute for each kind of lighting, with the norm-ball.
+    settings: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
     if additional:
-        limits |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
+        # No margin is as large as MAX_SCALE, so the attack never stops early.
+        settings |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
-        limits |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
+        settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     if not classifier.has_gradients:
-        limits |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
+        settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,
         views.scene(classifier.size, kind),
-        settings=AttackSettings(**limits, batch_size=BATCH),
+        settings=AttackSettings(**settings, batch_size=BATCH),
         seed=views.seed,
         force=True,
     )
@@ -267,47 +273,51 @@ def success_by_light(
     kind: str,
     out: Path,
 ) -> dict[str, Any]:
-    """Count the views that are misclassified after attacks within each radius.
+    """Attack one kind of lighting, and count the misclassified views for each radius.
 
-    The function writes the adversaries of the largest radius to out/KIND.npz,
-    which `transfers` reads. If there are any, it also writes a picture of the
-    first one, before and after the attack, to out/KIND.png.
+    The attacked lighting of the largest radius is written to out/KIND.npz, which
+    `transfer_success` reads. If an attack succeeds, a picture of the first
+    success, before and after the attack, is written to out/KIND.png.
 
     Args:
-        classifier: Attacked classifier.
-        views: Views to attack.
-        kind: Key of KINDS.
-        out: Existing folder.
+        classifier: Classifier to attack.
+        views: Views whose lighting is attacked.
+        kind: Kind of lighting, a key of KINDS.
+        out: Existing folder for the files.
 
     Returns:
-        Dictionary with the keys
+        Dictionary with these keys. The last three are missing if no attack
+        succeeds.
 
-        - n: number of views,
-        - correct: number of views that are classified correctly before,
-        - adversarial: for each radius, how many of the correct views an attack
-          or random draws make misclassified, also with noise of a sensor,
-        - random: for each radius, the same of the random draws alone,
-        - adversarial_without_noise and random_without_noise: the same two
-          counts for images without noise,
-        - predicted, confidence: classes of the picture before and after, with
-          their probabilities, if there is a picture,
-        - slider: lights between both, as `frames_of` returns them, if there is
-          a picture.
+        - n: number of views;
+        - correct: number of views that are classified correctly before the
+          attack;
+        - adversarial: for each radius, the number of correct views that an
+          attack or random draws make misclassified, even with the noise of a
+          camera;
+        - random: for each radius, the same number for random draws alone;
+        - adversarial_without_noise, random_without_noise: the same two numbers
+          for images without noise;
+        - predicted: class that is predicted for the picture before the attack,
+          and class after it;
+        - confidence: probabilities of these two classes;
+        - slider: renders of the picture in light between natural and attacked,
+          as `frames_of` returns them.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
     clean = result.clean_correct
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
-    # The counts are made twice: with noise of a sensor, and without.
-    for end, success in (
+    for suffix, success in (
         ("", result.success),
         ("_without_noise", result.success_without_noise),
     ):
-        adversarial = f"adversarial{end}"
-        random = f"random{end}"
-        # Within the largest radius, `result` is an attack from the start. The
-        # attack of `by_radius` continues from the end of the smaller radii.
+        adversarial = f"adversarial{suffix}"
+        random = f"random{suffix}"
+        # For the largest radius there are two attacks: the one in `by_radius`, which
+        # starts where the attack within the next smaller radius ended, and `result`,
+        # which starts at the natural light. Either may succeed.
         by_radius[-1][adversarial] |= success[clean].cpu()
         counts[adversarial] = [int((row[adversarial] | row[random]).sum()) for row in by_radius]
         counts[random] = [int(row[random].sum()) for row in by_radius]
@@ -325,15 +335,16 @@ def success_by_light(
 
 
 def _draw_pair(result: AttackResult, example: int) -> Image.Image:
-    """Draw the first view of an example before and after the attack, side by side.
+    """Draw the image of an example before and after the attack, side by side.
 
     Args:
-        result: Result of the attack.
+        result: Result of an attack with one view per example.
         example: Index of the example.
 
     Returns:
-        Image of 2 · SIDE by SIDE pixels. Renders that are smaller are enlarged
-        without smoothing, so that single pixels are visible.
+        Picture with a width of 2 · SIDE pixels and a height of SIDE pixels.
+        Smaller renders are enlarged without smoothing, so that their pixels are
+        visible.
     """
     before = result.images_before[example]
     after = result.images[example]
@@ -349,45 +360,47 @@ def transfer_success(
     views: Views,
     out: Path,
 ) -> dict[str, dict[str, list[int]]]:
-    """Test whether the adversaries of one classifier also fool another classifier.
+    """Test whether lighting that fools one classifier also fools another classifier.
 
-    "first" are the adversaries that `success_by_light` wrote. "further" are
-    adversaries of attacks that continue after their success. All are rendered
-    at the size of the other classifier.
+    There are two sets of attacked lighting. "first" is the lighting that
+    `success_by_light` wrote, whose attack ended at its first success. "further"
+    comes from attacks that continue after their success. The views are rendered
+    again at the image size of the other classifier.
 
     Args:
         attacked: Classifier that was attacked.
         other: Classifier to test.
-        views: Attacked views.
-        out: Folder that `success_by_light` wrote for the attacked classifier.
+        views: Views whose lighting was attacked.
+        out: Folder in which `success_by_light` wrote files for the attacked
+            classifier.
 
     Returns:
-        For each kind of lighting and for "further" and "first", three counts:
-        of adversaries that also fool the other classifier, of adversaries
-        whose view it classifies correctly before, and of adversaries that fool
-        it in images without noise of a sensor.
+        For each kind of lighting, the keys "further" and "first", each with
+        three numbers that `_TransferTest.count` describes.
     """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
-        is_wrong = result.clean_correct & result.success
-        found = {"further": (is_wrong, result.descent.values)}
-        with np.load(out / f"{kind}.npz") as saved:
-            found["first"] = (torch.from_numpy(saved["wrong"]), torch.from_numpy(saved["values"]))
         problem = build_problem(result.settings, views.scene(other.size, kind))
         test = _TransferTest(result, other, problem)
-        counts[kind] = {name: test.count(*found_here) for name, found_here in found.items()}
+        is_wrong = result.clean_correct & result.success
+        further = test.count(is_wrong, result.descent.values)
+        with np.load(out / f"{kind}.npz") as saved:
+            is_wrong = torch.from_numpy(saved["wrong"])
+            values = torch.from_numpy(saved["values"])
+        first = test.count(is_wrong, values)
+        counts[kind] = {"further": further, "first": first}
     return counts
 
 
 class _TransferTest:
-    """Test whether the adversaries of one attack fool another classifier.
+    """Test whether attacked lighting of one classifier fools another classifier.
 
     Args:
-        result: Result of the attack on the first classifier.
-        other: Classifier to test.
-        problem: The attacked parameters, with a scene at the size of the other
-            classifier.
+        result: Result of an attack on the first classifier.
+        other: Second classifier, which is tested.
+        problem: Scene with images of the size of the second classifier, and the
+            attacked parameters.
     """
 
     def __init__(self, result: AttackResult, other: Classifier, problem: AttackProblem):
@@ -399,19 +412,20 @@ class _TransferTest:
         self.model = preprocessed_model(result.settings, other)
 
     def count(self, is_wrong: Tensor, values: Tensor) -> list[int]:
-        """Count the adversaries that fool the other classifier, too.
+        """Count the views whose attacked lighting also fools the second classifier.
 
-        Only adversaries count whose view the other classifier recognizes before
-        the attack.
+        A view is tested if its attacked lighting fools the first classifier, and
+        if the second classifier recognizes it before the attack.
 
         Args:
-            is_wrong: Whether each example fools the attacked classifier, shape (E,).
-            values: Attacked values of all examples, shape (E, D).
+            is_wrong: Whether the lighting of each example fools the first
+                classifier, shape (E,).
+            values: Attacked lighting of each example, shape (E, D).
 
         Returns:
-            Three counts: adversaries that fool the other classifier also with
-            noise of a sensor, all counted adversaries, and adversaries that
-            fool it in images without noise.
+            Three numbers: tested views that the second classifier misclassifies
+            even with the noise of a camera; tested views; and tested views that
+            it misclassifies without noise.
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))
@@ -426,5 +440,5 @@ class _TransferTest:
             self.result.seed,
         ).all(1)
         is_fooled_without_noise = self.criterion.reached(predicted)
-        parts = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
-        return [int(part.sum()) for part in parts]
+        masks = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
+        return [int(mask.sum()) for mask in masks]

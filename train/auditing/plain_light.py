@@ -1,4 +1,8 @@
-"""Find views that a classifier recognizes in plain light, from which an audit attacks."""
+"""Find ordinary lighting in which a classifier recognizes objects before an attack.
+
+Plain light is ordinary light. An attack says nothing about views that the
+classifier does not even recognize in plain light.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,26 +16,26 @@ from augment.scene.conditions import Conditions
 from renderer.light.presets import UNIFORM, load_light
 from train.auditing.lights import LIGHT, Views, is_correct
 
-# Lights that have nothing unusual: that of the scene, and even light.
+# Names of the plain lights that are tried: an environment map, and uniform light.
 PLAIN_LIGHTS = (LIGHT, UNIFORM)
-# Factors of the size of the objects that are tried.
+# The objects are scaled by each of these factors.
 SIZES = (1.0, 0.75, 1.2)
-# Least fraction of recognized views at which the search ends.
+# The search ends as soon as this fraction of the views is recognized.
 ENOUGH = 0.75
 
 
 @dataclass(frozen=True)
 class PlainViews:
-    """How many views a classifier recognizes in plain light.
+    """Lighting and size at which a classifier recognizes most views in plain light.
 
     Attributes:
-        light: Name of the light.
-        exposure: Factor of the light.
-        size: Factor of the size of the objects.
+        light: Name of the environment lighting.
+        exposure: Factor by which this lighting is multiplied.
+        size: Factor by which the objects are scaled.
         recognized: Number of views that are classified correctly.
         n: Number of views.
-        recognized_as_given: The same number before the search, with exposure
-            and size as they are.
+        recognized_as_given: Number of views that are classified correctly with
+            the first candidate, whose exposure and size are 1.
     """
 
     light: str
@@ -42,22 +46,22 @@ class PlainViews:
     recognized_as_given: int
 
     def apply_to(self, views: Views) -> Views:
-        """Return views in this light, with this exposure and this size."""
+        """Return a copy of views with the light, the exposure and the size of this result."""
         return replace(views, light=self.light, exposure=self.exposure, size=self.size)
 
 
 def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
-    """Search light, exposure and size for the views that a classifier recognizes most often.
+    """Find the plain light, exposure and size at which a classifier recognizes most views.
 
-    The search ends at the first candidate with ENOUGH recognized views. The
-    views as they are come first.
+    All combinations are tried, until one is found at which the classifier
+    recognizes a fraction of ENOUGH.
 
     Args:
         classifier: Classifier to test.
         views: Views of objects of one class.
 
     Returns:
-        The best candidate. The views as they are, if none is recognized.
+        The best combination. The first one, if no view is ever recognized.
     """
     best: PlainViews | None = None
     candidates = list(_candidates(views))
@@ -79,7 +83,7 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
 
 
 def _candidates(views: Views) -> Iterator[Views]:
-    """Yield copies of views in each plain light, at each exposure and each size of objects."""
+    """Yield a copy of views for each combination of size, exposure and plain light."""
     for size in SIZES:
         for exposure in EXPOSURES:
             for light in PLAIN_LIGHTS:
@@ -87,7 +91,7 @@ def _candidates(views: Views) -> Iterator[Views]:
 
 
 def _count_recognized(classifier: Classifier, views: Views) -> int:
-    """Render views in their light, and count those that a classifier recognizes."""
+    """Render views in their own light, and count those that are classified correctly."""
     scene = views.scene(classifier.size)
     light = load_light(views.light).to(scene.lights) * views.exposure
     examples = torch.arange(views.count, device=views.device)

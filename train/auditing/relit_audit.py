@@ -1,7 +1,8 @@
-"""The part of an audit that needs neither meshes nor labels: photographs in a projector's light.
+"""Audit of networks on photographs in the light of a projector, without meshes or labels.
 
-`train.auditing.audit` measures this part for each network. If an audit has no
-meshes, it is the only part.
+The projector shows a slide, which is a random picture. A photograph keeps its class
+if no slide changes the predicted class. `train.auditing.audit` runs this test on
+each network. If an audit has no meshes, it is the only test.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,25 +29,25 @@ from train.report.report_page import write_page
 from train.runs.run_config import CONFIG, read_config
 from train.settings import published
 
-# Part of a network with the scores on relit photographs.
-RELIT_PART = "relit"
-# Number of photographs that an audit with a budget of 1 attacks.
-PHOTOGRAPHS = 100
-# Number of passes through the network in each search.
+# Name of the subfolder for these results in the folder of results of a network.
+RELIT_FOLDER = "relit"
+# Number of photographs that are attacked, if the setting `budget` is 1.
+PHOTOGRAPH_COUNT = 100
+# Number of passes through the network in each attack on a photograph.
 PASSES = 11
-# Width of a picture in pixels.
-WIDEST = 900
-# `_answer` says that predictions depend on the light if fewer photographs than this
-# fraction keep their class under random slides.
+# Largest width of a picture in the report, in pixels.
+MAX_PICTURE_WIDTH = 900
+# The report says that predictions depend on the light if less than this fraction of
+# the photographs keeps its class under random slides.
 PASS_THRESHOLD = 0.9
-# Titles of the numbers on the first screen.
-NUMBERS = {
+# For each kind of light, the title of its number at the top of the report.
+NUMBER_TITLES = {
     SLIDE: "Keep their class under a random slide",
     RANDOM: "… after random search",
     ADVERSARIAL: "… after as many passes along the gradient",
 }
 
-# Lights in sentences.
+# For each kind of light, its description in a sentence.
 IN_LIGHT = {
     SLIDE: "under a random slide",
     RANDOM: "after random search",
@@ -56,13 +57,14 @@ IN_LIGHT = {
 
 @dataclass(frozen=True)
 class RelitSection:
-    """Section of a page on the relit photographs of one network.
+    """Section of a report about one network and photographs in the light of a projector.
 
     Attributes:
         name: Name of the network.
-        tables: Tables by light and by class.
-        pictures: Photographs in all lights.
-        sentences: What was measured.
+        tables: Table with a row for each kind of light, and table with a row
+            for each class.
+        pictures: Pictures that show a photograph in each kind of light.
+        sentences: Sentences about the results and the test.
     """
 
     name: str
@@ -72,12 +74,12 @@ class RelitSection:
 
 
 def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
-    """Attack a network through the light on the photographs of an audit.
+    """Attack a network through the light of a projector on photographs.
 
     Args:
-        classifier: Network.
-        settings: Settings of the audit, with `photographs`.
-        out: Folder of the results.
+        classifier: Network to attack.
+        settings: Settings of the audit, with the folder `photographs`.
+        out: Folder for the results.
 
     Raises:
         InputError: If the folder holds no photograph that can be read.
@@ -88,59 +90,61 @@ def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Pa
         RelightingSettings(passes=PASSES),
         out,
         seed=settings.seed,
-        limit=settings.scale(PHOTOGRAPHS),
+        limit=settings.scale(PHOTOGRAPH_COUNT),
     )
 
 
-def relit_sections(paths: Mapping[str, Path]) -> list[RelitSection]:
-    """Make the section of each network that has scores on relit photographs.
+def relit_sections(results: Mapping[str, Path]) -> list[RelitSection]:
+    """Make a section about photographs in the light of a projector for each network.
 
     Args:
-        paths: Folder of the parts of each network by its name.
+        results: Folder of results of each network, by the name of the network.
+            A network without such results has no section.
 
     Returns:
-        The sections.
+        Sections of the report.
     """
     sections = []
-    for name, path in paths.items():
-        folder = path / RELIT_PART
+    for name, path in results.items():
+        folder = path / RELIT_FOLDER
         if folder.exists():
             sections.append(_section(name, folder))
     return sections
 
 
-def photographs_screen(paths: Mapping[str, Path]) -> FirstScreen:
-    """Make the first screen of an audit without meshes, of one network or of two.
+def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
+    """Make the top of the report of an audit without meshes.
 
     Args:
-        paths: Folder of the parts of each network by its name.
+        results: Folder of results of each network, by the name of the network.
+            There are one or two networks. The second is compared with the
+            first.
 
     Returns:
-        The first screen.
+        Headline, main numbers and sentences.
     """
-    scores = [read_relit(path / RELIT_PART) for path in paths.values()]
+    scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
     first = scores[0]
     last = scores[-1]
     numbers = []
     for light in first.lights:
         if light in last.lights:
+            title = NUMBER_TITLES[light]
             before = first.kept(light) if len(scores) > 1 else None
-            numbers.append(
-                ShownMetric(NUMBERS[light], "higher is better", before, last.kept(light))
-            )
-    sentences = [_sentence(name, item) for name, item in zip(paths, scores, strict=True)]
-    counted = f"{len(first.photographs)} photographs of {first.folder}"
-    return FirstScreen(_answer(last), [*sentences, MODELED], numbers, {}, [*paths], counted)
+            numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
+    sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
+    place = f"{len(first.photographs)} photographs of {first.folder}"
+    return FirstScreen(_answer(last), [*sentences, MODELED], numbers, {}, [*results], place)
 
 
 def write_photographs_page(
-    screen: FirstScreen, paths: Mapping[str, Path], out: Path, caveats: Sequence[str]
+    screen: FirstScreen, results: Mapping[str, Path], out: Path, caveats: Sequence[str]
 ) -> Path:
-    """Write the page of an audit without meshes.
+    """Write the report of an audit without meshes.
 
     Args:
-        screen: First screen of the page.
-        paths: Folder of the parts of each network by its name.
+        screen: Top of the report: headline, main numbers and sentences.
+        results: Folder of results of each network, by the name of the network.
         out: Folder of the audit.
         caveats: Sentences at the beginning of the report.
 
@@ -151,19 +155,19 @@ def write_photographs_page(
         out,
         "relit.html.jinja",
         title="Audit: photographs in the light of a projector",
-        about=" and ".join(paths),
+        about=" and ".join(results),
         screen=screen,
-        relit=relit_sections(paths),
+        relit=relit_sections(results),
         caveats=caveats,
         config=read_config(out / CONFIG),
     )
 
 
 def _answer(scores: RelitScores) -> str:
-    """Say whether the predictions of a network depend on the light of a projector.
+    """Write whether the predictions of a network depend on the light of a projector.
 
-    The fraction of photographs that keep their class under random slides
-    decides.
+    They do if less than a fraction of PASS_THRESHOLD of the photographs keeps
+    its class under random slides.
     """
     kept = scores.kept(SLIDE)
     if kept.value is not None and kept.value < PASS_THRESHOLD:
@@ -172,7 +176,7 @@ def _answer(scores: RelitScores) -> str:
 
 
 def _sentence(name: str, scores: RelitScores) -> str:
-    """Say how many photographs keep their class in each light.
+    """Write how many photographs keep their class in each kind of light.
 
     Args:
         name: Name of the network.
@@ -184,11 +188,11 @@ def _sentence(name: str, scores: RelitScores) -> str:
 
 
 def _section(name: str, folder: Path) -> RelitSection:
-    """Read the tables, the pictures and the sentences of a network.
+    """Make the section of a report about one network.
 
     Args:
         name: Name of the network.
-        folder: Folder that `attack_folder` wrote.
+        folder: Folder to which `attack_folder` wrote the results.
     """
     scores = read_relit(folder)
     sentences = [
@@ -197,22 +201,23 @@ def _section(name: str, folder: Path) -> RelitSection:
         f"1/{scores.gain:g} and {scores.gain:g}, in {scores.passes} passes through the network. "
         "A change counts only if it remains in three draws of the noise of a sensor.",
     ]
-    attacked = len(scores.photographs)
-    if attacked + len(scores.unreadable) < scores.found:
+    attacked_count = len(scores.photographs)
+    unreadable_count = len(scores.unreadable)
+    if attacked_count + unreadable_count < scores.found:
         sentences.append(f"The folder holds {scores.found} photographs, of which these are some.")
     if scores.unreadable:
-        sentences.append(f"{len(scores.unreadable)} photographs cannot be read.")
+        sentences.append(f"{unreadable_count} photographs cannot be read.")
     pictures: list[Picture] = []
     for index, file in scores.pictures.items():
         caption = _caption(scores.photographs[index])
-        pictures += plots.from_file(folder / file, caption, WIDEST, caption)
+        pictures += plots.from_file(folder / file, caption, MAX_PICTURE_WIDTH, caption)
     tables = [scores.summary_table(), scores.class_table()]
     return RelitSection(name, tables, pictures, sentences)
 
 
 def _caption(photograph: RelitPhotograph) -> str:
-    """Name the predictions for a photograph, from left to right in its picture."""
-    shown = [f"unchanged: {photograph.predicted}"]
+    """Write the caption of a picture: the predicted class in each light, from left to right."""
+    predictions = [f"unchanged: {photograph.predicted}"]
     for light, predicted in photograph.becomes.items():
-        shown.append(f"{TITLES[light]}: {predicted[0]}")
-    return f"{photograph.path}. {'; '.join(shown)}"
+        predictions.append(f"{TITLES[light]}: {predicted[0]}")
+    return f"{photograph.path}. {'; '.join(predictions)}"

@@ -1,6 +1,7 @@
 """Compare the remedies for unusual lighting: normalized light, hardening, or both.
 
-Normalized light is in front of the network at test time, and needs no training.
+Normalized light changes the colors of an image before the network classifies it. It
+needs no training. Hardening trains the network on renders in unusual lighting.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,29 +13,31 @@ from train.evaluation.tables import Table, format_interval
 from train.report.comparison import ALL, Evaluation, Evaluations, difference, mean_metric
 from train.report.first_screen import EQUAL_RATE, gain_sentence
 
-# Keys of the networks of an audit, and names of the folders of their parts.
+# Keys of the two networks of an audit. They are also the names of the subfolders for
+# their results.
 CLASSIFIER = "classifier"
 HARDENED = "hardened"
-# End of the key of a network with normalized light in front.
+# This is added to the key of a network for the same network behind normalized light.
 NORMALIZED = "_normalized_light"
-# Name of the audited network among the remedies.
+# Name of the audited network in the comparison with the remedies.
 ORIGINAL = "the original network"
-# Remedies, from the cheapest to the most expensive.
+# Names of the remedies, from the cheapest to the most expensive.
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
-# Metric for several classes under study. For one class, it is EQUAL_RATE.
+# With several positive classes, remedies are compared by top-1 accuracy.
 TOP1 = "class_top1"
 
 
 @dataclass(frozen=True)
 class Recommendation:
-    """Which remedy an audit recommends.
+    """Remedy for unusual lighting that an audit recommends.
 
     Attributes:
-        remedy: Name of the remedy. None for none.
-        sentence: The recommendation in words.
-        table: The metric with each remedy, and its gain over the original network.
+        remedy: Name of the recommended remedy. None if none is recommended.
+        sentence: Recommendation in words.
+        table: Metric of the network with each remedy, and its gain over the
+            original network.
     """
 
     remedy: str | None
@@ -46,11 +49,12 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
     """Put normalized light in front of the networks of an audit.
 
     Args:
-        networks: Networks by `CLASSIFIER` and `HARDENED`.
+        networks: Networks under the keys CLASSIFIER and HARDENED.
 
     Returns:
-        Networks by the name of the folder of their parts. Those that normalize
-        the light already are left out.
+        Networks behind normalized light, under keys such as
+        "hardened_normalized_light". Networks that normalize the light already
+        are left out.
     """
     return {
         key + NORMALIZED: network.normalizing_light()
@@ -60,40 +64,40 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
 
 
 def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Name the networks that are compared.
+    """Name the remedies that an audit compares, and find their results.
 
     Args:
-        networks: Networks by `CLASSIFIER` and `HARDENED`.
+        networks: Networks under the keys CLASSIFIER and HARDENED.
 
     Returns:
-        Folder of the parts of each network by name: `ORIGINAL`, and then the
-        remedies, from the cheapest to the most expensive.
+        For the name of the original network, and then of each remedy from the
+        cheapest to the most expensive, the name of the subfolder with the
+        results.
     """
-    folders = {ORIGINAL: CLASSIFIER}
+    subfolders = {ORIGINAL: CLASSIFIER}
     for key, network in {**normalizing(networks), **networks}.items():
         if key == CLASSIFIER:
             continue
         is_normalized = network.normalized_light is not None
         if not key.startswith(HARDENED):
-            folders[LIGHT_ALONE] = key
+            subfolders[LIGHT_ALONE] = key
         else:
-            folders[BOTH if is_normalized else HARDENING] = key
+            subfolders[BOTH if is_normalized else HARDENING] = key
     order = (ORIGINAL, LIGHT_ALONE, HARDENING, BOTH)
-    return {name: folders[name] for name in order if name in folders}
+    return {name: subfolders[name] for name in order if name in subfolders}
 
 
 def recommend(evaluations: Evaluations) -> Recommendation | None:
-    """Recommend the cheapest remedy that no more expensive one improves on.
+    """Recommend the cheapest remedy that is better than no remedy, unless a dearer one is better.
 
-    A remedy counts only if the 95% interval of its gain over the original
-    network is above 0. A more expensive remedy replaces a cheaper one only if
-    the interval of its gain over the cheaper one is above 0, too. The metric is
-    the recall at 10% false positives for one class under study, and top-1 for
-    several.
+    One network is better than another if the 95% interval of its gain is above
+    0. The metric is the recall at 10% false positives. With several positive
+    classes, it is top-1 accuracy.
 
     Args:
-        evaluations: Evaluations of the original network, and then of each
-            remedy, from the cheapest to the most expensive, by name.
+        evaluations: Evaluation of the original network, and then of each
+            remedy, from the cheapest to the most expensive. The keys are their
+            names.
 
     Returns:
         The recommendation. None if the metric of a network is unknown.
@@ -105,52 +109,48 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     }
     if any(gain is None for gain in gains.values()):
         return None
-    # A remedy must gain over the original network and over the cheaper remedy that
-    # was chosen so far.
     chosen = original
     for name in remedies:
-        if _is_gain(evaluations, name, original, metric) and _is_gain(
-            evaluations, name, chosen, metric
-        ):
+        is_better_than_original = _is_gain(evaluations, name, original, metric)
+        if is_better_than_original and _is_gain(evaluations, name, chosen, metric):
             chosen = name
-    subject = metric_title(metric)
+    title = metric_title(metric)
     gain = gains.get(chosen)
     if gain is None:
         listed = ", ".join(remedies)
-        sentence = f"Recommended: nothing. No gain in {subject} is proven for: {listed}."
+        sentence = f"Recommended: nothing. No gain in {title} is proven for: {listed}."
     else:
-        sentence = f"Recommended: {chosen}. " + gain_sentence(f"With it, {subject}", gain)
+        sentence = f"Recommended: {chosen}. " + gain_sentence(f"With it, {title}", gain)
     rows = []
-    for name, group in evaluations.items():
-        change = format_interval(gains.get(name), "+")
-        rows.append([name, format_interval(mean_metric(group, ALL, metric)), change])
-    table = Table("", ["network", subject, "gain over the original network"], rows)
+    for name, evaluations_of_network in evaluations.items():
+        value = format_interval(mean_metric(evaluations_of_network, ALL, metric))
+        rows.append([name, value, format_interval(gains.get(name), "+")])
+    table = Table("", ["network", title, "gain over the original network"], rows)
     return Recommendation(None if gain is None else chosen, sentence, table)
 
 
-def _metric_for(group: Sequence[Evaluation]) -> str:
-    """Return the metric by which remedies are compared.
+def _metric_for(evaluations: Sequence[Evaluation]) -> str:
+    """Choose the metric by which remedies are compared.
 
     Args:
-        group: Evaluations of the original network.
+        evaluations: Evaluations of the original network.
 
     Returns:
-        TOP1 with several classes under study. Otherwise EQUAL_RATE.
+        Top-1 accuracy if there are several positive classes. Otherwise the
+        recall at 10% false positives.
     """
-    labels = {prediction.label for prediction in group[0].pools[ALL].positives}
+    labels = {prediction.label for prediction in evaluations[0].pools[ALL].positives}
     return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 
 def _is_gain(evaluations: Evaluations, name: str, reference: str, metric: str) -> bool:
-    """Return whether a remedy is proven to be better than another network.
-
-    It is proven if the 95% interval of its gain is above 0.
+    """Return whether the 95% interval of the gain of one network over another is above 0.
 
     Args:
         evaluations: Evaluations by the name of the network.
-        name: Name of the remedy.
+        name: Name of the network that may be better.
         reference: Name of the other network.
-        metric: Name of the metric.
+        metric: Name of the metric in which the gain is measured.
     """
     gain = difference(evaluations[name], evaluations[reference], ALL, metric)
     return gain is not None and gain.low is not None and gain.low > 0

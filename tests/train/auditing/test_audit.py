@@ -186,10 +186,10 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
         monkeypatch.delitem(KINDS, kind)
     monkeypatch.setattr(audit, "PATTERNS", ("solid", "rings"))
     monkeypatch.setattr(audit, "SPP", 1)
-    monkeypatch.setattr(audit, "VIEWS", 2)
-    monkeypatch.setattr(audit, "ATTACKED", 2)
+    monkeypatch.setattr(audit, "VIEW_COUNT", 2)
+    monkeypatch.setattr(audit, "ATTACKED_COUNT", 2)
     monkeypatch.setattr(audit, "SETUPS", 1)
-    monkeypatch.setattr(audit, "LIGHTS", 1)
+    monkeypatch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
     monkeypatch.setattr(audit, "load_network", CLASSIFIERS.__getitem__)
     monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.classifier])
@@ -282,7 +282,7 @@ class TestAnAuditWithoutMitsuba:
         recognized = {"uniform": [True], "random 1": [True]}
         transferred = {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}
         monkeypatch.setattr(audit, "mitsuba", missing)
-        monkeypatch.setattr(audit, "recognized", lambda *arguments: recognized)
+        monkeypatch.setattr(audit, "recognize_in_environments", lambda *arguments: recognized)
         monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
         monkeypatch.setattr(audit, "transfer_success", lambda *arguments: transferred)
 

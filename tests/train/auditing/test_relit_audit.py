@@ -11,7 +11,7 @@ import augment
 from renderer.errors import InputError
 from tests.helpers import bright_or_dark
 from train.auditing.audit import run_audit
-from train.auditing.relit_audit import RELIT_PART
+from train.auditing.relit_audit import RELIT_FOLDER
 from train.command_settings import AuditSettings
 from train.evaluation.relit import RELIT, read_relit
 
@@ -47,8 +47,8 @@ def page(settings) -> str:
 
 
 def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
-    first = read_relit(Path(settings.out) / "classifier" / RELIT_PART)
-    second = read_relit(Path(settings.out) / "hardened" / RELIT_PART)
+    first = read_relit(Path(settings.out) / "classifier" / RELIT_FOLDER)
+    second = read_relit(Path(settings.out) / "hardened" / RELIT_FOLDER)
     # The second network answers all images alike.
     assert [second.kept(light).hits for light in second.lights] == [10, 10, 10]
     for light in first.lights:
@@ -58,7 +58,7 @@ def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
 
 
 def test_the_page_names_every_class_and_shows_pictures(page, settings):
-    scores = read_relit(Path(settings.out) / "classifier" / RELIT_PART)
+    scores = read_relit(Path(settings.out) / "classifier" / RELIT_FOLDER)
     for row in scores.class_table().rows:
         assert f"<td>{row[0]}</td><td>{row[1]}</td>" in page
     for index in scores.pictures:
@@ -70,7 +70,7 @@ def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_pat
     name = "python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
     named = replace(settings, classifier=name, out=str(tmp_path / "out"), budget=0.02)
     run_audit(named)
-    path = tmp_path / "out" / "classifier" / RELIT_PART / RELIT
+    path = tmp_path / "out" / "classifier" / RELIT_FOLDER / RELIT
     marked = path.read_text().replace('"predicted": "', '"predicted": "marked ')
     path.write_text(marked)
     assert "marked" in run_audit(named).path.read_text()
@@ -82,7 +82,7 @@ def test_the_budget_limits_the_photographs(photographs, tmp_path):
     out = tmp_path / "out"
     few = AuditSettings(classifier="first", photographs=str(photographs), out=str(out), budget=0.03)
     text = run_audit(few, {"classifier": NETWORKS["classifier"]}).path.read_text()
-    scores = read_relit(out / "classifier" / RELIT_PART)
+    scores = read_relit(out / "classifier" / RELIT_FOLDER)
     assert [item.path for item in scores.photographs] == ["0.png", "4.png", "9.png"]
     assert "holds 10 photographs" in text
 

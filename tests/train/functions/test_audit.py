@@ -44,7 +44,7 @@ def options(monkeypatch, laboratory) -> dict:
     monkeypatch.setattr(lights, "STEPS", 2)
     for kind in ("skylight", "projector", "lamps"):
         monkeypatch.delitem(lights.KINDS, kind)
-    for name, count in {"VIEWS": 2, "ATTACKED": 2, "LIGHTS": 1}.items():
+    for name, count in {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}.items():
         monkeypatch.setattr(engine, name, count)
     return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
 

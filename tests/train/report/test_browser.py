@@ -88,7 +88,7 @@ def page(tmp_path_factory) -> Path:
         for name in ("skylight", "projector", "lamps"):
             patch.delitem(lights.KINDS, name)
         patch.setitem(lights.KINDS, "lighting", kind)
-        patch.setattr(audit, "LIGHTS", 1)
+        patch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
         return run_audit(settings, networks).path
 
 
