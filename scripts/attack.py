@@ -8,25 +8,25 @@ from train.help import HelpText
 def list_parameters(words: list[str]) -> list[str]:
     """Replace attack=lighting+geometry by the list attack=[lighting,geometry].
 
-    With reload=FOLDER, the command shows a saved adversary. The default attack is
-    then replaced by an empty list, unless the words contain attack=.
+    With reload=FOLDER and without attack=, the command only shows a saved
+    adversary. attack=[] is then added, which means no attack.
 
     Args:
         words: Words of the command line.
 
     Returns:
-        Words in which the attack is a list.
+        Words of the command line in which the attack is a list.
     """
     keys = {word.partition("=")[0] for word in words}
-    listed = []
+    rewritten = []
     for word in words:
         key, _, value = word.partition("=")
         if key == "attack" and not value.startswith("["):
             word = f"attack=[{value.replace('+', ',')}]"
-        listed.append(word)
+        rewritten.append(word)
     if "reload" in keys and "attack" not in keys:
-        listed.append("attack=[]")
-    return listed
+        rewritten.append("attack=[]")
+    return rewritten
 
 
 main = Command(

@@ -8,27 +8,29 @@ from train.help import HelpText
 
 
 def name_folders(words: list[str]) -> list[str]:
-    """Write folders that are given without a key as runs=[...].
+    """Replace the paths of folders on a command line by one setting, runs=[...].
+
+    For example, "runs/a runs/b out=page" becomes "out=page runs=[runs/a,runs/b]".
 
     Args:
         words: Words of the command line.
 
     Returns:
-        Settings and options, and then runs=[...] if there are folders.
+        Words of the command line, with runs=[...] at the end.
     """
     folders = [word for word in words if names_folder(word)]
-    others = [word for word in words if not names_folder(word)]
+    other_words = [word for word in words if not names_folder(word)]
     if not folders:
-        return others
+        return other_words
     quoted_folders = ",".join(quoted(folder) for folder in folders)
-    return [*others, f"runs=[{quoted_folders}]"]
+    return [*other_words, f"runs=[{quoted_folders}]"]
 
 
 def names_folder(word: str) -> bool:
     """Return whether a word of the command line is the path of a folder.
 
-    Words that begin with "-" are options. Words that contain "=" are settings,
-    such as out=page, except if a file or folder of this name exists.
+    A word that begins with "-" is an option. A word with "=" is a setting, such
+    as out=page, unless a file or folder of this name exists.
     """
     if not word or word.startswith("-"):
         return False

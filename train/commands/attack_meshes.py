@@ -1,4 +1,8 @@
-"""The attack command: attack each mesh of a scene, or a saved adversary."""
+"""pnb-attack: attack each mesh of a scene, or continue from a saved adversary.
+
+An adversary is an attacked scene that the classifier misclassifies. Its files can
+be loaded again with reload=FOLDER.
+"""
 
 import shlex
 import shutil
@@ -58,17 +62,17 @@ from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, keys_of, writable_folder
 from train.system.verbosity import is_verbose, shortened
 
-# Settings that `find_scene` may change, in the order in which they are printed.
+# The search for a scene in which a mesh is recognized may change these settings.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
 
 
 class MeshAttack(NamedTuple):
-    """The attack on one mesh.
+    """Attack on one mesh.
 
     Attributes:
-        name: Name of the mesh: its file or its solid.
+        name: File of the mesh, or name of the generated solid.
         scene: Settings of the attacked scene.
-        result: Result of `nb.attack`.
+        result: Result of the attack.
     """
 
     name: str
@@ -78,15 +82,16 @@ class MeshAttack(NamedTuple):
 
 @dataclass
 class Outcome:
-    """Lines and numbers that are printed about the attack on one mesh.
+    """Text and numbers that pnb-attack prints about the attack on one mesh.
 
     Attributes:
         name: Name of the mesh.
-        heading: Sentence with the success.
-        details: Lines of further results.
-        success_count: Number of examples with a success, of those that were
-            correct before.
-        correct_count: Number of examples that were correct before.
+        heading: Sentence that says whether the attack succeeded.
+        details: Lines about other results.
+        success_count: Number of examples that were classified correctly before
+            the attack, and for which the attack succeeded.
+        correct_count: Number of examples that were classified correctly before
+            the attack.
         example_count: Number of all examples.
     """
 
@@ -100,13 +105,15 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TransferTargets:
-    """Other classifiers, views and objects to which successful adversaries are shown.
+    """Classifiers, views and objects other than the attacked ones.
+
+    pnb-attack tests whether successful attacks also succeed with each of them.
 
     Attributes:
         classifiers: Other classifiers.
-        azimuths: Angles in degrees by which the cameras are turned about the
-            vertical.
-        objects: Objects that replace the attacked one.
+        azimuths: Angles in degrees. The cameras are rotated about the vertical
+            axis by each of them.
+        objects: Objects that replace the attacked object.
     """
 
     classifiers: Sequence[Classifier] = ()
@@ -114,11 +121,18 @@ class TransferTargets:
     objects: Sequence[SceneObject] = ()
 
     def __bool__(self) -> bool:
-        """Return whether there is anything to transfer to."""
+        """Return whether there is any classifier, azimuth or object."""
         return bool(self.classifiers or self.azimuths or self.objects)
 
     def transfer(self, result: AttackResult) -> list[dict[str, Any]]:
-        """Show the adversaries of a result to all targets, see `nb.transfer`."""
+        """Test whether the successful attacks of a result also succeed with each target.
+
+        Args:
+            result: Result of an attack.
+
+        Returns:
+            A dictionary for each target, as `nb.transfer` returns them.
+        """
         return transfer(
             result,
             classifiers=self.classifiers,
@@ -128,15 +142,17 @@ class TransferTargets:
 
 
 def run(settings: AttackExperimentSettings) -> None:
-    """Attack each mesh or the reloaded adversary, write the results, and print a summary.
+    """Run pnb-attack: attack meshes, write the results, and print a summary.
 
-    Without an attack, print how the reloaded adversary is classified.
+    If the settings name photographs, their lighting is attacked instead. With
+    `settings.reload`, the predictions for a saved adversary are printed, and
+    the attack, if there is one, starts at this adversary.
 
     Args:
         settings: Settings of pnb-attack.
 
     Raises:
-        InputError: If a setting or an input file is wrong, or if a classifier
+        InputError: If a setting or an input file is wrong, or if the classifier
             misclassifies a mesh before the attack.
     """
     if settings.attack.relighting is not None:
@@ -175,13 +191,23 @@ def run(settings: AttackExperimentSettings) -> None:
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
-    """Start the rasterizer that the settings name."""
+    """Create the rasterizer that the settings of the renderer choose.
+
+    Raises:
+        InputError: If the rasterizer is not available. The message names the
+            setting.
+    """
     with keyed(**keys_of("renderer", settings.renderer)):
         return choose_rasterizer(settings.renderer)
 
 
 def _require_attack_settings(settings: AttackExperimentSettings) -> None:
-    """Check the settings that can be checked before any file or classifier is read."""
+    """Check the settings of the transfer and of the renderers before any file is read.
+
+    Raises:
+        InputError: If the attack cannot be transferred as the settings ask, or
+            if a renderer is not installed.
+    """
     with keyed("transfer", **keys_of("transfer", settings.transfer)):
         require_transferable(
             settings.attack.parameters,
@@ -198,22 +224,25 @@ def _write_attacks(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> tuple[list[Outcome], dict[str, Sweep]]:
-    """Attack each mesh, and write the result to a folder of its own.
+    """Run the attacks on several meshes, and write each result to its own folder.
 
     Args:
-        mesh_attacks: Attacks, each of which runs when it is asked for.
-        out: Folder that contains the folders of the meshes.
+        mesh_attacks: Iterator that runs the next attack when it is advanced.
+        out: Folder for the folders of the results.
         settings: Settings of pnb-attack.
-        targets: Other classifiers, views and meshes that see the adversaries.
+        targets: Other classifiers, views and objects with which successful
+            attacks are tested.
 
     Returns:
-        Outcome of each attack, and the success at each radius by the name of the
-        folder. The second is empty if `attack.radius_scales` is empty.
+        Two values:
+        - what is printed about each attack;
+        - the success at each radius of `attack.radius_scales`, by the name of
+          the folder of the result. Empty if no radii are set.
     """
     sweeps: dict[str, Sweep] = {}
     outcomes = []
     for index, mesh_attack in enumerate(mesh_attacks):
-        # Windows allows no colon in the name of a folder.
+        # The name of a solid has colons, which Windows does not allow in file names.
         stem = Path(mesh_attack.name.replace(":", "_")).stem
         folder = out / f"{index}_{stem}"
         outcome = _write_attack(mesh_attack, folder, settings, targets)
@@ -233,22 +262,22 @@ def _write_attack(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> Outcome:
-    """Check the attack on one mesh, and write its files into a folder.
+    """Check the result of the attack on one mesh, and write it to a folder.
 
     Args:
-        mesh_attack: The attack.
-        folder: Folder of the files.
+        mesh_attack: Attack on the mesh.
+        folder: Folder for the files of the result.
         settings: Settings of pnb-attack.
-        targets: Classifiers, views and objects to which the adversaries are
-            transferred.
+        targets: Other classifiers, views and objects with which successful
+            attacks are tested.
 
     Returns:
-        The lines to print and the numbers of successes. With --verbose, the
-        lines have the results of the checks, too.
+        Text and numbers to print. With --verbose, the text has the results of
+        the checks.
     """
     name = mesh_attack.name
     result = mesh_attack.result
-    clean = result.clean_correct
+    is_correct_before = result.clean_correct
     details = []
     if mesh_attack.scene != settings.scene:
         changes = overrides(mesh_attack.scene, settings.scene)
@@ -259,12 +288,12 @@ def _write_attack(
     checks = check(result) if has_checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
     if is_verbose():
-        heading, *found = format_attack(name, result, checks, lines)
-        details += [*found, f"images, adversaries and numbers: {folder}"]
+        heading, *more_lines = format_attack(name, result, checks, lines)
+        details += [*more_lines, f"images, adversaries and numbers: {folder}"]
     else:
         (heading,) = format_attack(name, result, None)
-        doubts = warnings(checks) if checks else []
-        details += [f"warning about {name}: {doubt}" for doubt in doubts]
+        texts = warnings(checks) if checks else []
+        details += [f"warning about {name}: {text}" for text in texts]
     if targets:
         table = write_transfers(targets.transfer(result), folder / TRANSFERS)
         details += table.splitlines()
@@ -272,29 +301,30 @@ def _write_attack(
         name,
         heading,
         details,
-        success_count=int(result.success[clean].sum()),
-        correct_count=int(clean.sum()),
-        example_count=len(clean),
+        success_count=int(result.success[is_correct_before].sum()),
+        correct_count=int(is_correct_before.sum()),
+        example_count=len(is_correct_before),
     )
 
 
 def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
-    """Write the outcomes of several meshes.
+    """Format the summary that pnb-attack prints about the attacks on all meshes.
 
     Args:
-        outcomes: Outcome for each mesh.
+        outcomes: Text and numbers about the attack on each mesh.
 
     Returns:
-        Lines. One mesh has its sentence. Several meshes have their number of
-        successes and a table with a row for each. The details follow.
+        Lines: for a single mesh, the sentence about its attack. For several
+        meshes, the number of successes and a table with a row for each mesh.
+        Then the details about all meshes.
     """
     (first, *others) = outcomes
     lines = [first.heading]
     if others:
-        successes = sum(outcome.success_count for outcome in outcomes)
-        correct = sum(outcome.correct_count for outcome in outcomes)
-        counted = f"{successes} of {correct} examples that were correct before"
-        lines = [f"{len(outcomes)} meshes: success on {counted}"]
+        success_count = sum(outcome.success_count for outcome in outcomes)
+        correct_count = sum(outcome.correct_count for outcome in outcomes)
+        counts = f"{success_count} of {correct_count} examples that were correct before"
+        lines = [f"{len(outcomes)} meshes: success on {counts}"]
         header = ["mesh", "examples", "correct before", "success"]
         rows = [
             [item.name, item.example_count, item.correct_count, item.success_count]
@@ -307,9 +337,12 @@ def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def _remove_adversaries(out: Path) -> None:
-    """Remove the files of an earlier attack from a folder.
+    """Remove the files of an earlier pnb-attack from a folder.
 
-    Otherwise a report would show its adversaries among the new ones.
+    Otherwise a report of this folder would show old and new adversaries.
+
+    Args:
+        out: Folder with a subfolder for the result of each mesh.
     """
     for lines in out.glob(f"*/{LINES}"):
         for example in lines.parent.glob("example_*"):
@@ -329,24 +362,25 @@ def attacks(
     device: torch.device,
     adversary: Adversary | None = None,
 ) -> Iterator[MeshAttack]:
-    """Attack a saved adversary or, without one, each mesh of the scene.
+    """Attack each mesh of the settings, or the scene of a saved adversary.
 
-    A mesh that is misclassified in the given scene is attacked in the scene
-    that `scene.search` finds.
+    If a mesh is misclassified in its scene, a search looks for another scene in
+    which it is recognized. This scene is then attacked.
 
     Args:
         settings: Settings of pnb-attack.
         classifier: Classifier to attack.
         device: Device of the light and the images.
-        adversary: Adversary at which the attack starts, and around which its
-            norm-balls lie.
+        adversary: Saved adversary, or None to attack the meshes. The attack
+            starts at the values of the adversary, which are also the centers of
+            the norm-balls.
 
     Yields:
-        Attack on each mesh.
+        Result of the attack on each mesh, or on the adversary.
 
     Raises:
         InputError: If a mesh is misclassified before the attack, or if the
-            adversary consists of changed pixels.
+            adversary has changed pixels instead of a changed scene.
     """
     if adversary is not None:
         yield _attack_adversary(settings, classifier, device, adversary)
@@ -367,17 +401,22 @@ def _attack_adversary(
     device: torch.device,
     adversary: Adversary,
 ) -> MeshAttack:
-    """Attack the scene of a saved adversary.
+    """Attack the scene of a saved adversary, starting at its attacked values.
+
+    Args:
+        settings: Settings of pnb-attack.
+        classifier: Classifier to attack.
+        device: Device of the light and the images.
+        adversary: Saved adversary.
 
     Raises:
-        InputError: If the adversary consists of changed pixels, which have no
+        InputError: If the adversary has changed pixels instead of a changed
             scene.
     """
     if adversary.pixels is not None:
         raise InputError(
-            f"reload={settings.reload}: "
-            "an attack cannot continue from changed pixels: "
-            "leave attack= out",
+            f"reload={settings.reload} is an adversary with changed pixels, from which an attack "
+            "cannot continue: remove attack=",
         )
     scene = adversary.scene(_start_rasterizer(settings), device)
     result = attack(
@@ -397,10 +436,17 @@ def _attack_mesh(
     device: torch.device,
     mesh: ObjectSettings,
 ) -> MeshAttack:
-    """Attack one mesh in the given scene, or in a scene that a search finds.
+    """Attack one mesh in the scene of the settings, or in a scene that a search finds.
 
-    The search looks for a scene in which the classifier recognizes the mesh. It
-    is left out if `attack.force` attacks a misclassified mesh, too.
+    The search looks for a scene in which the classifier recognizes the mesh.
+    There is no search if `scene.search` is 0, or if `attack.force` allows to
+    attack a misclassified mesh.
+
+    Args:
+        settings: Settings of pnb-attack.
+        classifier: Classifier to attack.
+        device: Device of the light and the images.
+        mesh: Settings of the mesh.
     """
     build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
     scene_settings = settings.scene
@@ -433,23 +479,25 @@ def build_attacked(
     size: int,
     device: torch.device,
 ) -> Scene:
-    """Build the scene of one mesh.
+    """Build the scene in which one mesh is attacked.
 
-    If the views are shared, the scene has an example per background. Otherwise
-    it has an example per view and background.
+    With `attack.shared`, one attack must succeed in all views, so the scene has
+    one example for each background. Otherwise it has one example for each pair
+    of a view and a background.
 
     Args:
-        settings: All settings of the attack.
-        item: The mesh.
-        scene: The settings of the scene, which replace those in `settings`.
+        settings: Settings of pnb-attack.
+        item: Settings of the mesh.
+        scene: Settings of the scene, which replace `settings.scene`.
         size: Pixels per side of the images.
-        device: The device of the light and the images.
+        device: Device of the light and the images.
 
     Returns:
-        The scene that is attacked.
+        Scene to attack.
 
     Raises:
-        InputError: If a setting of the scene does not fit, which the message names.
+        InputError: If a setting of the scene is wrong. The message names the
+            setting.
     """
     rasterizer = _start_rasterizer(settings)
     with keyed("scene", **keys_of("scene", scene)):
@@ -471,23 +519,25 @@ def load_targets(
     attacked: Classifier,
     device: torch.device,
 ) -> TransferTargets:
-    """Load the classifiers and the meshes to which adversaries are transferred.
+    """Load the other classifiers and meshes with which successful attacks are tested.
 
     Args:
-        settings: Settings of pnb-attack.
-        attacked: Classifier that is attacked. It classifies the other meshes.
+        settings: Settings of pnb-attack. `settings.transfer` names the
+            classifiers, azimuths and meshes.
+        attacked: Classifier that is attacked. It also classifies the other
+            meshes.
         device: Device of the other classifiers.
 
     Returns:
-        Targets of the transfer, which may be none.
+        Loaded classifiers and meshes. May be empty.
 
     Raises:
         InputError: If a classifier or a mesh cannot be loaded, or if a
-            classifier lacks a class that it is asked for.
+            classifier lacks the class of a mesh.
     """
     label = ""
     if settings.transfer.classifiers or settings.transfer.meshes:
-        # Another classifier may have the class at another index.
+        # The class is compared by name, because its index may differ in other classifiers.
         if settings.label is None:
             label = class_of_meshes(settings.scene.meshes, attacked.classes, "scene.meshes")
         else:
@@ -495,12 +545,13 @@ def load_targets(
     classifiers = []
     for item in settings.transfer.classifiers:
         classifier = _load_classifier(item).to(device)
-        # A missing class is an error before anything is attacked.
+        # `label` raises an InputError if the classifier lacks the class.
         classifier.label(label)
         classifiers.append(classifier)
     objects = []
     meshes = read_objects(settings.transfer.meshes, label, "transfer.meshes")
     for mesh in meshes.values():
+        # `label` raises an InputError if the classifier lacks the class.
         attacked.label(mesh.label)
         loaded = load_object(mesh, settings.scene.vertices)
         objects.append(add_table(loaded, settings.scene.ground))
@@ -508,26 +559,36 @@ def load_targets(
 
 
 def _load_classifier(item: Any) -> Classifier:
-    """Load an item of `transfer.classifiers`: a name, or a mapping {classifier, weights}."""
-    named = item if isinstance(item, dict) else {"classifier": item}
-    for key in named:
+    """Load one classifier that the setting `transfer.classifiers` names.
+
+    Args:
+        item: Name of the classifier, or a dictionary with the keys "classifier"
+            and "weights".
+
+    Raises:
+        InputError: If the dictionary has another key, or if the classifier
+            cannot be loaded.
+    """
+    values = item if isinstance(item, dict) else {"classifier": item}
+    for key in values:
         if key not in ("classifier", "weights"):
             raise InputError(
-                f"transfer.classifiers: {key} is not known: give names, or {{classifier, weights}}",
+                f"transfer.classifiers has an entry with the key {key}: give the name of a "
+                "classifier, or {classifier: NAME, weights: FILE}",
             )
     with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
-        return load_network(str(named.get("classifier")), named.get("weights"))
+        return load_network(str(values.get("classifier")), values.get("weights"))
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
-    """Write the words of a command line that turn one scene into another.
+    """Write the settings that the search for a scene changed, as a command line takes them.
 
     Args:
-        scene: Settings of the scene that a search found.
-        before: Settings of the scene that was given.
+        scene: Settings of the scene after the search.
+        before: Settings of the scene before the search.
 
     Returns:
-        Words such as "scene.polar=80.0 scene.exposure=2.0".
+        Changed settings, such as "scene.polar=80.0 scene.exposure=2.0".
     """
     words = []
     for name in SEARCHED_SETTINGS:
@@ -544,28 +605,30 @@ def format_reloaded(
     settings: AttackSettings,
     seed: int,
 ) -> list[str]:
-    """Say how a classifier predicts the images of a reloaded adversary.
+    """Classify the images of a reloaded adversary, and describe the predictions.
 
     Args:
-        adversary: Adversary with the images that were saved.
-        images: Images that were rendered again, in [0, 1], shape
+        adversary: Adversary that was loaded from files, with its saved images.
+        images: Images of its V views, rendered again, in [0, 1], shape
             (V, 3, size, size).
-        classifier: Classifier of the images.
-        settings: Settings of the attack, which say whether there is sensor
-            noise.
+        classifier: Classifier that classifies the images.
+        settings: Settings of the attack, with the standard deviation of the
+            noise of a camera.
         seed: Seed of the noise.
 
     Returns:
-        A line for each view: the predicted class, whether the prediction is the
-        same with sensor noise, and the largest difference from the saved image.
+        A line for each view: the predicted class, whether it stays the same
+        with the noise, and the largest difference between the image and the
+        saved image.
     """
     model = preprocessed_model(settings, classifier)
-    # The views are one example, so logits and predictions have shape (1, V, ...).
+    # The views are one example of V views. Logits have the shape (1, V, classes).
     logits = logits_of(model, images[None], len(images))
     predicted = logits.argmax(2)
-    # The criterion of a view is met if it is classified as without noise.
+    # With `predicted` as the target class of an "attack", `fooled_in_views` tests whether
+    # the images are still classified as `predicted` when there is noise.
     criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
-    is_steady = fooled_in_views(
+    is_same_with_noise = fooled_in_views(
         model,
         images[None],
         predicted,
@@ -574,7 +637,8 @@ def format_reloaded(
         settings=settings,
         seed=seed,
     )
-    differences = (images - adversary.images_in_views.to(images)).abs().flatten(1).amax(1)
+    saved_images = adversary.images_in_views.to(images)
+    max_differences = (images - saved_images).abs().flatten(1).amax(1)
     named = predictions(logits[0], classifier.classes)
     lines = []
     for view in range(len(images)):
@@ -583,10 +647,10 @@ def format_reloaded(
         line = f"view {view}: {adversary.shown.label} is classified as {predicted_name}"
         line += f" ({confidence:.1%})"
         if settings.sensor_noise:
-            steady = ", and so with a sensor's noise"
-            unsteady = ", but not always with a sensor's noise"
-            line += steady if is_steady[0, view] else unsteady
-        difference = 255 * float(differences[view])
+            same = ", and so with a sensor's noise"
+            different = ", but not always with a sensor's noise"
+            line += same if is_same_with_noise[0, view] else different
+        difference = 255 * float(max_differences[view])
         line += f"; values differ from the saved image's by {difference:.3g}/255 at most"
         lines.append(line)
     return lines

@@ -1,4 +1,4 @@
-"""The attack command for photographs: attack the light of a projector on each photograph."""
+"""pnb-attack for photographs: attack a network through the light of a projector on them."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import shortened
 
-# Lines about files that cannot be read, without --verbose.
+# Without --verbose, warnings about at most 3 unreadable files are printed.
 MAX_UNREADABLE = 3
 
 
@@ -23,15 +23,19 @@ def run(settings: AttackExperimentSettings) -> None:
     """Attack a network through the light on photographs, write the results, and print them.
 
     Args:
-        settings: Settings of pnb-attack, with `attack.relighting` and
-            `photographs`.
+        settings: Settings of pnb-attack. `attack.relighting` has the settings
+            of the light, and `photographs` the folder of the photographs.
 
     Raises:
-        InputError: If the folder or the network cannot be read.
+        InputError: If one of these two settings is missing, or if the
+            photographs or the network cannot be read.
     """
     relighting = settings.attack.relighting
     if relighting is None or settings.photographs is None:
-        raise InputError("attack=relighting and photographs=FOLDER need each other: set both")
+        raise InputError(
+            "attack=relighting needs photographs=FOLDER, and photographs=FOLDER needs "
+            "attack=relighting: set both"
+        )
     device = choose_device(settings.device)
     with keyed(name="classifier"):
         classifier = load_chosen(settings).to(device)

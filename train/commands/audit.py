@@ -5,7 +5,11 @@ from train.command_settings import AuditSettings
 
 
 def audit(settings: AuditSettings) -> None:
-    """Run the audit of pnb-audit, and print its answer, its numbers and the path of its report."""
+    """Test a network in unusual lighting, and print the main numbers and the path of the report.
+
+    Args:
+        settings: Settings of pnb-audit.
+    """
     audited = run_audit(settings)
     print(audited.screen)
     print(f"report: {audited.path}")

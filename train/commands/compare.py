@@ -1,4 +1,4 @@
-"""pnb-compare: tables of finished runs."""
+"""pnb-compare: tables that compare finished training runs."""
 
 from pathlib import Path
 
@@ -9,13 +9,16 @@ from train.system.verbosity import is_verbose, shortened
 
 
 def print_comparison(settings: CompareSettings) -> None:
-    """Print a Markdown table that compares finished runs. With --verbose, print all tables.
+    """Print a Markdown table that compares finished training runs.
+
+    With --verbose, intervals, settings, differences and other tables are
+    printed, too.
 
     Args:
-        settings: Settings of pnb-compare.
+        settings: Settings of pnb-compare, with the folders of the runs.
 
     Raises:
-        InputError: If a folder holds no finished run.
+        InputError: If a folder holds no finished training run.
     """
     runs = [summarize(Path(run)) for run in settings.runs]
     options = (settings.exclude, settings.photographs, settings.by)

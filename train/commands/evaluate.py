@@ -17,8 +17,12 @@ from train.system.verbosity import is_verbose
 def evaluate(settings: EvaluateSettings) -> None:
     """Score a network on photographs, write tables and images, and print a summary.
 
+    Args:
+        settings: Settings of pnb-evaluate.
+
     Raises:
-        InputError: If the network, a class or the photographs cannot be used.
+        InputError: If the network cannot be loaded, if it lacks a class, or if
+            the photographs cannot be read.
     """
     network = _load_network(settings)
     with keyed("label"):
@@ -43,7 +47,11 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _load_network(settings: EvaluateSettings) -> Classifier:
-    """Load the network of a run if `settings.run` is set. Otherwise load the classifier."""
+    """Load the network of the training run `settings.run`, or else `settings.classifier`.
+
+    Raises:
+        InputError: If the network cannot be loaded.
+    """
     if settings.run is None:
         with keyed(name="classifier"):
             return load_chosen(settings)

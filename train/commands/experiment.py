@@ -1,4 +1,9 @@
-"""Train the runs of one pnb-train command, and print the table that compares them."""
+"""pnb-train: train a network, and baselines to compare it with.
+
+The baselines have the same settings, except for the kind of renders (augment.mode).
+The setting `compare` names their kinds. Each baseline is trained in a subfolder of
+the folder of the main training run.
+"""
 
 import logging
 import shlex
@@ -30,13 +35,15 @@ from train.system.verbosity import is_verbose
 from train.training.initial import with_label
 from train.training.run import load_runs
 
-# Folders of conf/ from which an override can choose a file.
+# An override such as experiment=photographs chooses a file of settings. These keys
+# are the folders of such files in conf/.
 CHOICES = ("experiment", "augment", "data", "launcher")
-# File with the lines that a run prints.
+# Name of the log file in the folder of a training run.
 LOG = "train.log"
-# Sub-folder of the training on photographs, see `photographs_first`.
+# With the setting `photographs_first`, a first training on photographs is in this
+# subfolder.
 PHOTOGRAPHS = "photographs"
-# Settings that the training on photographs has in common with the training after it.
+# The first training on photographs takes these settings from the main training.
 SHARED = ("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light")
 SHARED_IN_TRAIN = (
     *("init_from", "precision", "device", "threads", "deterministic", "checkpoint_every"),
@@ -45,11 +52,11 @@ SHARED_IN_TRAIN = (
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Train the runs of a command, in this process or in each process of torchrun.
+    """Train a network and its baselines, in this process or in each process of torchrun.
 
     Args:
-        config: Configuration of the command.
-        overrides: Overrides of the command, such as "train.epochs=3".
+        config: Configuration that Hydra composed from files and overrides.
+        overrides: Settings on the command line, such as "train.epochs=3".
     """
     threading.excepthook = _report_thread_error
     with process_group():
@@ -57,30 +64,30 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _report_thread_error(error: threading.ExceptHookArgs) -> None:
-    """Print the error of a thread, unless it is an OSError.
+    """Print an error that a thread did not catch, unless it is an OSError.
 
-    On a full disk, the thread of TensorBoard raises OSError. The main thread
-    raises this error, too, so that it would be printed twice.
+    If the disk is full, the thread of TensorBoard raises an OSError. The main
+    thread then raises and prints the same error.
     """
     if error.exc_type is not OSError:
         threading.__excepthook__(error)
 
 
 def _train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Check all settings, and then train the baselines and the main run.
-
-    All processes write to the folder of rank 0, since the default name of the
-    folder has the time at which a process started.
+    """Read all settings, and train a network and its baselines.
 
     Args:
-        config: Configuration of the command. Its `run` becomes an absolute path.
-        overrides: Overrides of the command.
+        config: Configuration that Hydra composed. `config.run`, the folder of
+            the training run, is replaced by its absolute path.
+        overrides: Settings on the command line, such as "train.epochs=3".
     """
     command = given_command(overrides)
+    # The default name of the folder has the time, which differs between processes. All
+    # processes take the name of the first one.
     folder = Path(broadcast(str(config.run))).absolute()
     config.run = str(folder)
-    # A chosen file sets many values. Only single values can change when a run
-    # continues with the settings that it began with.
+    # A resumed run keeps its recorded settings, except for single values that the
+    # overrides change. An override that chooses a whole file prevents this.
     if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
     settings = with_label(read_settings(ExperimentSettings, config))
@@ -92,17 +99,19 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
 def _train_on_photographs(
     settings: ExperimentSettings, folder: Path, command: str
 ) -> ExperimentSettings:
-    """Train on photographs as the setting `photographs_first` asks.
+    """Train on photographs first, as the setting `photographs_first` asks.
 
-    A training that an earlier command finished is not repeated.
+    If this first training is already finished, it is not repeated.
 
     Args:
-        settings: Settings of the command.
-        folder: Folder of the run.
-        command: Command that was given.
+        settings: Settings of the main training.
+        folder: Folder of the main training. The first training gets a
+            subfolder.
+        command: Command line of the user, which is recorded.
 
     Returns:
-        Settings of the training that begins with the result.
+        Settings of the main training, which starts from the network of the
+        first training.
     """
     first = folder / PHOTOGRAPHS
     values = asdict(settings)
@@ -114,13 +123,14 @@ def _train_on_photographs(
     if settings.train.resume and is_finished(first):
         require_same_run(first, on_photographs, finished=True)
     else:
-        # The folder of the run has no settings yet, which a short command could read.
+        # The folder of the main training has no recorded settings yet. To resume, the
+        # user therefore has to give the whole command again.
         _train_in(first, on_photographs, command, shlex.split(command), folder)
     return replace(
         settings,
         photographs_first=False,
         train=replace(settings.train, init_from=str(first)),
-        # The first network has these.
+        # The file of the first network has its weights, classes and normalization.
         weights=None,
         classes=None,
         normalization=None,
@@ -132,128 +142,132 @@ def _train_in(
     settings: ExperimentSettings,
     command: str,
     resuming: Sequence[str],
-    whole: Path | None = None,
+    resumed_folder: Path | None = None,
 ) -> None:
-    """Train the baselines and the main run in a folder.
+    """Check that the folders can be written to, and train a network and its baselines.
+
+    If the training is interrupted, the command that resumes it is printed.
 
     Args:
-        folder: Folder of the main run.
-        settings: Settings of the main run.
-        command: Command that was given, which each run records.
-        resuming: Words before run=FOLDER and train.resume=true in the command
-            that continues the training.
-        whole: This FOLDER. None for `folder`.
+        folder: Folder of the main training run. Baselines get subfolders.
+        settings: Settings of the main training run.
+        command: Command line of the user, which each run records.
+        resuming: Words of the command line that resumes the training, without
+            run=FOLDER and train.resume=true.
+        resumed_folder: FOLDER in the command line that resumes the training.
+            None for `folder`.
     """
-    methods = _list_methods(settings, folder)
-    for path, method_settings in methods.items():
+    settings_of_runs = _settings_of_runs(settings, folder)
+    for path, run_settings in settings_of_runs.items():
         if settings.train.resume and (path / CONFIG).is_file():
-            require_same_run(path, method_settings)
+            require_same_run(path, run_settings)
         require_new_run(path, "run", settings.overwrite, settings.train.resume)
     is_first = distributed.rank() == 0
     log = logged_to(writable_folder(str(folder), "run") / LOG) if is_first else nullcontext()
     with log:
         try:
-            with sole_writer("run", *methods) if is_first else nullcontext():
-                _train_methods(methods, folder, command)
+            with sole_writer("run", *settings_of_runs) if is_first else nullcontext():
+                _train_runs(settings_of_runs, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
-            if any(map(checkpoint.exists, methods)):
-                words = [*resuming, f"run={whole or folder}", "train.resume=true"]
+            if any(map(checkpoint.exists, settings_of_runs)):
+                words = [*resuming, f"run={resumed_folder or folder}", "train.resume=true"]
                 advice = f"to go on: {shlex.join(words)}"
             console.info("%s%s", cause, advice)
             raise
 
 
-def _list_methods(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """List the settings of all runs of a command.
+def _settings_of_runs(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
+    """List the training runs of a command: the baselines, and then the main run.
 
     Args:
-        settings: Settings of the main run. `compare` names the kinds of renders
-            of the baselines.
-        folder: Folder of the main run.
+        settings: Settings of the main run. `settings.compare` names the kinds
+            of renders of the baselines.
+        folder: Folder of the main run. Each baseline has a subfolder with the
+            name of its kind of renders.
 
     Returns:
-        Settings by folder. Each baseline has a sub-folder with the name of its
-        kind of renders. The main run is the last.
+        For the folder of each run, its settings.
     """
-    methods = {}
-    for method in settings.compare:
+    settings_of_runs = {}
+    for mode in settings.compare:
         with keyed("compare"):
-            augment = replace(settings.augment, mode=method)
-            methods[folder / method] = replace(settings, compare=[], augment=augment)
-    methods[folder] = settings
-    return methods
+            augment = replace(settings.augment, mode=mode)
+            settings_of_runs[folder / mode] = replace(settings, compare=[], augment=augment)
+    settings_of_runs[folder] = settings
+    return settings_of_runs
 
 
-def _train_methods(
-    methods: Mapping[Path, ExperimentSettings],
+def _train_runs(
+    settings_of_runs: Mapping[Path, ExperimentSettings],
     folder: Path,
     command: str,
 ) -> None:
-    """Train all runs of a command, and print a table that compares them.
+    """Train and score several runs, print a table that compares them, and write a report.
 
     Args:
-        methods: Settings of each run by its folder.
-        folder: Folder of the main run, which gets the report.
-        command: Command that was given, which each run records.
+        settings_of_runs: For the folder of each run, its settings.
+        folder: Folder of the main run, in which the report is written.
+        command: Command line of the user, which each run records.
     """
-    for run in load_runs(methods, command):
-        method = run.settings.augment.mode
+    for run in load_runs(settings_of_runs, command):
+        mode = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"
-        console.debug("\n== augment=%s: %s%s", method, MODES[method], purpose)
+        console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
         run.fit()
         run.score()
         run.export()
     if distributed.rank() == 0:
-        summaries = [summarize(path) for path in methods]
+        summaries = [summarize(path) for path in settings_of_runs]
         console.debug("\n%s\n", format_table(summaries))
         console.info("%s\n", format_short_comparison(summaries))
         console.info("%s", report_of([folder], folder))
 
 
 def _is_choice(override: str) -> bool:
-    """Return whether an override chooses a file of conf/."""
+    """Return whether an override such as experiment=photographs chooses a file of settings."""
     key = override.partition("=")[0]
     return key in CHOICES or "@" in key
 
 
 class _QuietHandler(logging.Handler):
-    """Handler that ignores its own errors.
+    """Logging handler that ignores its own errors.
 
-    On a full disk, train.log lacks lines. The run itself then raises an error,
-    which is the only one that the user sees.
+    If the disk is full, the log file lacks lines. The training then raises an
+    error of its own, which is enough for the user.
     """
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Ignore the error, where `logging` would print a traceback."""
+        """Do nothing. The method of `logging` would print a traceback."""
 
 
 class _LogFile(_QuietHandler, logging.FileHandler):
-    """Handler that writes to a file."""
+    """Logging handler that writes to a file and ignores its own errors."""
 
 
 class _Terminal(_QuietHandler, logging.StreamHandler):
-    """Handler that writes to the console."""
+    """Logging handler that writes to the terminal and ignores its own errors."""
 
 
 @contextmanager
 def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterator[None]:
-    """Log to a file, and what is no detail also to the console, until the block ends.
+    """Write log messages to a file and to the terminal, until the `with` block ends.
 
-    With --verbose, the console shows details, too.
+    The file gets all messages. The terminal gets messages of at least `level`,
+    or with --verbose all messages.
 
     Args:
-        path: The file. If its folder does not exist, it is made.
-        prefix: Text before each line on the console.
-        level: Lowest level of the lines on the console, without --verbose.
+        path: Log file. Its folder is created if it does not exist.
+        prefix: Text at the beginning of each line on the terminal.
+        level: Lowest level of the messages on the terminal without --verbose.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
     terminal = _Terminal(sys.stdout)
     file.setFormatter(logging.Formatter("%(message)s"))
     terminal.setFormatter(logging.Formatter(f"{prefix}%(message)s"))
-    # Matplotlib reports that it builds its font cache.
+    # Messages of matplotlib about its font cache do not concern the user.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     root = logging.getLogger()
     level_before = root.level

@@ -1,4 +1,4 @@
-"""The fit command: find the camera and the light of a photograph of a mesh."""
+"""pnb-fit: find the camera and the lighting of a photograph that shows a mesh."""
 
 import shlex
 from importlib import import_module
@@ -23,29 +23,31 @@ from train.report.results import require_replaceable
 from train.settings import read_object
 from train.system.user_errors import writable_folder
 
-# Pixels per side of the background that is written.
+# Width and height of the background image that is written, in pixels.
 BACKGROUND_SIZE = 448
-# Pixels per side of the images that the printed attack renders for its default
-# classifier.
+# Width and height of the images that pnb-attack renders for its default classifier, in
+# pixels.
 ATTACKED_SIZE = 224
-# A pixel belongs to the object if the mask covers more than this fraction of it.
+# A pixel counts as a pixel of the object if the mask covers more than 98% of it.
 MIN_COVERAGE = 0.98
-# Below this overlap of the silhouettes, or above this error of the pixels, the
-# command warns that the mesh hardly fits.
+# A warning is printed if the silhouettes of the mesh and of the object overlap less than
+# this, as intersection over union.
 MIN_OVERLAP = 0.9
+# A warning is printed if the relative error of the rendered pixels is larger than this.
 MAX_ERROR = 0.3
-# Iterations of GrabCut, which OpenCV's tutorial uses, too.
+# Number of iterations of GrabCut. OpenCV's tutorial uses the same number.
 GRAB_CUT_STEPS = 5
 
 
 def fit(settings: FitSettings) -> None:
-    """Fit the camera and the lighting of a photograph, and print a command that attacks them.
+    """Find camera and lighting of a photograph, and print a command that attacks the lighting.
 
     Args:
         settings: Settings of pnb-fit.
 
     Raises:
-        InputError: If a file cannot be read, or no object is found.
+        InputError: If a file cannot be read, or if no object is found in the
+            photograph.
     """
     image = read_file(settings.photograph)
     out = writable_folder(settings.out, "out")
@@ -79,35 +81,36 @@ def fit(settings: FitSettings) -> None:
 
 
 def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
-    """Compare the photograph with a render of the fitted scene.
+    """Compare the photograph with a render in the camera and lighting that were found.
 
-    The function writes both images to comparison.png, side by side.
+    Both images are written to comparison.png, side by side.
 
     Args:
-        attacked: Settings of pnb-attack for the fitted scene.
-        out: Folder of the fit, with mask.png.
-        encoding: Encoding of both images.
+        attacked: Settings with which pnb-attack renders the scene.
+        out: Folder with mask.png, the mask of the object.
+        encoding: Encoding of both images, "srgb" or "linear".
 
     Returns:
-        Relative error of the pixels that the object covers.
+        Relative error of the rendered pixels of the object.
     """
     photograph, rendered = render_attacked(attacked)
     write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
-    # The written mask is gray, so its channels are equal.
-    object_mask = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
-    return relative_error(rendered[:, object_mask], photograph[:, object_mask], encoding)
+    # The three channels of the mask are equal, so the first one is enough.
+    coverage = read_image(out / "mask.png", ATTACKED_SIZE)[0]
+    is_object = coverage > MIN_COVERAGE
+    return relative_error(rendered[:, is_object], photograph[:, is_object], encoding)
 
 
 def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackExperimentSettings:
-    """Choose the settings of an attack on the lighting of the fitted scene.
+    """Choose settings with which pnb-attack attacks the lighting of the photograph.
 
     Args:
-        settings: Settings of the fit.
-        camera: The camera, which looks at the mesh's middle.
-        out: Folder of the fit.
+        settings: Settings of pnb-fit.
+        camera: Camera that was found. It looks at the center of the mesh.
+        out: Folder with the background and the lighting that were found.
 
     Returns:
-        Settings of pnb-attack. Numbers are rounded, as they are printed.
+        Settings of pnb-attack. Numbers are rounded as in the printed command.
     """
     fov = None
     if isinstance(camera, PerspectiveCamera):
@@ -131,10 +134,10 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
 
 
 def attack_command(settings: AttackExperimentSettings) -> list[str]:
-    """Write the command that attacks with the settings of `attack_settings`.
+    """Write the command line of pnb-attack that attacks the lighting of the photograph.
 
     Args:
-        settings: Settings of pnb-attack.
+        settings: Settings of pnb-attack, as `attack_settings` returns them.
 
     Returns:
         Words of the command line.
@@ -167,35 +170,36 @@ def attack_command(settings: AttackExperimentSettings) -> list[str]:
 
 
 def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render the scene that pnb-attack would attack.
+    """Render the scene that pnb-attack would attack, as it is before the attack.
 
     Args:
         settings: Settings of pnb-attack.
 
     Returns:
-        The background and the image before the attack, both encoded, of shape
-        (3, ATTACKED_SIZE, ATTACKED_SIZE).
+        Background and rendered image, encoded, shape
+        (3, ATTACKED_SIZE, ATTACKED_SIZE) each.
     """
     mesh = read_object(settings.scene.meshes[0], settings.label, "scene.meshes[0]")
     device = torch.device("cpu")
     scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
     first_example = torch.arange(1)
     images = scene.render(scene.conditions(first_example), first_example)
-    # The images have shape (1, 1, 3, ATTACKED_SIZE, ATTACKED_SIZE).
+    # `images` has one example and one view, shape (1, 1, 3, size, size).
     return scene.backgrounds[0], images[0, 0]
 
 
 def relative_error(rendered: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
-    """Compute the relative root mean square error of rendered pixels in linear light.
+    """Compute the relative root mean square error of rendered pixels, in linear RGB.
 
     Args:
         rendered: Encoded pixels of the render, shape (3, N).
-        photograph: Encoded pixels of the photograph, shape (3, N).
-        encoding: Encoding of both.
+        photograph: Encoded pixels of the photograph at the same places, shape
+            (3, N).
+        encoding: Encoding of both, "srgb" or "linear".
 
     Returns:
-        Root mean square difference, divided by the root mean square of the
-        photograph.
+        Root mean square of the difference, divided by the root mean square of
+        the photograph.
     """
     expected = decode(photograph.double(), encoding)
     difference = decode(rendered.double(), encoding) - expected
@@ -203,83 +207,92 @@ def relative_error(rendered: torch.Tensor, photograph: torch.Tensor, encoding: s
 
 
 def read_file(path: str) -> np.ndarray:
-    """Read an image file.
+    """Read an image file at its full size.
 
     Args:
-        path: The file. An orientation in its metadata is applied.
+        path: Image file. The image is rotated as its EXIF orientation says.
 
     Returns:
-        Pixels in sRGB, shape (H, W, 3), uint8.
+        Pixels in sRGB, uint8, shape (H, W, 3).
 
     Raises:
-        InputError: If the file is missing or is no image.
+        InputError: If the file is missing or is not an image.
     """
     try:
         return np.asarray(read_rgb(Path(path), 10**6))
-    except Exception as error:  # Pillow's decoders raise almost any error at a broken file.
+    # Pillow raises errors of almost any type for a damaged file.
+    except Exception as error:
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
 
 
 def read_mask(path: str, image: np.ndarray) -> np.ndarray:
-    """Read the mask of an object.
+    """Read the mask of the object in a photograph.
 
     Args:
-        path: Image file, white where the object is.
-        image: Photograph that the mask belongs to, shape (H, W, 3).
+        path: Image file that is white where the object is, and black elsewhere.
+        image: Photograph, shape (H, W, 3).
 
     Returns:
-        Mask in [0, 255], shape (H, W), uint8.
+        Mask, uint8, shape (H, W): 255 where the object is.
 
     Raises:
-        InputError: If the file is no image, or is not as large as the
-            photograph.
+        InputError: If the file is not an image, or if its size differs from the
+            size of the photograph.
     """
     mask = read_file(path)[..., 0]
     if mask.shape != image.shape[:2]:
         given = _format_size(mask)
         expected = _format_size(image)
         raise InputError(
-            f"mask={path} has {given} pixels: give one of the photograph's size, {expected}",
+            f"mask={path} has {given} pixels, but the photograph has {expected}: "
+            "give a mask of the same size",
         )
     return mask
 
 
 def _format_size(image: np.ndarray) -> str:
-    """Write the width and the height of an image (H, W, ...), such as "640 × 480"."""
+    """Format the size of an image as "WIDTH × HEIGHT", such as "640 × 480".
+
+    Args:
+        image: Image, shape (H, W, ...).
+    """
     height, width = image.shape[:2]
     return f"{width} × {height}"
 
 
 def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
-    """Segment the object in a box with OpenCV's GrabCut (Rother et al. 2004).
+    """Segment the object inside a box with OpenCV's GrabCut (Rother et al. 2004).
 
     Args:
-        image: Photograph in sRGB, shape (H, W, 3), uint8.
+        image: Photograph in sRGB, uint8, shape (H, W, 3).
         box: Left, top, right and bottom of the box in pixels.
 
     Returns:
-        255 for pixels of the object and 0 for the others, shape (H, W), uint8.
+        Mask, uint8, shape (H, W): 255 for pixels of the object, 0 for others.
 
     Raises:
-        InputError: If OpenCV is not installed, or if the box does not lie in
-            the photograph.
+        InputError: If OpenCV is not installed, or if the box is empty or
+            exceeds the photograph.
     """
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
         raise InputError(
-            "box= needs OpenCV: pip install opencv-python-headless, or give mask=FILE",
+            "box= needs OpenCV, which is not installed: run pip install "
+            "opencv-python-headless, or give mask=FILE instead of box=",
         ) from error
     height, width = image.shape[:2]
     if not _is_box_within(box, height, width):
         raise InputError(
-            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels",
+            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels: "
+            "give four whole numbers with left < right and top < bottom",
         )
     left, top, right, bottom = box
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)
-    # OpenCV's functions take BGR, and store their color models in these arrays.
+    # OpenCV takes the color channels in the order blue, green, red.
     bgr = image[..., ::-1].copy()
+    # `grabCut` stores its color models in two arrays of this size.
     background_model = np.zeros((1, 65))
     foreground_model = np.zeros((1, 65))
     cv2.grabCut(
@@ -296,7 +309,13 @@ def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
 
 
 def _is_box_within(box: list[int], height: int, width: int) -> bool:
-    """Return whether a box [left, top, right, bottom] has an area and lies in an image."""
+    """Return whether a box is not empty and lies within an image.
+
+    Args:
+        box: Left, top, right and bottom of the box in pixels.
+        height: Height of the image in pixels.
+        width: Width of the image in pixels.
+    """
     if len(box) != 4:
         return False
     left, top, right, bottom = box
@@ -304,11 +323,11 @@ def _is_box_within(box: list[int], height: int, width: int) -> bool:
 
 
 def write_values(path: Path, image: torch.Tensor) -> None:
-    """Write an image with 8 bits per channel.
+    """Write an image to a file with 8 bits per channel.
 
     Args:
-        path: File to write. Its suffix chooses the format.
-        image: Values in [0, 1], shape (3, H, W).
+        path: File to write. The format follows from its suffix.
+        image: Image with values in [0, 1], shape (3, H, W).
     """
     pixels = to_bytes(image.permute(1, 2, 0)).numpy()
     write_image(path, Image.fromarray(pixels))

@@ -1,4 +1,4 @@
-"""pnb-lab: path-traced photographs of objects under projected patterns and maps."""
+"""pnb-lab: path-traced renders of objects in the light of projectors and environment maps."""
 
 from pathlib import Path
 
@@ -8,13 +8,14 @@ from train.report.results import require_replaceable
 
 
 def render_laboratory(settings: LabSettings) -> None:
-    """Render the laboratory, and print what was written.
+    """Render a test set of objects in unusual lighting, and print the number of renders.
 
     Args:
-        settings: The settings of the command.
+        settings: Settings of pnb-lab.
 
     Raises:
-        InputError: If the folder holds results, or a setting is wrong.
+        InputError: If the folder for the renders holds other results, or if a
+            setting is wrong.
     """
     require_replaceable(Path(settings.out), "out", settings.overwrite)
     count = write_laboratory(settings)

@@ -1,4 +1,4 @@
-"""pnb-light: a light as an environment map for other software."""
+"""pnb-light: write environment lighting as an environment map for other software."""
 
 from pathlib import Path
 
@@ -13,14 +13,20 @@ from train.system.user_errors import keyed
 
 
 def export_light(settings: LightSettings) -> None:
-    """Write a light without negative radiance, and print by how much its irradiance differs.
+    """Write environment lighting to an image file, without its negative radiance.
+
+    The function prints how much the irradiance changes by this.
+
+    Args:
+        settings: Settings of pnb-light.
 
     Raises:
-        InputError: If the light cannot be read, or the file cannot be written.
+        InputError: If the light cannot be read, or if the file cannot be
+            written.
     """
     out = Path(settings.out)
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
-        message = f"out={out} is the light itself, which would be lost: choose another file"
+        message = f"out={out} would overwrite the light itself: choose another file"
         raise InputError(message, "out")
     require_replaceable(out, "out", settings.overwrite)
     light = load_light(settings.light, degree=None)

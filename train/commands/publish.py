@@ -1,4 +1,4 @@
-"""The publish command: write the network of a run as half-precision safetensors."""
+"""pnb-publish: write the network of a training run as half-precision safetensors."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,30 +18,31 @@ from train.system.verbosity import shortened
 
 
 def publish_network(settings: PublishSettings) -> None:
-    """Write the network of a run, and print its folder.
+    """Write the network of a training run with its settings and scores, and print the folder.
 
     Args:
         settings: Settings of pnb-publish.
 
     Raises:
-        InputError: If there is no network, or if it cannot be loaded from what
-            would be written.
+        InputError: If the folder has no network, or if the published network
+            could not be loaded again.
     """
     out = writable_folder(settings.out, "out")
-    given = Path(settings.run)
-    path, state = load_selected(given)
-    # A published network may be written again, with another operating point.
-    is_in_place = path.resolve() == (out / PUBLISHED).resolve()
-    own = [PUBLISHED] if is_in_place else []
-    require_replaceable(out, "out", settings.overwrite, own)
-    is_run = path.suffix != Path(PUBLISHED).suffix
-    if is_run:
-        state |= _describe_run(given)
-    # A network may be built by a Python function of the user. Publishing calls
-    # this function only if the network has to be calibrated.
+    folder = Path(settings.run)
+    path, state = load_selected(folder)
+    # `run` may be the folder of a published network, which is then replaced. This adds
+    # an operating point to the network.
+    is_replaced = path.resolve() == (out / PUBLISHED).resolve()
+    own_files = [PUBLISHED] if is_replaced else []
+    require_replaceable(out, "out", settings.overwrite, own_files)
+    is_training_run = path.suffix != Path(PUBLISHED).suffix
+    if is_training_run:
+        state |= _describe_run(folder)
+    # A Python function of the user may build the network. It is called only if the
+    # network must be calibrated.
     is_python = str(state["architecture"].get("name")).startswith(PYTHON)
     if settings.calibrate or not is_python:
-        # Loading fails for a network that nobody could use.
+        # `load_run` raises an InputError if nobody could load the published network.
         network = load_run(path, model=settings.model)
         if settings.calibrate and settings.false_positive_rate:
             state["operating_point"] = _calibrate(
@@ -53,14 +54,17 @@ def publish_network(settings: PublishSettings) -> None:
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
-    """Collect the facts about a run that are stored in the file of its published network.
+    """Collect the settings and scores of a training run for the file of the published network.
 
     Args:
-        folder: Folder of the run.
+        folder: Folder of the training run.
 
     Returns:
-        "settings" by dotted key, "versions" of the packages by name, and
-        "scores" by name: metrics, and the scores of each folder of photographs.
+        Dictionary with these keys:
+        - settings: value of each setting, with keys such as "train.epochs";
+        - versions: version of each package;
+        - scores: value of each metric, and scores on each folder of
+          photographs.
     """
     run = summarize(folder)
     photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
@@ -72,7 +76,12 @@ def _describe_run(folder: Path) -> dict[str, Any]:
 
 
 def _without_folder(text: str) -> str:
-    """Replace an absolute path, which exists only on this machine, by the name of its file."""
+    """Remove the folders from an absolute path, because other machines do not have them.
+
+    Args:
+        text: Value of a setting. Other values than absolute paths are returned
+            as they are.
+    """
     return Path(text).name if text.startswith("/") else text
 
 
@@ -82,19 +91,19 @@ def _calibrate(
     label: Any,
     false_positive_rate: float,
 ) -> list[dict[str, Any]]:
-    """Choose the threshold of each label on a folder of photographs, and print it.
+    """Choose a detection threshold for each positive class on photographs, and print it.
 
     Args:
-        network: Network to publish. Its weights are rounded to 16 bits.
+        network: Network to publish. The function rounds its weights to 16 bits.
         folder: Folder of photographs.
-        label: Positive class, or several.
-        false_positive_rate: False-positive rate that the threshold must not
-            exceed, in (0, 1).
+        label: Positive class, or a list of several.
+        false_positive_rate: Largest false-positive rate of each threshold, in
+            (0, 1).
 
     Returns:
-        Fields of the operating point of each label.
+        For each positive class, the attributes of its `OperatingPoint`.
     """
-    # The thresholds are those of the published weights, which have 16 bits.
+    # Published weights have 16 bits, so the thresholds are chosen with rounded weights.
     network.half().float()
     with keyed(folder="calibrate"):
         points = scoring.choose_operating_points(

@@ -1,4 +1,4 @@
-"""pnb-report: a page of runs, sweeps and attacks."""
+"""pnb-report: a report page about training runs, sweeps and attacks."""
 
 import os
 from pathlib import Path
@@ -10,23 +10,24 @@ from train.system.user_errors import writable_folder
 
 
 def report(settings: ReportSettings) -> None:
-    """Write the page of runs and attacks, and print its path.
+    """Write a report page about training runs and attacks, and print its path.
 
     Args:
-        settings: Settings of pnb-report.
+        settings: Settings of pnb-report, with the folders of the runs and
+            attacks.
 
     Raises:
-        InputError: If a folder holds no run and no attack, or if the page cannot
-            be written.
+        InputError: If a folder has neither a training run nor an attack, or if
+            the page cannot be written.
     """
     folders = [Path(run) for run in settings.runs]
     parent = Path(os.path.commonpath([folder.absolute() for folder in folders]))
     out = writable_folder(settings.out or parent, "out")
-    # The folder that holds the runs may have a report of them, which is replaced.
-    # The report of an audit is not replaced.
-    own: list[str] = []
+    # An earlier report in the common folder of all runs is replaced, unless it is the
+    # report of an audit.
+    own_files: list[str] = []
     if out.resolve() == parent.resolve():
-        own = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]
-    require_replaceable(out, "out", settings.overwrite, own)
+        own_files = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]
+    require_replaceable(out, "out", settings.overwrite, own_files)
     page = write_report(folders, out)
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -1,8 +1,9 @@
-"""Sweeps: the runs of `pnb-train --multirun`.
+"""Sweeps: several training runs that one command, `pnb-train --multirun`, starts.
 
-Each run has a folder that is named by its overrides. A finished run is not
-repeated. Hydra's launchers start the runs, in this process or in others. The
-results are read from the folders.
+The command line has several values for some settings, such as seed=0,1. There is a
+training run for each combination of values. Its folder is named after the settings
+that differ between the runs. A finished run is not repeated. Hydra's launchers start
+the runs in this process or in others. The results are read from the folders.
 """
 
 import logging
@@ -36,39 +37,42 @@ from train.system.user_errors import user_message, writable_folder
 from train.system.verbosity import is_verbose, shortened
 from train.training.run import load_runs
 
-# Largest number of lines of the table that `format_sweep` prints without --verbose.
+# Without --verbose, the table of the finished runs has at most this many lines.
 MAX_TABLE_LINES = 10
-# Largest number of lines of the list of unfinished runs without --verbose.
+# Without --verbose, at most this many unfinished runs are listed.
 MAX_UNFINISHED = 3
 
 
-def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
-    """Make all runs of a sweep, and print their table.
+def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
+    """Train all runs of a sweep, print a table of their results, and write a report.
 
     Args:
-        start: Starts Hydra with the words of the command line.
-        overrides: The words of the command line, flags included.
+        start: Function that starts Hydra, which trains the runs.
+        words: Words of the command line: settings and flags.
 
     Raises:
-        InputError: If two runs are the same, or a folder holds a run with other
-            settings. This is checked before the first run.
+        InputError: If two runs have the same settings, or if the folder of a
+            run has a run with other settings. This is checked before the
+            training.
         SystemExit: With status 1, if a run is not finished at the end.
     """
-    runs = _expand([word for word in overrides if not word.startswith("-")])
-    first = compose("train", runs[0])
-    if first.photographs_first:
-        raise InputError("photographs_first is not for sweeps: start the runs one by one")
-    overwrite = bool(first.overwrite)
-    parent = writable_folder(str(first.sweep), "sweep")
-    # The folder may hold the page that an earlier call wrote about the same sweep.
+    runs = _expand([word for word in words if not word.startswith("-")])
+    first_config = compose("train", runs[0])
+    if first_config.photographs_first:
+        raise InputError(
+            "photographs_first=true cannot be used in a sweep: start the runs one by one"
+        )
+    overwrite = bool(first_config.overwrite)
+    parent = writable_folder(str(first_config.sweep), "sweep")
+    # An earlier report about the same sweep may be replaced.
     require_replaceable(parent, "sweep", overwrite, own=[PAGE])
     shared_keys = _shared_keys(runs)
-    folders = [parent / run_name(words, shared_keys, str(parent)) for words in runs]
+    folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):
-        raise InputError("the sweep has a run twice: give each value once")
-    for folder, words in zip(folders, runs, strict=True):
-        _require_usable_folder(folder, words, overwrite)
-    # Hydra names the folder of a run by its overrides, but for these keys.
+        raise InputError("the sweep has two runs with the same settings: give each value once")
+    for folder, overrides in zip(folders, runs, strict=True):
+        _require_usable_folder(folder, overrides, overwrite)
+    # The names of the folders leave out settings that are the same in all runs.
     excluded = ",".join(map(quoted, shared_keys))
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{excluded}]")
     try:
@@ -82,26 +86,30 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
 
 
 def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
-    """List the keys of the overrides that have the same value in all runs of a sweep.
+    """List the settings on the command line that have the same value in all runs of a sweep.
 
     Args:
-        runs: Overrides of each run, such as "train.epochs=3".
+        runs: Settings of each run, such as ("seed=0", "train.epochs=3").
+
+    Returns:
+        Keys of these settings, such as "train.epochs".
     """
     shared = set.intersection(*map(set, runs))
     return [override.partition("=")[0] for override in shared]
 
 
 def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bool) -> None:
-    """Check that a run of a sweep may write to its folder.
+    """Check that a training run of a sweep may write to its folder.
 
     Args:
         folder: Folder of the run.
-        overrides: Overrides of the run.
-        overwrite: Whether the run may replace results of other commands.
+        overrides: Settings of the run, such as ("seed=0", "train.epochs=3").
+        overwrite: Whether results of other commands in the folder may be
+            replaced.
 
     Raises:
-        InputError: If the folder holds a run with other settings, or results of
-            another command.
+        InputError: If the folder has a training run with other settings, or
+            results of another command.
     """
     if is_finished(folder) or checkpoint.exists(folder):
         settings = read_settings(ExperimentSettings, compose("train", overrides))
@@ -111,25 +119,31 @@ def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bo
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
-    """List the overrides of every run of a sweep, as Hydra's basic sweeper makes them.
+    """List the settings of each run of a sweep, in the order in which Hydra starts them.
 
     Args:
-        overrides: Overrides of the command, such as "seed=0,1" and
+        overrides: Settings on the command line, such as "seed=0,1" and
             "train.epochs=3".
 
     Returns:
-        For each combination of values, overrides such as
+        For each combination of values, settings such as
         ("seed=0", "train.epochs=3").
+
+    Raises:
+        InputError: If `run` is set, which names the folder of a single run, or
+            if Slurm is chosen and not installed.
     """
     choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if key == "run":
-            raise InputError("run= names the folder of a single run: name a sweep's with sweep=")
+            raise InputError(
+                "run= names the folder of a single run: name the folder of a sweep with sweep="
+            )
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
             raise InputError(
-                "launcher=slurm needs Slurm's sbatch, which is missing: "
-                "start the sweep on the cluster",
+                "launcher=slurm needs the command sbatch of Slurm, which this computer does not "
+                "have: start the sweep on the cluster, or remove launcher=slurm",
             )
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
@@ -140,13 +154,14 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def run_in_sweep(config: DictConfig) -> None:
-    """Make a run of a sweep in its folder, or resume it, unless it is finished.
+    """Train one run of a sweep, or resume its training, unless it is finished.
 
-    The reason of a failure is written to failed.txt. SystemExit and
-    KeyboardInterrupt stop the sweep.
+    If the run fails, the reason is written to failed.txt in its folder, and the
+    sweep continues with the next run. SystemExit and KeyboardInterrupt stop the
+    sweep.
 
     Args:
-        config: The configuration of the run. `config.run` is its folder.
+        config: Configuration of the run. `config.run` is its folder.
     """
     folder = Path(config.run)
     with locked(folder) as has_lock:
@@ -161,43 +176,44 @@ def run_in_sweep(config: DictConfig) -> None:
 
 
 def _print_detail(line: str) -> None:
-    """Print a line about one run of a sweep if details are printed."""
+    """Print a line about one run of a sweep, but only with --verbose."""
     if is_verbose():
         print(line, flush=True)
 
 
 def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
-    """Make a run of a sweep, and write the reason to failed.txt if it fails.
+    """Train one run of a sweep. If it fails, write the reason to failed.txt.
 
     Args:
         config: Configuration of the run.
         folder: Folder of the run.
     """
     job = HydraConfig.get()
-    # The runs of joblib's launcher print at the same time.
-    shares_console = "n_jobs" in job.launcher
-    prefix = f"#{job.job.num} " if shares_console else ""
+    # Hydra's joblib launcher trains several runs at once. Their lines on the terminal
+    # then start with the number of the run.
+    is_parallel = "n_jobs" in job.launcher
+    prefix = f"#{job.job.num} " if is_parallel else ""
     with logged_to(folder / LOG, prefix, level=logging.CRITICAL):
         try:
             _run(config, folder, list(job.overrides.task))
         except Exception as error:
             sentence = user_message(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
-            # If `user_message` has no sentence, the error is a fault of the program.
-            # It is shown with its traceback.
+            # `user_message` has a sentence for mistakes of the user. Other errors are faults
+            # of the program, which are printed with their traceback.
             console.error("failed: %s", reason, exc_info=None if sentence else error)
-            # If the disk is full, the console alone shows the reason.
+            # If the disk is full, the file cannot be written.
             with suppress(OSError):
                 atomic_write(folder / FAILURE, f"{reason}\n")
 
 
 def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
-    """Train, score and export a run. If it has a checkpoint, it is resumed from there.
+    """Train, score and export one run. If it has a checkpoint, the training is resumed.
 
     Args:
         config: Configuration of the run.
         folder: Folder of the run.
-        overrides: Overrides of the run, as Hydra's sweeper writes them.
+        overrides: Settings of the run, such as "seed=0", as Hydra escapes them.
     """
     settings = read_settings(ExperimentSettings, config)
     settings.train.resume = checkpoint.exists(folder)
@@ -209,7 +225,10 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
 
 
 def _unescaped(override: str) -> str:
-    r"""Quote a text that Hydra's sweeper escapes: path='a b' instead of path=a\ b."""
+    r"""Write the value of a setting in quotes, if Hydra wrote it with backslashes.
+
+    For example, path=a\ b becomes path='a b'.
+    """
     value = OverridesParser.create().parse_override(override).value()
     if "\\" in override and isinstance(value, str):
         key = override.partition("=")[0]
@@ -218,15 +237,15 @@ def _unescaped(override: str) -> str:
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
-    """Write the results of a sweep.
+    """Format the results of the training runs of a sweep.
 
     Args:
         folders: Folders of all runs of the sweep.
 
     Returns:
-        The number of finished runs, their table with means over several seeds,
-        and the state of the other runs. Without --verbose, the table and the
-        list are short.
+        The number of finished runs; a table of their results, averaged over
+        seeds; and the state of each unfinished run. Without --verbose, the
+        table and the list are cut off after a few lines.
     """
     finished = [folder for folder in folders if is_finished(folder)]
     lines = [f"{len(finished)} of {len(folders)} runs are finished", ""]
@@ -234,9 +253,9 @@ def format_sweep(folders: Sequence[Path]) -> str:
     if finished:
         runs = [summarize(folder) for folder in finished]
         table = format_table(runs) if is_verbose() else format_short_comparison(runs)
-        # Only a few rows fit beside a list of unfinished runs.
-        limit = MAX_TABLE_LINES - MAX_UNFINISHED if unfinished else MAX_TABLE_LINES
-        lines += shortened(table.splitlines(), limit)
+        # The table and the list of unfinished runs have MAX_TABLE_LINES lines together.
+        max_lines = MAX_TABLE_LINES - MAX_UNFINISHED if unfinished else MAX_TABLE_LINES
+        lines += shortened(table.splitlines(), max_lines)
     if unfinished:
         states = [f"{folder}: {state(folder)}" for folder in unfinished]
         lines += shortened(states, MAX_UNFINISHED)
