@@ -190,7 +190,10 @@ def _recommendation(
 def _with_remedies(
     results: Mapping[str, Path], remedies: Mapping[str, str], out: Path
 ) -> dict[str, Path]:
-    """Add the networks behind normalized light to the networks of an audit.
+    """Add the networks with the remedy "normalized light" to the networks of an audit.
+
+    This remedy normalizes the colors of an image before the network classifies
+    it.
 
     Args:
         results: Folder of results of each network, by the name of the network.

@@ -1,9 +1,8 @@
 """Top of the report of an audit: main numbers, sentences, and pictures of attacks.
 
-Plain light is ordinary light, before an attack changes it. The counts of an attack
-are the dictionary that `success_by_light` of `train.auditing.lights` returned. It
-has the numbers of views that are correct before the attack and misclassified after
-it.
+Plain light is ordinary light, before an attack changes it. The result of an attack
+is the dictionary that `success_by_light` of `train.auditing.lights` returned. It has
+the numbers of views that are correct before the attack and misclassified after it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +24,8 @@ from train.report.first_screen import (
 
 # Width of the picture that shows a view before and after an attack, in pixels.
 PAIR_WIDTH = 400
-# For each kind of lighting, the counts of its attack.
+# For each kind of lighting, the result of its attack, a dictionary with numbers of
+# views.
 Counts = Mapping[str, Mapping[str, Any]]
 
 
@@ -61,7 +61,8 @@ def strongest_kind(counts: Counts) -> str | None:
     """Return the kind of lighting by which the most views become misclassified.
 
     Args:
-        counts: Counts of the attack on each kind of lighting.
+        counts: For each kind of lighting, the numbers of views that are correct
+            before the attack and misclassified after it.
 
     Returns:
         Kind of lighting, such as "lamps". None if no view is recognized before
@@ -77,9 +78,9 @@ def _misclassified_fraction(attack_counts: Mapping[str, Any]) -> float:
     """Return which fraction of the correct views the attack at the largest radius changes.
 
     Args:
-        attack_counts: Counts of an attack. "correct" is the number of views
-            that were correct before. "adversarial" has the number of these
-            views that are misclassified, for each radius in ascending order.
+        attack_counts: Result of an attack. "correct" is the number of views
+            that are correct before. "adversarial" has the number of them that
+            are misclassified, for each radius in ascending order.
     """
     return attack_counts["adversarial"][-1] / attack_counts["correct"]
 
@@ -99,7 +100,8 @@ def screen_of_one(
         name: Name of the network.
         answer: Headline, which says whether the network is safe.
         plain: How many views the network recognizes in plain light.
-        counts: Counts of the attack on each kind of lighting.
+        counts: For each kind of lighting, the numbers of views that are correct
+            before the attack and misclassified after it.
         scores: Content of summary.json with the scores on test images. None
             without test images.
 
@@ -161,7 +163,8 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
 
     Args:
         folder: Folder of results of one network.
-        counts: Counts of the attack on each kind of lighting.
+        counts: For each kind of lighting, the numbers of views that are correct
+            before the attack and misclassified after it.
 
     Returns:
         Pictures with the two predictions. A kind of lighting by which no attack
@@ -183,7 +186,7 @@ def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
     """Describe the predictions for one view before and after an attack.
 
     Args:
-        attack_counts: Counts of an attack. If the attack succeeds, "predicted"
+        attack_counts: Result of an attack. If the attack succeeds, "predicted"
             has the two predicted classes, and "confidence" their probabilities.
 
     Returns:
@@ -204,8 +207,9 @@ def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
     """Plot the fraction of recognized views against the radius of attacks.
 
     Args:
-        counts_by_network: Counts of the attack on each kind of lighting, by the
-            name of the network.
+        counts_by_network: For the name of each network and for each kind of
+            lighting, the numbers of views that are correct before the attack
+            and misclassified after it.
 
     Returns:
         One plot for each kind of lighting. It has a line for the attack on each
@@ -229,7 +233,9 @@ def _remaining(attack_counts: Mapping[str, Any], method: str) -> list[Estimate]:
     """Compute the fraction of views that stay correctly classified, for each radius.
 
     Args:
-        attack_counts: Counts of an attack.
+        attack_counts: Result of an attack. "correct" is the number of views that
+            are correct before. The entry named `method` has the number of them
+            that are misclassified, for each radius.
         method: "adversarial" for the attack, or "random" for random draws.
 
     Returns:

@@ -34,8 +34,8 @@ class PlainViews:
         size: Factor by which the objects are scaled.
         recognized: Number of views that are classified correctly.
         n: Number of views.
-        recognized_as_given: Number of views that are classified correctly with
-            the first candidate, whose exposure and size are 1.
+        recognized_as_given: Number of views that are classified correctly
+            before the search, with an exposure and a size of 1.
     """
 
     light: str

@@ -622,7 +622,7 @@ def format_reloaded(
         saved image.
     """
     model = preprocessed_model(settings, classifier)
-    # The views are one example of V views. Logits have the shape (1, V, classes).
+    # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
     logits = logits_of(model, images[None], len(images))
     predicted = logits.argmax(2)
     # With `predicted` as the target class of an "attack", `fooled_in_views` tests whether

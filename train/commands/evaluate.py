@@ -55,6 +55,8 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
     if settings.run is None:
         with keyed(name="classifier"):
             return load_chosen(settings)
+    # The file of a training run has its classes, size and normalization. These settings
+    # are therefore an error here.
     facts = as_facts(settings.classes, settings.size, settings.normalization)
     require_no_facts(f"run={settings.run}", facts)
     classifier = load_run(settings.run, settings.weights, settings.model)

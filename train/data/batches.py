@@ -353,8 +353,8 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
     """
     height, width = images.shape[2:]
     device = images.device
-    # `rows` has the source row of each pixel row, shape (B, H). `columns` has the
-    # source column of each pixel column, shape (B, W).
+    # For each row of the result, `rows` has the row of the image that it is copied from,
+    # shape (B, H). `columns` has the same for columns, shape (B, W).
     rows = torch.arange(height, device=device) + shifts[0, :, None]
     rows = _reflect(rows, height)
     columns = torch.arange(width, device=device).expand(len(chosen), -1)

@@ -37,8 +37,9 @@ def kept_aside_settings(
     generated. Otherwise the meshes of training are rendered in other lighting.
 
     Args:
-        settings: Settings of the training run. `evaluate.laboratory_setups` is
-            a multiple of 5, because there are 5 patterns.
+        settings: Settings of the training run. The number of random setups of
+            light and camera, `evaluate.laboratory_setups`, is a multiple of the
+            number of projected patterns, 5.
         classes: Names of the classes of the network.
         size: Pixels per side of the renders.
         out: Folder of the renders.

@@ -421,15 +421,15 @@ def _count_objects(predictions: Sequence[Prediction]) -> int:
 
 
 def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
-    """Create a pool whose ROC curve compares all of its positives with all of its negatives.
+    """Collect predictions that are scored together, with one ROC curve of all of them.
 
     Args:
         predictions: Predictions that are scored together.
         thresholds: Threshold on the log-odds of each label. None omits the
-            metrics in `AT_THRESHOLD`.
+            metrics that need a threshold.
 
     Returns:
-        Pool of the predictions.
+        The predictions, divided into positives and negatives.
     """
     positives = [prediction for prediction in predictions if prediction.positive]
     negatives = [prediction for prediction in predictions if not prediction.positive]
@@ -459,18 +459,20 @@ class Pooled:
 
     @cached_property
     def all(self) -> Pool:
-        """Pool of the images of all sources that are not excluded."""
+        """Predictions that are scored together: all, except those of excluded sources."""
         return pool(self._included, self.thresholds)
 
     @cached_property
     def by_label(self) -> dict[str, Pool]:
-        """Pool of the predictions for each label."""
+        """For each label, its predictions, which are scored together."""
         groups = _group(self._included, lambda prediction: prediction.label)
         return {label: pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
     def by_source(self) -> dict[str, Pool]:
-        """Pool of the images of each source, including excluded sources.
+        """For each source, the predictions for its images, which are scored together.
+
+        Excluded sources are included here.
 
         The ROC curve compares the positives of a source with its negatives. A
         positive can name other sources in its `hard_negatives`. The negatives
@@ -515,16 +517,16 @@ class Pooled:
 
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
-        """Pool of the images of each mesh. Images of an unknown mesh are left out."""
+        """For each known mesh, the predictions for its images, which are scored together."""
         return self._by_content(lambda prediction: prediction.photograph.mesh)
 
     @cached_property
     def by_class(self) -> dict[str, Pool]:
-        """Pool of the images of each class."""
+        """For each class, the predictions for its images, which are scored together."""
         return self._by_content(lambda prediction: prediction.photograph.label)
 
     def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
-        """Make a pool for each mesh, or for each class, that images show.
+        """Collect the predictions for the images of each mesh, or of each class.
 
         The ROC curve of a positive mesh or class compares its images with all
         negatives. The ROC curve of a negative mesh or class compares all
@@ -536,7 +538,8 @@ class Pooled:
                 out.
 
         Returns:
-            Pools by the name of the mesh or class.
+            For the name of each mesh or class, its predictions, which are
+            scored together.
         """
         labels = {prediction.label for prediction in self.predictions}
         pools = {}
@@ -792,8 +795,8 @@ def auc_and_recalls(
 
     order = negatives.argsort()
     sorted_negatives = negatives[order]
-    # Entry i of `counts_below` is how often the negatives with the i lowest scores
-    # count together, for i from 0 to m, shape (..., m + 1).
+    # Entry i of `counts_below` is the sum of the counts of the i negatives with the
+    # lowest scores, for i from 0 to m, shape (..., m + 1).
     counts_below = np.insert(negative_counts[..., order].cumsum(axis=-1), 0, 0, axis=-1)
     negative_total = counts_below[..., -1]
     # Number of negatives with a lower score than each positive, shape (..., n).
@@ -833,7 +836,7 @@ def thresholds(
     """
     order = negatives.argsort()
     sorted_negatives = negatives[order]
-    # Entry i is how often the negatives with the i + 1 lowest scores count together,
+    # Entry i is the sum of the counts of the i + 1 negatives with the lowest scores,
     # shape (..., m).
     counts_up_to = counts[..., order].cumsum(axis=-1)
     total = counts_up_to[..., -1]
