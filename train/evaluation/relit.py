@@ -54,9 +54,10 @@ MODELED = (
 class RelitPhotograph:
     """Predictions of a network for one photograph in the light of several slides.
 
-    There are up to three kinds of light: "slide" is a random slide, "random" is
-    the slide after a random search, and "adversarial" is the slide after a
-    gradient attack.
+    A slide is a random picture that a projector shows on the photograph. There
+    are up to three kinds of light: "slide" is the slide itself, "random" is the
+    slide after a random search, and "adversarial" is the slide after a gradient
+    attack.
 
     Attributes:
         path: Path of the photograph, relative to its folder.

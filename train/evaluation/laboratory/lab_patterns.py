@@ -313,7 +313,8 @@ def draw_pattern(
     """
     first_color = torch.from_numpy(draw_color(rng))[:, None, None]
     second_color = torch.from_numpy(draw_color(rng))[:, None, None]
-    # The brightness is drawn for all patterns, so that later draws are the same.
+    # The brightness is drawn even if it is not used, so that all patterns take the same
+    # number of random draws.
     second_brightness = rng.uniform()
     if name not in TWO_COLORED:
         second_brightness = 0.0

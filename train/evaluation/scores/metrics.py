@@ -545,9 +545,9 @@ class Pooled:
         pools = {}
         for name, group in _group(self._included, name_of).items():
             own_pool = pool(group, self.thresholds)
-            # With the labels orange and lemon, an image of an orange is a positive
-            # for orange and a negative for lemon. Without this condition, the
-            # oranges would be compared only with themselves, as negatives for lemon.
+            # Images of positive classes are left out. With the labels orange and lemon,
+            # an image of an orange is also a negative for lemon, so oranges would be
+            # compared with themselves.
             negatives = [
                 prediction
                 for prediction in own_pool.negatives
@@ -801,7 +801,7 @@ def auc_and_recalls(
     negative_total = counts_below[..., -1]
     # Number of negatives with a lower score than each positive, shape (..., n).
     lower = counts_below[..., sorted_negatives.searchsorted(positives, "left")]
-    # Number of negatives with a lower or an equal score.
+    # Number of negatives with a lower or an equal score than each positive.
     lower_or_equal = counts_below[..., sorted_negatives.searchsorted(positives, "right")]
     wins = (positive_counts * lower).sum(axis=-1)
     wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)

@@ -268,13 +268,14 @@ def score(
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of several pools of predictions, and show the progress.
+    """Compute the metrics of several groups of predictions, and show the progress.
 
     Args:
-        pools: Pools by the name of their label, source, mesh or class.
+        pools: For the name of each label, source, mesh or class, its
+            predictions.
 
     Returns:
-        For each name, the metrics of its pool.
+        For each name, the metrics of its predictions.
     """
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
