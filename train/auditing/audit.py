@@ -263,9 +263,9 @@ class _Plan:
         self.attacked_views = Views(positives, settings.scale(ATTACKED_COUNT), seed, self.device)
 
     def find_views(self, results: Path) -> None:
-        """Find lighting and size of the views in which the audited network recognizes them.
+        """Find the ordinary light and the size at which the audited network recognizes most views.
 
-        The views of all networks then have this lighting and this size.
+        The views of all networks then have this light and this size.
 
         Args:
             results: Folder for the results of the audited network.
@@ -299,9 +299,9 @@ class _Plan:
             _write_json(path, transfer_success, network, *others, self.attacked_views, results)
 
     def score_in_normalized_light(self, out: Path) -> None:
-        """Score each network behind the remedy "normalized light" on the test images.
+        """Score each network with the remedy "normalized light" on the test images.
 
-        This remedy normalizes the light of an image before the network
+        This remedy normalizes the colors of an image before the network
         classifies it.
 
         Args:

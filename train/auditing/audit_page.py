@@ -522,8 +522,8 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
         # `hits` has one row for each view and one column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
         if hits.min() == hits.max():
-            # The bootstrap interval would have no width. This interval treats the lights
-            # of a view as one render.
+            # If all renders have the same result, the bootstrap interval has no width.
+            # Wilson's interval is used instead, with one render of each view.
             rates[title] = fraction(int(hits[:, 0].sum()), len(hits))
             continue
         # Index of the view in each entry of `hits.ravel()`.

@@ -17,7 +17,7 @@ from train.report.first_screen import EQUAL_RATE, gain_sentence
 # their results.
 CLASSIFIER = "classifier"
 HARDENED = "hardened"
-# This is added to the key of a network for the same network behind normalized light.
+# End of the key of a network whose images are normalized before they are classified.
 NORMALIZED = "_normalized_light"
 # Name of the audited network in the comparison with the remedies.
 ORIGINAL = "the original network"
@@ -46,13 +46,16 @@ class Recommendation:
 
 
 def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
-    """Put normalized light in front of the networks of an audit.
+    """Add the remedy "normalized light" to the networks of an audit.
+
+    This remedy normalizes the colors of an image before the network classifies
+    it.
 
     Args:
         networks: Networks under the keys CLASSIFIER and HARDENED.
 
     Returns:
-        Networks behind normalized light, under keys such as
+        Networks with the remedy, under keys such as
         "hardened_normalized_light". Networks that normalize the light already
         are left out.
     """
@@ -88,11 +91,12 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
 
 
 def recommend(evaluations: Evaluations) -> Recommendation | None:
-    """Recommend the cheapest remedy that is better than no remedy, unless a dearer one is better.
+    """Recommend the cheapest remedy that helps, unless a more expensive one helps more.
 
-    One network is better than another if the 95% interval of its gain is above
-    0. The metric is the recall at 10% false positives. With several positive
-    classes, it is top-1 accuracy.
+    A remedy helps if the 95% interval of its gain over the original network is
+    above 0. It helps more than a cheaper one if the interval of its gain over
+    the cheaper one is above 0, too. The metric is the recall at 10% false
+    positives. With several positive classes, it is top-1 accuracy.
 
     Args:
         evaluations: Evaluation of the original network, and then of each

@@ -205,8 +205,8 @@ def _require_attack_settings(settings: AttackExperimentSettings) -> None:
     """Check the settings of the transfer and of the renderers before any file is read.
 
     Raises:
-        InputError: If the attack cannot be transferred as the settings ask, or
-            if a renderer is not installed.
+        InputError: If the attack cannot be tested with the other views or
+            meshes of `settings.transfer`, or if a renderer is not installed.
     """
     with keyed("transfer", **keys_of("transfer", settings.transfer)):
         require_transferable(
@@ -573,7 +573,7 @@ def _load_classifier(item: Any) -> Classifier:
     for key in values:
         if key not in ("classifier", "weights"):
             raise InputError(
-                f"transfer.classifiers has an entry with the key {key}: give the name of a "
+                f"transfer.classifiers: {key} is not a key of its entries: give the name of a "
                 "classifier, or {classifier: NAME, weights: FILE}",
             )
     with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):

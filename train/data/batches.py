@@ -156,7 +156,7 @@ def training_batches(
         images: Images of the data set, and renders.
         batch_size: Number of images of a batch in all processes together.
         seed: Seed of the training run.
-        this_round: Round whose images are shown.
+        this_round: Round, a part of the epoch, whose images are shown.
         flips: "random" flips each image with probability 0.5. "alternating"
             flips each image in every other epoch.
         first: Index of the first batch that is yielded.
@@ -183,7 +183,7 @@ def _draw(
         images: Images of the data set, and renders.
         batch_size: Number of images of a batch in all processes together.
         seed: Seed of the training run.
-        this_round: Round whose images are shown.
+        this_round: Round, a part of the epoch, whose images are shown.
         flips: "random" flips each image with probability 0.5. "alternating"
             flips each image in every other epoch.
 
@@ -195,7 +195,8 @@ def _draw(
         shown_count, generator=generator(seed, this_round.number, "batches")
     )
     batch_count = math.ceil(shown_count / batch_size)
-    # After the last image, the places of the last batch start again at image 0.
+    # The last batch is filled up with the first images of the permutation: `%` starts
+    # again at 0.
     places = torch.arange(batch_count * batch_size) % shown_count
     order = this_round.rows[permutation][places].view(batch_count, batch_size)
 
@@ -236,7 +237,7 @@ def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Tensor:
 
 
 def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round from a data set in memory.
+    """Yield the batches of a round (part of an epoch) from a data set in memory.
 
     A chunk of several batches is shifted and flipped in one call, which takes
     less time than one call for each batch.
@@ -290,7 +291,7 @@ def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) ->
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round from a data set on disk.
+    """Yield the batches of a round (part of an epoch) from a data set on disk.
 
     Worker processes read random crops of the images, and flip half of them.
     Renders are in memory. They are shifted and flipped here.

@@ -142,7 +142,8 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
     """
 
     def __init__(self, files: ImageFiles):
-        from torchvision.transforms import v2  # torchvision takes a second to import
+        # This import is here because torchvision takes a second to import.
+        from torchvision.transforms import v2
 
         self._files = files
         crop = v2.RandomResizedCrop(

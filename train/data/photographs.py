@@ -75,7 +75,15 @@ class Photograph:
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of photos.csv, with the attributes that `Photograph` explains."""
+    """Row of the table photos.csv about one photograph.
+
+    Attributes:
+        source: Name of the collection that the photograph comes from. None if
+            it is unknown.
+        hard_negatives: Names of other sources, whose negatives the photograph
+            is ranked against.
+        mesh: Name of the photographed object. None if it is unknown.
+    """
 
     source: str | None = None
     hard_negatives: tuple[str, ...] = ()

@@ -230,7 +230,8 @@ def load_cifar100(path: str) -> DataSet:
     Raises:
         InputError: If the data set cannot be downloaded.
     """
-    from torchvision.datasets import CIFAR100  # torchvision takes a second to import
+    # This import is here because torchvision takes a second to import.
+    from torchvision.datasets import CIFAR100
 
     try:
         train = CIFAR100(path, train=True, download=True)

@@ -255,7 +255,7 @@ def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw a number uniformly between two limits, the lowest and the highest number."""
+    """Draw a random number from the uniform distribution between two limits."""
     return rng.uniform(limits[0], limits[1])
 
 

@@ -195,7 +195,7 @@ class Pool:
     these predictions count.
 
     Attributes:
-        positives: Predictions for photographs that show the label.
+        positives: Predictions for photographs whose class is the label.
         negatives: Predictions for all other photographs.
         for_roc: Predictions for the ROC curve. They may include photographs of
             other sources or meshes than `positives` and `negatives` do.
@@ -443,11 +443,13 @@ def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None
 
 @dataclass(frozen=True)
 class Pooled:
-    """All pools of one evaluation: of all images, and of each label, source, mesh and class.
+    """Predictions of one evaluation, grouped by label, source, mesh and class.
+
+    Each group is a `Pool`, whose predictions are scored together.
 
     Attributes:
         predictions: Predictions for one or several labels.
-        exclude: Names of sources that are left out of all pools except
+        exclude: Names of sources that are left out of all groups except
             `by_source`.
         thresholds: Threshold on the log-odds of each label. If it is empty, the
             metrics in `AT_THRESHOLD` are None.
@@ -801,7 +803,7 @@ def auc_and_recalls(
     negative_total = counts_below[..., -1]
     # Number of negatives with a lower score than each positive, shape (..., n).
     lower = counts_below[..., sorted_negatives.searchsorted(positives, "left")]
-    # Number of negatives with a lower or an equal score than each positive.
+    # Number of negatives whose score is lower than that of each positive, or equal to it.
     lower_or_equal = counts_below[..., sorted_negatives.searchsorted(positives, "right")]
     wins = (positive_counts * lower).sum(axis=-1)
     wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)
