@@ -13,8 +13,9 @@ pip download --no-deps -d packages robosuite pybullet
 python -m benchmarks.many_objects make --data DATA --packages packages --out OBJECTS
 python -m benchmarks.many_objects score efficientnet_lite0 RUNS/hardened --objects OBJECTS
 
-RUNS/hardened/0,RUNS/hardened/1 is one column with the mean over two seeds. DATA
-has meshes/ and hdri/. docs/results.md has the commands of the training.
+RUNS/hardened/0,RUNS/hardened/1 is one column with the mean over two seeds. Scores
+on the test split require --table NAME, which docs/test_evaluations.csv records.
+DATA has meshes/ and hdri/. docs/results.md has the commands of the training.
 """
 
 import argparse
@@ -33,7 +34,7 @@ from PIL import Image
 
 from augment.classifiers import Classifier
 from augment.photographs.projected_light import relight_photographs
-from benchmarks.splits import adapt_texture_or_material, load
+from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
@@ -413,29 +414,33 @@ def score(options: argparse.Namespace) -> None:
         options: Parsed command line.
     """
     networks = load_networks(options)
+    each_seed = {}
+    for name, seeds in networks.items():
+        for number, network in enumerate(seeds):
+            each_seed[f"{name}/{number}" if len(seeds) > 1 else name] = network
+    parts = find_renders(options.objects / options.split)
+    if options.split == TEST:
+        folders = [part.paths[0].parents[1] for part in parts]
+        log_evaluations([Method("all", each_seed)], folders, options.table)
     rows = []
     # Hits and setups of each group, by the kind of light.
     by_light: dict[str, list[tuple[dict[str, np.ndarray], np.ndarray]]] = {}
-    for part in find_renders(options.objects / options.split):
+    for part in parts:
         images = read_images(part.paths, options.network_size)
         hits = find_hits(networks, images, part.labels)
         rows.append([part.group, part.light, len(part.labels), *compare(hits, part.setups)])
         by_light.setdefault(part.light, []).append((hits, part.setups))
-    for light, parts in by_light.items():
+    for light, groups in by_light.items():
         pooled_hits = {}
         for name in networks:
-            pooled_hits[name] = np.concatenate([hits[name] for hits, _ in parts], axis=1)
+            pooled_hits[name] = np.concatenate([hits[name] for hits, _ in groups], axis=1)
         # The groups have setups of their own, which get numbers of their own.
-        setups = np.concatenate([numbers + MAX_IMAGES * i for i, (_, numbers) in enumerate(parts)])
+        setups = np.concatenate([numbers + MAX_IMAGES * i for i, (_, numbers) in enumerate(groups)])
         rows.append(["all", light, len(setups), *compare(pooled_hits, setups)])
     title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups and seeds"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:
         paths = sorted(options.photographs.iterdir())
-        each_seed = {}
-        for name, seeds in networks.items():
-            for number, network in enumerate(seeds):
-                each_seed[f"{name}/{number}" if len(seeds) > 1 else name] = network
         print(photograph_table(each_seed, paths, options.network_size))
 
 
@@ -516,6 +521,7 @@ def make_parser() -> argparse.ArgumentParser:
     scoring.add_argument("--photographs", type=Path, help="folder of photographs INDEX_NAME.jpg")
     scoring.add_argument("--interpolate", nargs="*", type=float, default=[], help="factors")
     scoring.add_argument("--network-size", type=int, default=224)
+    scoring.add_argument("--table", default="", help="test: name of the table of the scores")
     return parser
 
 
@@ -525,7 +531,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: Words of the command line. None takes those of the process.
     """
-    options = make_parser().parse_args(arguments)
+    parser = make_parser()
+    options = parser.parse_args(arguments)
+    if options.body is score and options.split == TEST and not options.table:
+        parser.error("--split test requires --table NAME, the table that the scores are for")
     options.body(options)
 
 

@@ -490,7 +490,7 @@ def log_evaluations(methods: Sequence[Method], folders: Sequence[Path], table: s
         ]
         if days:
             print(f"{run} was evaluated for {table!r} before, on {', '.join(days)}")
-        shown = " ".join(folder.name for folder in folders)
+        shown = " ".join(dict.fromkeys(folder.name for folder in folders))
         row = [date.today(), commit, table, run, weights, shown, images]
         with LOG.open("a", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerow(row)
