@@ -1,5 +1,6 @@
 """Networks are scored on objects that no training shows, and intervals are over setups."""
 
+import csv
 import zipfile
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from PIL import Image
 from torch import nn
 
 from augment.classifiers import Classifier
-from benchmarks import many_objects
+from benchmarks import many_objects, splits
+from train.data.photographs import TABLE
 from train.evaluation.laboratory import lab_patterns
 
 CLASSES = ["orange", "lemon", "packet"]
@@ -115,3 +117,24 @@ def test_photographs_count_as_right_by_the_number_in_their_name(tmp_path):
     table = many_objects.photograph_table(classifiers, sorted(tmp_path.iterdir()), 4)
     assert [row[1][:6] for row in table.rows] == ["2 of 3", "0 of 3"]
     assert [row[2][:6] for row in table.rows] == ["3 of 3", "0 of 3"]
+
+
+def test_each_look_at_the_test_split_is_recorded(monkeypatch, tmp_path, capsys):
+    folder = tmp_path / "test" / "objects" / "patterns"
+    (folder / "orange").mkdir(parents=True)
+    Image.new("RGB", (4, 4), (200, 100, 0)).save(folder / "orange" / "a.png")
+    (folder / TABLE).write_text("path,setup\norange/a.png,0\n")
+    log = tmp_path / "log.csv"
+    log.write_text("date,commit,table,network,weights,parts,images\n")
+    monkeypatch.setattr(splits, "LOG", log)
+    right = Classifier(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), 4, CLASSES)
+    networks = {"original": [right], "hardened": [right, right]}
+    monkeypatch.setattr(many_objects, "load_networks", lambda options: networks)
+    words = ["score", "original", "--objects", str(tmp_path), "--split", "test"]
+    with pytest.raises(SystemExit):
+        many_objects.main(words)
+    many_objects.main([*words, "--network-size", "4", "--table", "many"])
+    rows = list(csv.DictReader(log.read_text().splitlines()))
+    assert [row["network"] for row in rows] == ["original", "hardened/0", "hardened/1"]
+    assert {row["table"] for row in rows} == {"many"}
+    assert "1.000" in capsys.readouterr().out
