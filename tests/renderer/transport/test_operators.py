@@ -139,6 +139,13 @@ def test_most_pixels_of_large_faces_are_multiplied_once():
     assert mixed_count < multiplied_count
 
 
+def test_an_operator_on_another_device_has_the_transfer_of_all_pixels():
+    operator = LAYOUTS["equal pixels"].operator()
+    moved = operator.to("meta")
+    assert moved.distinct is None
+    assert moved.distinct_transfer.shape == operator.transfer.shape
+
+
 def test_equal_pixels_change_no_transfer(monkeypatch):
     operator = LAYOUTS["equal pixels"].operator()
     monkeypatch.setattr(distinct_pixels, "FEWEST_COPIES", 10**9)
