@@ -218,10 +218,20 @@ def test_the_intervals_of_relit_photographs_are_those_of_scipy():
 
     draws = torch.Generator().manual_seed(1)
     column, first = torch.randint(0, 2, (2, 60), generator=draws).double()
-    text = relit_photographs.cell(column, first)
+    text = relit_photographs.cell(column[None], first[None])
     low, high = (float(end) for end in text.partition("[")[2].rstrip("]").split(","))
     difference = (column - first).numpy()
     expected = bootstrap((difference,), np.mean, method="percentile", rng=0).confidence_interval
     assert text.startswith(f"{column.mean():.3f}, {difference.mean():+.3f}")
     assert low == pytest.approx(expected.low, abs=0.03)
     assert high == pytest.approx(expected.high, abs=0.03)
+
+
+def test_the_intervals_of_relit_photographs_contain_the_variation_between_seeds():
+    from scipy.stats import bootstrap
+
+    means = torch.linspace(0, 1, 12, dtype=torch.float64) ** 2
+    low, high = relit_photographs.interval(means[:, None].expand(-1, 20))
+    expected = bootstrap((means.numpy(),), np.mean, method="percentile", rng=0).confidence_interval
+    assert low == pytest.approx(expected.low, abs=0.02)
+    assert high == pytest.approx(expected.high, abs=0.02)
