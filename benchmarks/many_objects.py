@@ -40,7 +40,6 @@ from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
-from train.settings import MAX_IMAGES
 
 TEST = "test"
 SAME = "objects trained on"
@@ -362,9 +361,9 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
     networks = {first: [original], "normalized light": [original.normalizing_light()]}
     for word in words:
         folders = word.split(",")
-        # The last part of the path of each seed is its number.
+        # The folder of a seed has its number as its name.
         path = Path(folders[0])
-        title = path.name if len(folders) == 1 else path.parent.name
+        title = path.parent.name if path.name.isdigit() else path.name
         seeds = [load(folder, options.network_size) for folder in folders]
         networks[title] = seeds
         for factor in options.interpolate:
@@ -373,37 +372,48 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
     return networks
 
 
-def mean_with_interval(values: np.ndarray, setups: np.ndarray) -> Estimate:
-    """Return the mean of values with its 95% bootstrap interval over setups and seeds.
+def mean_with_interval(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Estimate:
+    """Return the mean of groups of values with its 95% bootstrap interval over setups and seeds.
 
     Args:
-        values: Value of each image, shape (N,), or for several seeds (S, N).
-        setups: Number of the setup of each image, shape (N,).
+        parts: For each group, the value of each image, shape (N,), or for
+            several seeds (S, N), and the number of the setup of each image,
+            shape (N,). Groups have the same weight and setups of their own.
     """
-    by_seed = np.atleast_2d(values)
-    means = np.stack([by_seed[:, setups == number].mean(1) for number in np.unique(setups)])
-    setup_count, seed_count = means.shape
-    rng = np.random.default_rng(0)
-    rows = rng.integers(setup_count, size=(RESAMPLES, setup_count, 1))
-    columns = rng.integers(seed_count, size=(RESAMPLES, 1, seed_count))
-    low, high = np.quantile(means[rows, columns].mean((1, 2)), [0.025, 0.975])
-    return Estimate(float(means.mean()), float(low), float(high))
+    means = []
+    resampled = []
+    for number, (values, setups) in enumerate(parts):
+        by_seed = np.atleast_2d(values)
+        by_setup = np.stack([by_seed[:, setups == one].mean(1) for one in np.unique(setups)])
+        setup_count, seed_count = by_setup.shape
+        # All groups have the same draws of the seeds.
+        seed_draws = np.random.default_rng(0)
+        columns = seed_draws.integers(seed_count, size=(RESAMPLES, 1, seed_count))
+        setup_draws = np.random.default_rng([1, number])
+        rows = setup_draws.integers(setup_count, size=(RESAMPLES, setup_count, 1))
+        means.append(by_setup.mean())
+        resampled.append(by_setup[rows, columns].mean((1, 2)))
+    low, high = np.quantile(np.mean(resampled, axis=0), [0.025, 0.975])
+    return Estimate(float(np.mean(means)), float(low), float(high))
 
 
-def compare(hits: Mapping[str, np.ndarray], setups: np.ndarray) -> list[str]:
+def compare(parts: Sequence[tuple[dict[str, np.ndarray], np.ndarray]]) -> list[str]:
     """Write the cells of a row: the accuracy of each network, and its gain.
 
     Args:
-        hits: 1 for each image that a network is right about, otherwise 0, shape
-            (S, N) with S seeds, by the name of the network. The gain is that
-            over the first network, which has one seed.
-        setups: Number of the setup of each image, shape (N,).
+        parts: For each group of images, the hits of each network by name, and
+            the number of the setup of each image, shape (N,). Hits are 1 for
+            each image that a network is right about, otherwise 0, shape (S, N)
+            with S seeds. The gain is that over the first network, which has one
+            seed.
     """
-    first, *others = hits.values()
-    cells = [format_interval(mean_with_interval(first, setups))]
-    for other in others:
-        gain = mean_with_interval(other - first, setups)
-        cells.append(f"{other.mean():.3f} ({format_interval(gain, '+')})")
+    first, *others = parts[0][0]
+    cells = [format_interval(mean_with_interval([(hits[first], setups) for hits, setups in parts]))]
+    for name in others:
+        accuracy = mean_with_interval([(hits[name], setups) for hits, setups in parts])
+        gains = [(hits[name] - hits[first], setups) for hits, setups in parts]
+        gain = format_interval(mean_with_interval(gains), "+")
+        cells.append(f"{accuracy.value:.3f} ({gain})")
     return cells
 
 
@@ -427,16 +437,12 @@ def score(options: argparse.Namespace) -> None:
     by_light: dict[str, list[tuple[dict[str, np.ndarray], np.ndarray]]] = {}
     for part in parts:
         images = read_images(part.paths, options.network_size)
-        hits = find_hits(networks, images, part.labels)
-        rows.append([part.group, part.light, len(part.labels), *compare(hits, part.setups)])
-        by_light.setdefault(part.light, []).append((hits, part.setups))
+        scored = (find_hits(networks, images, part.labels), part.setups)
+        rows.append([part.group, part.light, len(part.labels), *compare([scored])])
+        by_light.setdefault(part.light, []).append(scored)
     for light, groups in by_light.items():
-        pooled_hits = {}
-        for name in networks:
-            pooled_hits[name] = np.concatenate([hits[name] for hits, _ in groups], axis=1)
-        # The groups have setups of their own, which get numbers of their own.
-        setups = np.concatenate([numbers + MAX_IMAGES * i for i, (_, numbers) in enumerate(groups)])
-        rows.append(["all", light, len(setups), *compare(pooled_hits, setups)])
+        count = sum(len(setups) for _, setups in groups)
+        rows.append(["all", light, count, *compare(groups)])
     title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups and seeds"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:

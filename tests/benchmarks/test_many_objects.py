@@ -80,19 +80,28 @@ def test_a_hard_slide_has_two_complementary_saturated_colors_and_black():
 
 def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
     values = np.random.default_rng(0).integers(0, 2, 50).astype(float)
-    alone = many_objects.mean_with_interval(values, np.arange(50))
-    repeated = many_objects.mean_with_interval(values.repeat(4), np.arange(50).repeat(4))
+    alone = many_objects.mean_with_interval([(values, np.arange(50))])
+    repeated = many_objects.mean_with_interval([(values.repeat(4), np.arange(50).repeat(4))])
     assert repeated == alone
     # The interval of the normal approximation.
     error = 1.96 * values.std() / np.sqrt(50)
     assert alone.high - alone.low == pytest.approx(2 * error, rel=0.15)
 
 
-def test_the_interval_of_one_image_is_that_over_seeds():
+def test_the_interval_of_equal_images_is_that_over_seeds():
     # The mean of two seeds that are drawn anew is 0, 0.5 or 1, with 1/4, 1/2 and 1/4.
     values = np.array([[0.0] * 9, [1.0] * 9])
-    found = many_objects.mean_with_interval(values, np.arange(9))
+    found = many_objects.mean_with_interval([(values, np.arange(9))] * 2)
     assert (found.low, found.value, found.high) == (0.0, 0.5, 1.0)
+
+
+def test_groups_have_the_same_weight_and_draws_of_their_own():
+    many = np.random.default_rng(0).integers(0, 2, 400).astype(float)
+    few = np.random.default_rng(1).integers(0, 2, 100).astype(float)
+    found = many_objects.mean_with_interval([(many, np.arange(400)), (few, np.arange(100))])
+    assert found.value == pytest.approx((many.mean() + few.mean()) / 2)
+    error = 1.96 * np.sqrt(many.var() / 400 + few.var() / 100) / 2
+    assert found.high - found.low == pytest.approx(2 * error, rel=0.15)
 
 
 def test_weights_between_two_networks_of_one_layer_give_logits_between():
