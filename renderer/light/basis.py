@@ -400,7 +400,7 @@ class SumBasis(Basis):
         """Check that at most one of the bases in `parts` is environment light."""
         if sum(part.environment is not None for part in self.parts) > 1:
             raise InputError(
-                "parts has two environment lights: use one, and add the coefficients of both"
+                "parts has two environment lights: give one, with the sum of their coefficients"
             )
 
     def __str__(self) -> str:

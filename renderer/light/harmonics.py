@@ -84,7 +84,9 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
     degree = _degree_of_rows(light)
     if degree is None or light.shape[1] != 3:
         shape = tuple(light.shape)
-        raise InputError(f"light has shape {shape}: give ((degree + 1)², 3) coefficients")
+        raise InputError(
+            f"light has shape {shape}: give SH coefficients of shape ((degree + 1)², 3)"
+        )
     return degree
 
 
@@ -130,7 +132,8 @@ def basis(
     require_degree(degree)
     directions = as_tensor("directions", directions)
     if not directions.ndim or directions.shape[-1] != 3:
-        raise InputError(f"directions has shape {tuple(directions.shape)}: give (..., 3)")
+        shape = tuple(directions.shape)
+        raise InputError(f"directions has shape {shape}: give vectors of shape (..., 3)")
     require_finite(directions=directions)
     components = unit(directions.double().movedim(-1, 0))
     values = evaluate_harmonics(components, range((degree + 1) ** 2))
@@ -640,9 +643,12 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     degree = _degree_of_rows(coefficients)
     if degree is None:
         shape = tuple(coefficients.shape)
-        raise InputError(f"coefficients has shape {shape}: give ((degree + 1)², channels)")
+        raise InputError(
+            f"coefficients has shape {shape}: give SH coefficients of shape "
+            "((degree + 1)², channels)"
+        )
     if not _is_orthonormal(rotation):
-        raise InputError("rotation is not orthonormal: give an orthonormal matrix (3, 3)")
+        raise InputError("rotation is not orthonormal: give an orthonormal matrix of shape (3, 3)")
 
     def rotated_radiance(directions: Tensor) -> Tensor:
         """Compute the radiance of the rotated light from directions, shape (..., 3)."""

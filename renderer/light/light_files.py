@@ -116,7 +116,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         name = description.pop("basis")
         if name not in kind_of_name:
             known = " or ".join(kind_of_name)
-            raise InputError(f"the basis of the file is {name!r}, but {known} is needed")
+            raise InputError(f"basis is {name!r}: give a light with the basis {known}")
         description = angles_in_degrees(description, description.pop(ANGLE_UNIT, None))
         basis = kind_of_name[name](**description)
     except InputError as error:

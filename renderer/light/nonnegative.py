@@ -308,8 +308,10 @@ def _create_programs(coefficients: Tensor, within: Ball | None) -> "list[_Quadra
         return [_QuadraticProgram(channel) for channel in original]
     if within.norm == "linf":
         low, high = map(_split_channels, within.ends)
+        channels_and_bounds = zip(original, low, high, strict=True)
         return [
-            _QuadraticProgram(*arguments) for arguments in zip(original, low, high, strict=True)
+            _QuadraticProgram(channel, channel_low, channel_high)
+            for channel, channel_low, channel_high in channels_and_bounds
         ]
     # One row for each channel of each light becomes one block (C, K) for each light.
     shape = (len(coefficients), coefficients.shape[2], coefficients.shape[1])
@@ -734,6 +736,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
     """
     exponents = []
     coefficients = []
+    # The order of the exponents is that of the rows of `monomial_coefficients`.
     for total in range(degree, max(degree - 2, -1), -1):
         for a in range(total, -1, -1):
             exponents += [(a, b, total - a - b) for b in range(total - a, -1, -1)]
@@ -793,6 +796,7 @@ def _grid(degree: int, subdivisions: int) -> _Grid:
     from trimesh.creation import icosphere
 
     sphere = icosphere(subdivisions)
+    # A vertex has 5 or 6 neighbors. If it has 5, the first one is repeated.
     neighbors = [[*around, *around[:1]][:6] for around in sphere.vertex_neighbors]
     directions = np.array(sphere.vertices)
     harmonics = np.ascontiguousarray(_harmonics(directions, degree).T)

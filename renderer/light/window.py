@@ -150,6 +150,7 @@ def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray)
 
     # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.
     terms = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
-    # The sum over a row is the value of the lobe at this angle if all factors are 1.
+    # The sum over a row is the value of the lobe at this angle if all factors are 1. The
+    # change of the factors must add at least the negative of this value.
     weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
     return np.concatenate([[1.0], 1 + weighted_change / weight[1:]])

@@ -325,8 +325,9 @@ class Tilt(NamedTuple):
         Returns:
             Components in sample axes, shape (S,) each.
         """
-        without_x = _rotate_about_x(vectors, self.about_x.reversed())
-        return _rotate_about_y(without_x, self.about_y.reversed())
+        # Undo the last rotation first.
+        rotated_about_x = _rotate_about_x(vectors, self.about_x.reversed())
+        return _rotate_about_y(rotated_about_x, self.about_y.reversed())
 
 
 class Angle(NamedTuple):

@@ -188,6 +188,7 @@ def _lobe_radiance(
         Radiance, shape (3, S).
     """
     degree = harmonics.degree_of(light)
+    # `colored` and `white` have one row for each SH coefficient, one column for each sample.
     # The reflection of metals (colored) is multiplied by the albedo. All other specular
     # reflection (white) has the color of the light.
     colored, white, frame = gloss.specular_transfer(normals, to_camera, degree)
@@ -447,7 +448,10 @@ class _IrradiancePolynomial:
         self.constant = light[:1].T * math.sqrt(math.pi / 4)
 
     def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the irradiance c + a · n + p(n) and its gradient at N unit normals n.
+        """Compute the irradiance and its gradient at N unit normals n.
+
+        The irradiance is c + a · n + p(n), with the constant c, the vector a and the
+        polynomial p of this object.
 
         Args:
             directions: Unit normals n, shape (3, N).

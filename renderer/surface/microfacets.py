@@ -105,7 +105,8 @@ def fresnel(cosine: Tensor) -> Tensor:
 
     SCHLICK is 1 - (1 - cosine)⁵ and EDGE is (1 - cosine)⁵. DIELECTRIC is equation
     22 of Walter et al. (2007), for unpolarized light and the refractive index
-    REFRACTIVE_INDEX.
+    REFRACTIVE_INDEX. In this equation, the perpendicular and the parallel
+    polarization have the common factor (g - c)² / (g + c)², with the cosine c.
 
     Args:
         cosine: Cosine v·h of the angle of incidence, in [0, 1], shape (...).
@@ -119,6 +120,7 @@ def fresnel(cosine: Tensor) -> Tensor:
     # Reflected fraction of the amplitude of light that is polarized perpendicular to the
     # plane of incidence.
     perpendicular = (refracted - cosine) / (refracted + cosine)
+    # Reflected fraction of the amplitude of light that is polarized parallel to this plane.
     numerator = cosine * (refracted + cosine) - 1
     denominator = cosine * (refracted - cosine) + 1
     parallel = perpendicular * numerator / denominator

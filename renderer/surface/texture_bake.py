@@ -222,7 +222,8 @@ class _TextureSheet:
         for charts in np.array_split(np.arange(len(self._faces)), block_count):
             texels = self.charts.texels(charts)
             old_position = texels.position / self.charts.scale
-            # Column and row in the old texture. The modulo is there because it repeats.
+            # Column and row in the old texture. The modulo is there because the texture
+            # repeats.
             old_texel = np.floor(old_position).astype(np.int64) % self._old_size
             old_column, old_row = old_texel.T
             albedo = linear_values[torch.from_numpy(self._old_texture[old_row, old_column]).int()]

@@ -472,7 +472,7 @@ class OperatorStack:
         used_lights = lights.index_select(1, self._coefficients)
         light_table = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
         light_table = light_table.index_copy(0, cell, used_lights)
-        # Axes: operator, slot, coefficient, color.
+        # Axes: operator, slot for one of its images, coefficient, color.
         light_table = light_table.unflatten(0, (len(operators), slot_count))
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]

@@ -144,14 +144,13 @@ class TransferOperator:
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
-            # Separate operations of autograd also give the gradient with respect to the
-            # background.
+            # `_Image` has no gradient with respect to the background, so the image is composed
+            # of differentiable operations.
             images = as_background(background, self.settings.size, lights)
             coverage = self.coverage.to(lights)
             radiance = self.radiance(lights)
             return composite(radiance, coverage, self.pixels, images, self.settings.encoding)
-        # A single operation of autograd is faster. It only gives the gradient with respect
-        # to the lights.
+        # `_Image` is faster, because it is a single operation of autograd.
         return _Image.apply(lights, self, self._prepare_background(background, lights))
 
     def image_and_gradient(
@@ -204,10 +203,10 @@ class TransferOperator:
         if isinstance(background, Tensor):
             background = background.detach()
         prepared = self._prepare_background(background, lights)
-        images, is_unclamped, clamped = self._images(lights, prepared)
+        images, is_unclamped, clamped_values = self._images(lights, prepared)
         image_gradient = loss_gradient(images)
         require_image_gradient(image_gradient, images)
-        gradient = self._gradient_of_images(image_gradient.detach(), is_unclamped, clamped)
+        gradient = self._gradient_of_images(image_gradient.detach(), is_unclamped, clamped_values)
         return images, gradient
 
     def radiance(
@@ -284,10 +283,12 @@ class TransferOperator:
             - the clamped linear values of the distinct pixels, shape (..., 3, D).
         """
         unclamped = self._radiance(lights).add_(background.term)
-        clamped = unclamped.clamp(0, 1)
+        clamped_values = unclamped.clamp(0, 1)
         # 1 for values in [0, 1], including the limits. Only these have a gradient.
-        is_unclamped = unclamped.eq_(clamped)
-        encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
+        is_unclamped = unclamped.eq_(clamped_values)
+        encoded = (
+            clamped_values if self._is_linear else encode(clamped_values, self.settings.encoding)
+        )
         canvas = background.images
         pixel_index = self._pixels_by_color
         image_shape: tuple[int, ...] = self._image_shape
@@ -302,10 +303,10 @@ class TransferOperator:
         else:
             # On a CPU, `scatter_` takes half the time of `index_copy_`.
             images.scatter_(-1, pixel_index, encoded)
-        return images.view(image_shape), is_unclamped, clamped
+        return images.view(image_shape), is_unclamped, clamped_values
 
     def _gradient_of_images(
-        self, image_gradient: Tensor, is_unclamped: Tensor, clamped: Tensor
+        self, image_gradient: Tensor, is_unclamped: Tensor, clamped_values: Tensor
     ) -> Tensor:
         """Convert the gradient of a loss from the images of `_images` to the lights.
 
@@ -314,7 +315,7 @@ class TransferOperator:
                 shape (..., 3, size, size).
             is_unclamped: 1 for values of the D distinct pixels that clamping did not
                 change, and 0 for other values, shape (..., 3, D).
-            clamped: Clamped linear values of the distinct pixels,
+            clamped_values: Clamped linear values of the distinct pixels,
                 shape (..., 3, D).
 
         Returns:
@@ -330,7 +331,7 @@ class TransferOperator:
             # `gather` is faster than `index_select`, most of all for three axes.
             pixel_gradient = flat_gradient.gather(-1, pixel_index)
         if not self._is_linear:
-            pixel_gradient = encode_gradient(clamped, pixel_gradient, self.settings.encoding)
+            pixel_gradient = encode_gradient(clamped_values, pixel_gradient, self.settings.encoding)
         gradient = self._light_gradient(pixel_gradient.mul_(is_unclamped))
         # Checking the few numbers of the result is fast. If one is not finite,
         # `require_bounded` checks the gradient of all pixels and raises the error.
@@ -656,10 +657,10 @@ class _Image(torch.autograd.Function):
         Returns:
             Images in [0, 1], shape (..., 3, size, size).
         """
-        images, is_unclamped, clamped = operator._images(lights, background)
+        images, is_unclamped, clamped_values = operator._images(lights, background)
         ctx.operator = operator
         ctx.is_unclamped = is_unclamped
-        ctx.clamped = clamped
+        ctx.clamped_values = clamped_values
         return images
 
     @staticmethod
@@ -683,7 +684,9 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the result of `backward`. Second derivatives would be wrong, without an error.
+        """Compute the gradient with respect to the lights, without a check for second derivatives.
+
+        A second derivative through this function would be wrong, without an error.
 
         Args:
             ctx: Context of autograd.
@@ -691,9 +694,10 @@ class _Image(torch.autograd.Function):
                 shape (..., 3, size, size).
 
         Returns:
-            The same as `backward`.
+            Gradient, shape (..., coefficients, 3), and None for the other two
+            arguments of `forward`.
         """
-        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped)
+        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped_values)
         return gradient, None, None
 
     # The same function, but a second derivative through it raises an error.

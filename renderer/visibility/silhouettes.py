@@ -262,6 +262,7 @@ class _MovingView:
             selected.distribute(sample_gradients).permute(2, 1, 0).flatten(1).double()
         )
         gradient = positions.new_zeros(positions.shape[::-1])
+        # Without perspective, only the first two coordinates have a gradient.
         coordinate_count = sample_gradients.shape[1]
         gradient[:coordinate_count].index_add_(1, selected.corners.T.flatten(), corner_gradients)
         return gradient.T
@@ -326,6 +327,7 @@ class _MovingView:
         # and for the first samples of the next pixels (after).
         before: Any = (slice(None), slice(samples - 1, -1, samples))
         after: Any = (slice(None), slice(samples, None, samples))
+        # Use the same slices for the rows of the image instead of the columns.
         if dim == 0:
             before = before[::-1]
             after = after[::-1]
@@ -765,6 +767,8 @@ class _Edges(NamedTuple):
 def _edges(face_bytes: bytes) -> _Edges:
     """Find the edges of a mesh.
 
+    Each face has three sides. Sides with the same two vertices are one edge.
+
     Args:
         face_bytes: Bytes of an int64 array with the vertex indices of F faces,
             shape (F, 3). Bytes can be hashed, so that the result can be cached.
@@ -779,8 +783,8 @@ def _edges(face_bytes: bytes) -> _Edges:
     low = np.minimum(start, end).ravel()
     high = np.maximum(start, end).ravel()
     vertex_count = int(high.max()) + 1
-    # Sides with the same two vertices are the same edge. The two vertices are combined to
-    # one number, because `np.unique` sorts numbers faster than pairs.
+    # The two vertices of a side are combined to one number, because `np.unique` sorts
+    # numbers faster than pairs.
     keys, edge_of_face_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )

@@ -83,6 +83,7 @@ class Rasterizer:
         highest = points.max(initial=0)
         if not (np.isfinite(lowest) and np.isfinite(highest)):
             raise ValueError("points has NaN or infinite values: give finite values")
+        # Larger coordinates would not fit into the integers of the rasterizers.
         limit = SPAN / resolution
         if max(-lowest, highest) > limit:
             points = np.clip(points, -limit, limit)

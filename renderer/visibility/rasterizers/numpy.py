@@ -72,6 +72,23 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     return ids
 
 
+class _TriangleRows(NamedTuple):
+    """Rows of the image in which T triangles may cover samples.
+
+    Attributes:
+        triangle_index: Index of each triangle among all triangles of a block,
+            shape (T,).
+        first_row: First row in which each triangle can cover samples,
+            shape (T,).
+        row_count: Number of rows in which each triangle can cover samples,
+            shape (T,).
+    """
+
+    triangle_index: np.ndarray
+    first_row: np.ndarray
+    row_count: np.ndarray
+
+
 def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Compute the smallest key of each sample of one view.
 
@@ -92,35 +109,60 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
     keys = np.full(resolution * resolution, EMPTY_KEY)
     for begin in range(0, len(faces), FACES_PER_BLOCK):
         block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
-        drawn = _cull(positions.take(block, axis=1), resolution, closed)
+        rows = _cull(positions.take(block, axis=1), resolution, closed)
         # Sort the corners of each face, so that two faces with the same corners in another
         # order get exactly the same depth.
-        corners = _sort(block.take(drawn.triangle_index, axis=1))
-        triangles = positions.take(corners, axis=1)
-        edges = _edges(triangles)
-        planes = _planes(triangles, depths.take(corners))
-        face_ids = drawn.triangle_index + begin
-        # One entry for each pair of a triangle and a row of samples that it may cover.
-        for triangle, row in _expand(drawn.row_count):
-            row += drawn.first_row.take(triangle)
-            left, right = _crossings(edges, triangle, row, resolution)
-            x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
-            depth_at_row = depth + (row - y) * slope_y
-            first_offset = left - x
-            first_sample = row * resolution + left
-            face = face_ids.take(triangle)
-            # One entry for each covered sample: the index of its pair of triangle and row,
-            # and the number of steps from the first covered sample of the row.
-            for pair, step in _expand(right - left):
-                offset = first_offset.take(pair) + step
-                exact_depth = depth_at_row.take(pair) + slope_x.take(pair) * offset
-                rounded = np.rint(exact_depth).astype(np.int64)
-                # Depths in front of the near plane are negative. As unsigned integers, they
-                # are larger than FAR, so they become FAR and are not drawn.
-                clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
-                sample_keys = (clipped << FACE_BITS) | face.take(pair)
-                np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
+        corners = _sort(block.take(rows.triangle_index, axis=1))
+        face_ids = rows.triangle_index + begin
+        _draw(
+            keys, positions.take(corners, axis=1), depths.take(corners), rows, face_ids, resolution
+        )
     return keys
+
+
+def _draw(
+    keys: np.ndarray,
+    triangles: np.ndarray,
+    depths: np.ndarray,
+    rows: _TriangleRows,
+    face_ids: np.ndarray,
+    resolution: int,
+) -> None:
+    """Draw T triangles: lower the keys of the samples at which a triangle is nearest so far.
+
+    Args:
+        keys: Smallest key of each sample so far, changed in place, shape (R²,).
+        triangles: Positions (x, y) of the three corners in subsamples,
+            shape (2, 3, T).
+        depths: Depths of the corners, shape (3, T).
+        rows: Rows in which the triangles may cover samples.
+        face_ids: Index of the face of each triangle, shape (T,).
+        resolution: Number R of samples per side.
+    """
+    edges = _edges(triangles)
+    planes = _planes(triangles, depths)
+    # One entry for each pair of a triangle and a row of samples that it may cover.
+    for triangle, row in _expand(rows.row_count):
+        row += rows.first_row.take(triangle)
+        left, right = _crossings(edges, triangle, row, resolution)
+        # Position and depth of the first corner, and slopes of the depth.
+        x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
+        depth_at_row = depth + (row - y) * slope_y
+        # Columns from the first corner to the first covered sample.
+        first_offset = left - x
+        first_sample = row * resolution + left
+        face = face_ids.take(triangle)
+        # One entry for each covered sample: the index of its pair of triangle and row, and
+        # the number of steps from the first covered sample of the row.
+        for pair, step in _expand(right - left):
+            offset = first_offset.take(pair) + step
+            exact_depth = depth_at_row.take(pair) + slope_x.take(pair) * offset
+            rounded = np.rint(exact_depth).astype(np.int64)
+            # Depths in front of the near plane are negative. As unsigned integers, they are
+            # larger than FAR, so they become FAR and are not drawn.
+            clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
+            sample_keys = (clipped << FACE_BITS) | face.take(pair)
+            np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
 
 
 def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -157,24 +199,7 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
     return positions, depths
 
 
-class _Drawn(NamedTuple):
-    """Rows of the image in which T triangles may cover samples.
-
-    Attributes:
-        triangle_index: Index of each triangle among all triangles of a block,
-            shape (T,).
-        first_row: First row in which each triangle can cover samples,
-            shape (T,).
-        row_count: Number of rows in which each triangle can cover samples,
-            shape (T,).
-    """
-
-    triangle_index: np.ndarray
-    first_row: np.ndarray
-    row_count: np.ndarray
-
-
-def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
+def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _TriangleRows:
     """Find the triangles that can cover samples, and their rows.
 
     By the top-left rule, a sample on an edge belongs to the triangle to the
@@ -200,7 +225,7 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
     # areas.
     is_facing = areas < 0 if closed else areas != 0
     index = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
-    return _Drawn(
+    return _TriangleRows(
         triangle_index=index,
         first_row=first[1].take(index),
         row_count=counts[1].take(index),
@@ -321,7 +346,9 @@ def _crossings(
     short_edge = triangle + (1 + is_below_middle) * triangle_count
     crossed_edges = np.stack([triangle, short_edge])
     slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed_edges, axis=1)
-    # The operator // rounds down. The minus sign before it makes the result round up.
+    # Each row crosses an edge at the column -(slope · row + constant) / height. The first
+    # column after it is this number, rounded up. The operator // rounds down, but the minus
+    # sign before it makes the result round up.
     columns = (-((slope * row + constant) // height)).clip(0, resolution)
     return np.minimum(*columns), np.maximum(*columns)
 
