@@ -236,7 +236,7 @@ class Harmonics(Basis):
         Args:
             coefficients: SH coefficients of the lights, shape (..., size, 3). With
                 `within`, the shape is (A, size, 3).
-            within: A norm-balls, one for each light, in which the results must
+            within: Norm balls, one for each of A lights, in which the results must
                 lie. Their centers must have no negative radiance. None for no
                 ball.
 
@@ -373,8 +373,8 @@ class LocalBasis(Basis):
         Args:
             coefficients: RGB coefficients, shape (..., size, 3). With `within`, the
                 shape is (A, size, 3).
-            within: A norm-balls, one for each row of the coefficients, in which the
-                results must lie, too. None for no ball.
+            within: Norm balls, one for each of A lights, in which the results must
+                lie, too. None for no ball.
 
         Returns:
             Nearest coefficients, in the same shape.

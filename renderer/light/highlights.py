@@ -107,8 +107,7 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
         degree: Degree of the light.
         roughness: Roughness of the smoothest surface, in [0, 1]. Values below
             MIN_ROUGHNESS count as MIN_ROUGHNESS.
-        width: Width α of the highlight, divided by the width roughness² that
-            belongs to the roughness.
+        width: Factor for the width α = roughness² of the highlight.
 
     Returns:
         Factor of each coefficient, float64, shape ((degree + 1)²,). The first

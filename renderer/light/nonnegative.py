@@ -259,8 +259,8 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
         coefficients: SH coefficients of the lights, shape (..., (degree + 1)², C)
             with C color channels. With `within`, the shape is
             (A, (degree + 1)², C) for A lights.
-        within: A norm-balls, one for each light, in which the results must lie.
-            Their centers must be non-negative lights. The norm "l2" is taken over
+        within: Norm balls, one for each of the A lights, in which the results must
+            lie. Their centers must be non-negative lights. The norm "l2" is taken over
             all channels of a light together. None for no ball.
 
     Returns:

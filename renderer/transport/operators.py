@@ -911,7 +911,7 @@ class _OperatorBuilder:
         )
 
     def _is_uniform_on_faces(self, surface: Surface, channels: _Channels) -> bool:
-        """Tell whether two pixels that the same face fills have the same rows of the matrix.
+        """Tell whether two pixels that the same face fills have the same values in the matrix.
 
         This needs flat normals, a matte surface in which all colors share a
         channel, no shadows, no lamps and no projectors.
