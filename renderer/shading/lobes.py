@@ -112,8 +112,8 @@ class ViewFrame(NamedTuple):
 
     @property
     def cosine(self) -> Tensor:
-        """Cosine n·v at the samples, shape (S,). Negative values count as 0."""
-        # The direction v is the z-axis of the sample axes.
+        """Cosine of the angle between normal and view direction, at least 0, shape (S,)."""
+        # The direction to the camera is the z-axis of the sample axes.
         return self.normals[2].clamp(0, 1)
 
     def harmonics(self, lobes: Tensor) -> Tensor:
