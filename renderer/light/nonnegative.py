@@ -680,7 +680,7 @@ def _step_down(directions: Array, derivatives: Array) -> Array:
     radial_derivative = directions[:, None] @ gradient
     sphere_hessian = tangents @ hessian @ tangents.mT - radial_derivative * np.eye(2)
     curvature, eigenvectors = np.linalg.eigh(sphere_hessian)
-    # Two unit tangents along which the second derivatives are the eigenvalues.
+    # The two unit tangents along which `curvature` holds the second derivatives.
     principal_axes = eigenvectors.mT @ tangents
     slope = (principal_axes @ gradient)[..., 0]
     # A Newton step is the slope divided by the curvature. This lower limit of the divisor

@@ -214,6 +214,8 @@ class SampleGloss(NamedTuple):
         if not metal_terms:
             return None, white
         schlick, edge = metal_terms
+        # A metal reflects the fraction albedo · SCHLICK + EDGE. The color of the light stays
+        # unchanged in the second term.
         return self.metallic * schlick, white + self.metallic * edge
 
     def reflect_uniform_light(

@@ -944,7 +944,8 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
     # The light is at the angle `camera_angle` + 2 θ_h from the normal, which must be at
     # most π/2.
     largest_polar = (math.pi / 2 - camera_angle) / 2
-    # Value of ψ for the largest polar angle, with a new axis for the nodes.
+    # The nodes are spaced in the variable ψ, for which tan θ_h = α tan ψ with the polar
+    # angle θ_h. This is its largest value, with a new axis for the nodes.
     largest_psi = (largest_polar.tan() / alpha).atan()[:, None]
     # Map the nodes from [-1, 1] to [0, largest ψ]. Axes: camera direction, node, azimuth.
     psi = largest_psi * (node + 1) / 2

@@ -203,7 +203,7 @@ def _group_sides(
     # Sides with equal rows belong to the same patch.
     keys = np.hstack([np.floor(centers / cell_width), np.rint(normals), facing])
     _, patch_of_side = np.unique(keys, axis=0, return_inverse=True)
-    # NumPy 2.0.0 returns the inverse with the shape (S, 1), which `ravel` mends.
+    # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
     return patch_of_side.ravel()
 
 
