@@ -19,7 +19,8 @@ GRADIENT = "gradient"
 RANDOM_SEARCH = "random_search"
 CMA_ES = "cma_es"
 OPTIMIZERS = (GRADIENT, RANDOM_SEARCH, CMA_ES)
-# Queries of each example by an optimizer without gradients.
+# Default number of images that an optimizer without gradients shows to the classifier for each
+# example.
 DEFAULT_QUERIES = 1000
 
 
@@ -81,12 +82,16 @@ class RelightingSettings(Settings):
 
     @property
     def radius(self) -> float:
-        """Radius of the L∞ ball of the logarithm of the factors."""
+        """Largest magnitude of the logarithm of a factor of the projected light."""
         return math.log(self.gain)
 
     @property
     def steps(self) -> int:
-        """Number of steps along the gradient. The last image needs a forward pass of its own."""
+        """Number of steps along the gradient.
+
+        A step takes a forward and a backward pass. The image after the last step takes another
+        forward pass.
+        """
         return (self.passes - 1) // 2
 
 
@@ -94,9 +99,9 @@ class RelightingSettings(Settings):
 class AttackSettings(ParameterSettings):
     """Attacked parameters, and the optimizer, restarts and checks of an attack.
 
-    The defaults are careful: the lighting stays physically possible, and a success survives the
-    noise of a camera and its 8 bits. The paper has allow_negative=True, margin=0, quantized=False
-    and sensor_noise=0.
+    By default, the lighting stays physically possible, and a success must survive the noise of a
+    camera and the rounding to 8 bits. The paper has allow_negative=True, margin=0,
+    quantized=False and sensor_noise=0.
     """
 
     optimizer: str | None = setting(
@@ -130,7 +135,9 @@ class AttackSettings(ParameterSettings):
     )
     margin: float = setting(
         2.0,
-        "Stop an example when the adversarial logit leads by this margin in every view.",
+        "Stop an example when, in every view, the logit gap is at least this large: the target "
+        "logit minus the largest other logit or, without a target, the largest other logit minus "
+        "the logit of the true class.",
         minimum=0,
         maximum=MAX_SCALE,
     )
@@ -145,9 +152,9 @@ class AttackSettings(ParameterSettings):
     )
     noise_margin: float | None = setting(
         None,
-        "Continue with an example until its smallest lead, with noise and without, is this many "
-        "times the range of these leads. null is 2 if the pose or the material is attacked, "
-        "and otherwise 0.",
+        "Continue with an example until sensor noise changes its logit gap little: the smallest "
+        "gap, with noise and without, must be this many times the range of the gaps. null is 2 if "
+        "the pose or the material is attacked, and otherwise 0.",
         minimum=0,
         maximum=MAX_SCALE,
     )
@@ -167,6 +174,11 @@ class AttackSettings(ParameterSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check that the settings do not contradict each other.
+
+        Raises:
+            InputError: If two parameters set the same light, or if restarts lack a norm-ball.
+        """
         super().__post_init__()
         if self.lighting and self.skylight:
             raise InputError("lighting and skylight both set the light: choose one of them")
@@ -185,27 +197,34 @@ class AttackSettings(ParameterSettings):
 
     @property
     def query_limit(self) -> int | None:
-        """The `max_queries` in use. None for no limit."""
+        """Largest number of images that an example may show to the classifier. None for no limit.
+
+        It is `max_queries`. If that is None, optimizers without gradients have a default limit.
+        """
         if self.max_queries is not None or self.uses_gradients:
             return self.max_queries
         return DEFAULT_QUERIES
 
     @property
     def step_limit(self) -> int:
-        """The largest number of steps, which is `max_steps`, or without gradients one per query."""
+        """Largest number of steps.
+
+        An optimizer without gradients has no limit of its own: it takes at most one step for each
+        query, which is an image that it shows to the classifier.
+        """
         if self.uses_gradients:
             return self.max_steps
         return self.query_limit or 0
 
     def with_budget(self, factor: int) -> Self:
-        """Return settings with so many times as many steps and queries."""
+        """Return settings whose largest numbers of steps and queries are multiplied by a factor."""
         query_limit = self.query_limit
         max_queries = None if query_limit is None else factor * query_limit
         return replace(self, max_steps=factor * self.max_steps, max_queries=max_queries)
 
     @property
-    def lead_over_noise(self) -> float:
-        """Return the `noise_margin` to apply, which is 0 without noise."""
+    def applied_noise_margin(self) -> float:
+        """Return the number that `noise_margin` stands for. It is 0 if `sensor_noise` is 0."""
         if not self.sensor_noise:
             return 0.0
         if self.noise_margin is not None:

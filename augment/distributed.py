@@ -1,4 +1,4 @@
-"""Divides examples among the processes of a distributed training, and gathers their results."""
+"""Divide examples among the processes of a distributed training, and gather their results."""
 
 import torch
 import torch.distributed as dist
@@ -11,21 +11,21 @@ def world_size() -> int:
 
 
 def rank() -> int:
-    """Return the number of this process, counted from 0."""
+    """Return the index of this process among those that train together, counted from 0."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def shard(total: int, rank: int, world_size: int) -> Tensor:
-    """Return the examples of one process.
+    """Select the examples that one of several processes works on.
 
     Args:
-        total: The number of examples, at least 1.
-        rank: The number of the process, counted from 0.
-        world_size: The number of processes.
+        total: Number of examples, at least 1.
+        rank: Index of the process, counted from 0.
+        world_size: Number of processes.
 
     Returns:
-        Ascending indices, int64: every `world_size`-th example, and at least
-        one, even if another process has it, too.
+        Indices of every `world_size`-th example, int64. If there are more
+        processes than examples, several processes get the same example.
 
     Example:
         >>> shard(5, rank=1, world_size=2)
@@ -35,20 +35,22 @@ def shard(total: int, rank: int, world_size: int) -> Tensor:
 
 
 def all_gather_rows(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tensor:
-    """Gather the rows of all examples from all processes.
+    """Collect the results for all examples from all processes.
 
     Args:
-        part: The rows of this process, shape (A, ...).
-        examples: The examples of these rows, shape (A,), int64.
-        total: The number of examples of all processes.
-        world_size: The number of processes.
+        part: Results of this process, one row for each of A examples, shape
+            (A, ...).
+        examples: Index of each of these A examples, shape (A,), int64.
+        total: Number of examples of all processes.
+        world_size: Number of processes.
 
     Returns:
-        The rows of all examples, shape (total, ...), the same in every process.
+        One row for each example, shape (total, ...). Every process gets the
+        same rows.
     """
     if world_size == 1:
         return part
-    # These entries are placeholders. `all_gather_object` replaces entry i by what
+    # Make a list with an entry for each process. `all_gather_object` replaces entry i by what
     # process i sends.
     parts = [(part, examples)] * world_size
     dist.all_gather_object(parts, (part.cpu(), examples.cpu()))

@@ -1,8 +1,8 @@
 """Losses: the cost that an attack decreases, and the losses of training.
 
 A label is the index of a class. A complementary label says that an image does not show a class. It
-is written as −1 − class. If there are several positive classes, `absent` contains the other classes
-that images with a complementary label do not show, either.
+is the number −1 − class. If there are several positive classes, the argument `absent` contains the
+other classes that images with a complementary label do not show, either.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from renderer.errors import require_range
 
-# Stands for "no class" as a source or target. No complementary label has this value.
+# Index that stands for "no class" in attacks without a source or a target class. It differs from
+# all labels.
 NO_CLASS = -(10**9)
 
 
@@ -24,11 +25,11 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
     entropy.
 
     Args:
-        logits: The logits of N images, shape (N, classes).
-        source: The class that each image is led away from, int64, shape (N,). NO_CLASS leaves the
-            first term out.
-        target: The class that each image is led to, int64, shape (N,). NO_CLASS leaves the second
-            term out, and so does None for all images.
+        logits: Logits of N images, shape (N, classes).
+        source: Class whose probability the attack lowers in each image, int64, shape (N,).
+            NO_CLASS omits the first term.
+        target: Class whose probability the attack raises in each image, int64, shape (N,).
+            NO_CLASS omits the second term of an image. None omits it for all images.
 
     Returns:
         The cost of each image, shape (N,).
@@ -36,7 +37,7 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
     Raises:
         InputError: If a source class has no logit.
     """
-    # NO_CLASS is negative. `clamp` turns it into class 0, which passes the check.
+    # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
     require_known(source.clamp(min=0), logits)
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
     if target is not None:
@@ -45,32 +46,37 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """Compute by how much an attack's criterion is reached.
+    """Compute by how much logits reach the aim of an attack.
+
+    With a target class, the logit gap is the logit of the target minus the largest other logit.
+    Without one, it is the largest logit of the other classes minus the logit of the source class.
+    It is positive if the attack succeeds, and negative if it does not.
 
     Args:
-        logits: The logits, shape (..., classes).
-        source: The class to lead away from, shape (...).
-        target: The class to lead to, shape (...). NO_CLASS or None is no target.
+        logits: Logits of images in any number of dimensions, shape (..., classes).
+        source: Source class of each image, shape (...).
+        target: Target class of each image, shape (...). NO_CLASS stands for no target of an
+            image, and None for no target of all images.
 
     Returns:
-        The lead of the target's logit over all others. Without a target, the lead of the best
-        other class over the source. It is negative if the criterion is not reached. Shape (...).
+        Logit gap of each image, shape (...).
     """
-    wanted = torch.full_like(source, NO_CLASS) if target is None else target
-    has_no_target = wanted == NO_CLASS
-    # The target if there is one, or else the source, shape (..., 1).
-    compared_class = torch.where(has_no_target, source, wanted)[..., None]
-    best_of_others = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
-    # Lead of the compared class. An attack without a target wants the source not to lead.
-    lead = logits.gather(-1, compared_class)[..., 0] - best_of_others
-    return torch.where(has_no_target, -lead, lead)
+    if target is None:
+        target = torch.full_like(source, NO_CLASS)
+    has_target = target != NO_CLASS
+    # Class whose logit is compared with the others, shape (..., 1).
+    compared_class = torch.where(has_target, target, source)[..., None]
+    compared_logit = logits.gather(-1, compared_class)[..., 0]
+    largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
+    difference = compared_logit - largest_other
+    return torch.where(has_target, difference, -difference)
 
 
 def complementary_label(label: int) -> int:
     """Return the complementary label of a class.
 
     Args:
-        label: The class that it does not show.
+        label: Class that images with the complementary label do not show.
 
     Returns:
         The complementary label, −1 − label.
@@ -82,11 +88,11 @@ def require_known(labels: Tensor, logits: Tensor) -> None:
     """Check that every label has a logit.
 
     Args:
-        labels: The labels, int64, shape (N,).
-        logits: The logits, shape (N, classes).
+        labels: Labels, also complementary ones, int64, shape (N,).
+        logits: Logits, shape (N, classes).
 
     Raises:
-        InputError: If a label is of a class beyond those of the logits.
+        InputError: If the class of a label is not below the number of classes.
     """
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
@@ -99,28 +105,29 @@ def label_loss(
 ) -> Tensor:
     """Compute the loss of each image by its label.
 
-    The loss is the cross entropy for a class c. For a label that is complementary to c, it is
-    −log(1 − p), where p is the sum of the probabilities of c and of the classes `absent`.
+    An image of class c has the label c. Its loss is the cross entropy. An image that does not
+    show class c has the complementary label −1 − c. Its loss is −log(1 − p), where p is the sum
+    of the probabilities of c and of the classes `absent`.
 
     Args:
-        logits: The logits, shape (N, classes).
-        labels: The labels, int64, shape (N,).
-        label_smoothing: The label smoothing of the cross entropy, at least 0 and below 1.
-        absent: Further classes that images of a complementary label do not show.
+        logits: Logits, shape (N, classes).
+        labels: Labels, int64, shape (N,).
+        label_smoothing: Label smoothing of the cross entropy, at least 0 and below 1.
+        absent: Further classes that images with a complementary label do not show.
 
     Returns:
-        The losses, shape (N,).
+        Losses, shape (N,).
     """
-    classes = _class_of(labels)[:, None]
-    # A logit of -∞ is a probability of 0, so these logits leave out the classes that an image
-    # with a complementary label does not show.
-    logits_of_others = logits.scatter(1, classes, -torch.inf)
+    classes = _class_of(labels)
+    # Set the logits of the classes that are not shown to -∞. Only the logits of the other
+    # classes remain.
+    other_logits = logits.scatter(1, classes[:, None], -torch.inf)
     for index in absent:
-        logits_of_others[:, index] = -torch.inf
-    # This is -log(1 - p), where 1 - p is the sum of the probabilities of the other classes.
-    complementary = logits.logsumexp(1) - logits_of_others.logsumexp(1)
+        other_logits[:, index] = -torch.inf
+    # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
+    complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
     cross_entropy = F.cross_entropy(
-        logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing
+        logits, classes, reduction="none", label_smoothing=label_smoothing
     )
     return torch.where(labels < 0, complementary, cross_entropy)
 
@@ -142,70 +149,74 @@ def log_odds(logits: Tensor, label: int) -> Tensor:
 
 
 def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
-    """Compute the loss of ranking the images of a class before all others.
+    """Compute the pairwise ranking loss of a class (RankNet, Burges et al. 2005).
 
-    It is the mean of log(1 + exp(o − p)) over all pairs of an image of the class, with log-odds
-    p, and another image, with log-odds o. It is a smooth upper bound of 1 − AUC, up to a factor
-    (RankNet, Burges et al. 2005).
+    It is low if the images of the class have higher log-odds than all other images. It is the
+    mean of log(1 + exp(n − p)) over all pairs of an image of the class, with log-odds p, and an
+    image of another class, with log-odds n. Up to a factor, it is a smooth upper bound of 1 − AUC.
 
     Args:
-        logits: The logits, shape (N, classes).
-        labels: The labels, int64, shape (N,).
-        label: The class.
+        logits: Logits, shape (N, classes).
+        labels: Labels, int64, shape (N,).
+        label: The class that is to rank first.
 
     Returns:
         The loss, a scalar. It is 0 if there is no pair.
     """
     odds = log_odds(logits, label)
     is_of_class = labels == label
-    # The first axis is the image of the class, and the second the other image, shape (N, N).
-    is_pair = is_of_class[:, None] & ~is_of_class
-    losses = F.softplus(odds - odds[:, None]) * is_pair
+    # Rows are images of the class, columns are images of other classes, shape (N, N).
+    is_pair = is_of_class[:, None] & ~is_of_class[None, :]
+    losses = F.softplus(odds[None, :] - odds[:, None]) * is_pair
     return losses.sum() / is_pair.sum().clamp(min=1)
 
 
 def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
-    """Compute the divergence of a network's predictions from the predictions of another network.
+    """Compute the distillation loss (Hinton et al. 2015) at temperature 1.
 
-    This is the Kullback–Leibler divergence Σ q log(q / p) of the probabilities p of the network
-    from the probabilities q of the other one: the loss of distillation (Hinton et al. 2015) at
-    temperature 1.
+    It is the Kullback–Leibler divergence Σ q log(q / p), summed over the classes, where p are the
+    probabilities of the student and q are those of the teacher.
 
     Args:
-        logits: The logits of the network, shape (N, classes).
-        predictions: The logits of the other network, shape (N, classes).
+        logits: Logits of the student, the network that is trained, shape (N, classes).
+        predictions: Logits of the teacher, shape (N, classes).
 
     Returns:
-        The divergence of each image, shape (N,).
+        Divergence for each image, shape (N,).
     """
-    terms = F.kl_div(
-        logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True
-    )
+    student = logits.log_softmax(1)
+    teacher = predictions.log_softmax(1)
+    terms = F.kl_div(student, teacher, reduction="none", log_target=True)
     return terms.sum(1)
 
 
 def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
     """Return a mask of the predictions that agree with the labels.
 
-    A prediction agrees with a complementary label if it is another class than the one that the
-    image does not show, and none of the classes `absent`.
+    A label that is a class demands the prediction of this class. The complementary label
+    −1 − c says that the image does not show class c. It demands a prediction that is neither c
+    nor one of the classes `absent`.
 
     Args:
-        predicted: The predicted classes, int64, shape (N,).
-        labels: The labels, int64, shape (N,).
-        absent: Further classes that images of a complementary label do not show.
+        predicted: Predicted classes, int64, shape (N,).
+        labels: Labels, int64, shape (N,).
+        absent: Further classes that images with a complementary label do not show.
 
     Returns:
-        Mask of the predictions, bool, shape (N,).
+        Mask of the correct predictions, bool, shape (N,).
     """
     is_complementary = labels < 0
-    # For a complementary label, a prediction of its class is wrong instead of right.
-    right = (predicted == _class_of(labels)) != is_complementary
+    is_class_of_label = predicted == _class_of(labels)
+    is_absent = torch.zeros_like(is_class_of_label)
     for index in absent:
-        right = right & (~is_complementary | (predicted != index))
-    return right
+        is_absent = is_absent | (predicted == index)
+    return torch.where(
+        is_complementary,
+        ~is_class_of_label & ~is_absent,
+        is_class_of_label,
+    )
 
 
 def _class_of(labels: Tensor) -> Tensor:
-    """Return the class of each label. A complementary label gives the class that is not shown."""
+    """Return the class c of each label, which is c or, if it is complementary, −1 − c."""
     return torch.where(labels < 0, -1 - labels, labels)

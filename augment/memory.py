@@ -10,17 +10,20 @@ MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine he
 GROUP = Path("/sys/fs/cgroup")  # Linux writes the memory limit of a container here (cgroup v2).
 GIB = 2**30
 
-# Numbers that an attack on the light keeps in memory beside the operators.
-# `NUMBERS_PER_LIGHT_VALUE` counts for each coefficient of each example,
-# `NUMBERS_PER_PIXEL` for each pixel of all images. The last two count for each
-# pixel of the images that are rendered at once.
+# An attack on the light keeps about so many numbers in memory for each coefficient of the light of
+# each example.
 NUMBERS_PER_LIGHT_VALUE = 12
+# An attack on the light keeps about so many numbers in memory for each pixel of all images.
 NUMBERS_PER_PIXEL = 10
+# An attack on the light also keeps about so many numbers for each pixel of the images that are
+# rendered at the same time.
 NUMBERS_PER_RENDERED_PIXEL = 16
+# The same number, if effects of a camera such as blur and noise are rendered, too: an attack keeps
+# so many numbers for each pixel of the images that are rendered at the same time.
 NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
 
-# Bytes that an operator takes for each pixel and each coefficient of the light:
-# two channels of float32.
+# Bytes of the linear operator from light to image, for each pixel and each coefficient of the
+# light: two channels of float32.
 OPERATOR_BYTES = 8
 
 
@@ -51,7 +54,7 @@ def has_memory(needed: int, device: torch.device) -> bool:
         device: Device on which they are needed.
 
     Returns:
-        True also if the system does not tell how much memory is free.
+        Whether enough bytes are free. True also if the amount of free memory is unknown.
     """
     free = free_memory(device)
     return free is None or needed <= free
@@ -64,10 +67,10 @@ def free_memory(device: torch.device) -> int | None:
         device: The device.
 
     Returns:
-        The number of bytes. None if the system does not say.
+        The number of bytes. None if it is unknown.
     """
     if device.type == "cuda":
-        # Memory that torch has reserved and does not use is free for torch.
+        # torch reserves memory that it does not use yet. This memory is free for torch.
         reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + reserved
     try:
@@ -78,7 +81,8 @@ def free_memory(device: torch.device) -> int | None:
     try:
         limit = int((GROUP / "memory.max").read_text())
         used = int((GROUP / "memory.current").read_text())
-    # There is no such file outside containers. Without a limit, it contains "max".
+    # Outside of a container, the files do not exist. A container without a limit has the text
+    # "max" in the first file, which is not a number.
     except (OSError, ValueError):
         return free
     return min(free, limit - used)
@@ -90,13 +94,15 @@ def attack_bytes(
     lights: torch.Tensor,
     camera_effects: bool,
 ) -> int:
-    """Estimate the memory that an attack on the light of a scene takes beside the operators.
+    """Estimate the memory that an attack on the light of a scene takes.
+
+    The linear operators from light to image are not counted.
 
     Args:
-        pixels: The pixels of all images, on one channel.
-        pixels_at_once: The pixels of the images that are rendered at once.
-        lights: The light of each example, shape (E, coefficients, 3).
-        camera_effects: Whether effects of a camera follow the renders.
+        pixels: Number of pixels of all images.
+        pixels_at_once: Number of pixels of the images that are rendered at the same time.
+        lights: RGB coefficients of the light of each of E examples, shape (E, coefficients, 3).
+        camera_effects: Whether effects of a camera, such as blur and noise, are rendered.
 
     Returns:
         The number of bytes.
@@ -111,11 +117,11 @@ def attack_bytes(
 
 
 def operator_bytes(degree: int, pixels: int) -> int:
-    """Estimate the memory of the operators that map light to images.
+    """Estimate the memory of the linear operators that map light to images.
 
     Args:
-        degree: The degree of the light.
-        pixels: The pixels of all views.
+        degree: Degree of the spherical harmonics of the light.
+        pixels: Number of pixels of all images.
 
     Returns:
         The number of bytes.

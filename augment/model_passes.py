@@ -1,4 +1,4 @@
-"""Chooses the batch size of passes through a classifier, and restores the classifier's state."""
+"""Choose the batch size of passes through a classifier, and restore the state of the classifier."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -17,24 +17,24 @@ Result = TypeVar("Result")
 
 @dataclass
 class BatchSize:
-    """Number of images per pass through a classifier. It is halved when memory runs out.
+    """Number of images that a classifier sees at a time. It is halved when memory runs out.
 
     Attributes:
-        images: The number of images, at least 1. It does not grow again.
+        images: Number of images, at least 1. It does not grow again.
     """
 
     images: int
 
     def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
-        """Compute results for consecutive slices of some images.
+        """Call a function for one batch of images after the other.
 
         Args:
-            compute: A function of a slice of the images. Where memory runs out,
-                it is called again with half of the slice.
-            total: The number of images.
+            compute: A function of a slice, which selects the images of a batch.
+                If memory runs out, it is called again with half of the slice.
+            total: Number of all images.
 
         Yields:
-            The result of each slice, in order.
+            The result of each call, in order.
 
         Raises:
             Exception: Whatever `compute` raises, also if memory runs out on a
@@ -58,28 +58,27 @@ class BatchSize:
                 yield result
                 begin = part.stop
                 continue
-            # The cache is emptied only after the error is gone, because the
-            # error keeps the tensors of the slice.
+            # Empty the cache outside of the `except` block, because the error refers to tensors
+            # there.
             torch.cuda.empty_cache()
 
 
 @cache
 def warn_once(images: int) -> None:
-    """Warn that passes have fewer images, once for each number of images."""
+    """Warn that memory ran out and batches have fewer images, once for each number of images."""
     logger = logging.getLogger(__name__)
     logger.warning("memory ran out: the attack goes on with %d images per pass", images)
 
 
 @contextmanager
 def eval_mode(model: nn.Module) -> Iterator[None]:
-    """Set a model to eval mode inside a `with` block, and restore the mode of each module after it.
+    """Set a model to eval mode in a `with` block, and restore the mode of each module afterwards.
 
     Args:
-        model: The model. A frozen layer of it may have another mode than the
-            rest.
+        model: The model. Its modules may have different modes.
     """
     training = [module for module in model.modules() if module.training]
-    # Setting the mode of a large network takes as long as rendering an image.
+    # `eval` of a large network takes as long as rendering an image, so call it only if needed.
     if training:
         model.eval()
     try:
@@ -91,7 +90,7 @@ def eval_mode(model: nn.Module) -> Iterator[None]:
 
 @contextmanager
 def frozen_eval_mode(model: nn.Module) -> Iterator[None]:
-    """Set a model to eval mode, without gradients of its parameters, inside a `with` block.
+    """Set a model to eval mode, without gradients of its parameters, in a `with` block.
 
     The mode of each module, `requires_grad` of each parameter and the state of
     the global random generators are restored after the block.

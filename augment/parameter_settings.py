@@ -19,20 +19,18 @@ NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
 MAX_JOINT_ANGLE = 180.0  # degrees
 
-# Parts of a pose without the joints, in the order in which an attack on the pose
-# stores them. `PoseSettings` has a field of the same name for each part: the unit
-# in which the attack measures this part.
+# Names of the fields of `PoseSettings` that have the units of an attack on the pose, except
+# `joints`.
 POSE_PARTS = ("rotation", "shift", "scale", "view", "distance")
 
-# The four values of an attack on the material, in the order in which the attack
-# stores them. `MaterialSettings` has a field of the same name for each value: the
-# unit in which the attack measures this value.
+# Names of the fields of `MaterialSettings` that have the units of the four values of an attack on
+# the material, in the order of these values.
 MATERIAL_PARTS = ("roughness", "metallic", "specular_factor", "hue")
 
 
 @dataclass
 class StepSettings(Settings):
-    """Norm-ball around the start of an attack, and the steps of gradient descent within it.
+    """Norm-ball around the values at which an attack starts, and steps of gradient descent in it.
 
     The radii of the paper (Section 4.1) are 0.1 per coefficient of the lighting and 0.002 per
     axis of a vertex, both with norm="linf".
@@ -42,8 +40,9 @@ class StepSettings(Settings):
     'unit'
 
     Attributes:
-        needs_noise_margin: Whether adversaries often end where the noise of a
-            camera decides about success (see `AttackSettings.noise_margin`).
+        needs_noise_margin: Whether attacks on this quantity often find images
+            that sensor noise makes correct again. Such attacks need the
+            `AttackSettings.noise_margin`.
     """
 
     needs_noise_margin: ClassVar[bool] = False
@@ -67,11 +66,11 @@ class StepSettings(Settings):
 
 @dataclass
 class SkylightSettings(StepSettings):
-    """Attack on the sun and the air of a clear sky, and where it starts.
+    """Attack on the position of the sun and the haze of a clear sky, and the initial sky.
 
-    A radius of 1 allows a change of the zenith angle and of the azimuth by `sun` degrees, and a
-    change of the turbidity by 4. With the default of `sun`, a radius of 0.1 allows changes by 5.7
-    degrees and by 0.4. Step sizes have the same units.
+    Attack values are the angles of the sun divided by `sun`, and the turbidity divided by 4. With
+    the default of `sun` and the norm "linf", a radius of 0.1 permits changes of the angles by 5.7
+    degrees, and of the turbidity by 0.4. Step sizes have the same units.
     """
 
     zenith: float = setting(
@@ -103,8 +102,8 @@ class SkylightSettings(StepSettings):
 class PoseSettings(StepSettings):
     """Attack on the pose of the object and of the camera.
 
-    Each part of the pose is measured in the unit that its field gives. A part with the unit 0
-    stays as it is.
+    An attack value of 1 changes a part of the pose, such as the rotation, by the number in the
+    field of this part. 0 leaves the part as it is.
     """
 
     needs_noise_margin = True
@@ -149,6 +148,11 @@ class PoseSettings(StepSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check the limits of the joints, and that the attack can change something.
+
+        Raises:
+            InputError: If a limit is not a number of degrees, or if all settings are 0.
+        """
         super().__post_init__()
         limits = self.joints if isinstance(self.joints, Mapping) else {"joints": self.joints}
         for name, degrees in limits.items():
@@ -157,7 +161,8 @@ class PoseSettings(StepSettings):
                 raise InputError(message, "joints")
             argument = "joints" if name == "joints" else f"joints.{name}"
             require_range(argument, degrees, 0, MAX_JOINT_ANGLE)
-        if not any([*limits.values(), *(getattr(self, name) for name in POSE_PARTS)]):
+        units = [getattr(self, name) for name in POSE_PARTS]
+        if not any([*limits.values(), *units]):
             raise InputError(
                 f"{', '.join(POSE_PARTS)} and joints "
                 "are all 0, so the pose cannot change: set one of them above 0",
@@ -168,8 +173,8 @@ class PoseSettings(StepSettings):
 class MaterialSettings(StepSettings):
     """Attack on the specular material and the hue of the object.
 
-    Each part is measured in the unit that its field gives. A part with the unit 0 stays as it
-    is. See `nb.Gloss` for roughness, metallic and strength.
+    An attack value of 1 changes a part of the material, such as the roughness, by the number in
+    the field of this part. 0 leaves the part as it is. `nb.Gloss` explains the parts.
     """
 
     needs_noise_margin = True
@@ -211,10 +216,10 @@ class MaterialSettings(StepSettings):
 
 @dataclass
 class ParameterSettings(Settings):
-    """Settings of each quantity that an attack can change; None leaves the quantity as it is.
+    """Settings of each quantity that an attack can change.
 
-    Where several quantities are changed, they are applied in the order of these
-    fields.
+    None leaves a quantity as it is. If several quantities are changed, they are
+    changed in the order of these fields.
     """
 
     lighting: StepSettings | None = setting(None, "Attack on the coefficients of the lighting.")
@@ -230,7 +235,7 @@ class ParameterSettings(Settings):
 
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        """Return the settings of the attacked parameters by name."""
+        """Return the settings of the quantities that are attacked, by their names."""
         named = {name: getattr(self, name) for name in PARAMETER_NAMES}
         return {name: settings for name, settings in named.items() if settings is not None}
 

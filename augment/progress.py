@@ -1,4 +1,4 @@
-"""Progress bars for long work, and timers for its phases."""
+"""Progress bars for long computations, and timers for their phases."""
 
 import sys
 import time
@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from augment.distributed import rank
 
-PATIENCE = 2.0  # Seconds before the first sign of progress.
+PATIENCE = 2.0  # Seconds before a progress bar is shown.
 Item = TypeVar("Item")
 
 
@@ -23,18 +23,18 @@ def progress(
     total: int | None = None,
     done: int = 0,
 ) -> Iterator[Item]:
-    """Yield items, and show a bar on a terminal that says how many of them are done.
+    """Yield items, and show on a terminal how many of them are done.
 
-    The bar stands on the standard error stream. It appears after `PATIENCE`
-    seconds, even if no item is done by then, and is removed at the end. Nothing
-    is written if the stream is a file or a pipe. If there are several processes,
-    only the first one shows the bar.
+    A bar appears on the standard error stream after `PATIENCE` seconds, even if
+    no item is done by then, and is removed at the end. Nothing is written if the
+    stream is a file or a pipe. If there are several processes, only the first
+    one shows the bar.
 
     Args:
         items: The items.
         description: What is done with the items, such as "saving".
-        total: The number of items, if they have no length.
-        done: The number of items that were done before.
+        total: Number of items. Needed only if `items` has no length.
+        done: Number of items that were done before.
 
     Yields:
         Each item.
@@ -49,7 +49,7 @@ def progress(
         disable=not is_shown,
         initial=done,
     )
-    # tqdm alone shows a bar only after the first item.
+    # tqdm would not show a bar before the first item is done.
     timer = Timer(PATIENCE, _show, [bar])
     timer.daemon = True
     if is_shown:
@@ -61,14 +61,14 @@ def progress(
 
 
 def _show(bar: "tqdm[Item]") -> None:
-    """Show a bar before its first item is done. It updates itself afterwards."""
+    """Show a progress bar of tqdm at once, even if no item is done."""
     bar.delay = 0
     bar.refresh()
 
 
 @contextmanager
 def progress_message(description: str) -> Iterator[None]:
-    """Show the bar of `progress` during a `with` block.
+    """Show a progress bar with a description during a `with` block.
 
     Args:
         description: What the block does, such as "loading the network".
@@ -78,10 +78,11 @@ def progress_message(description: str) -> Iterator[None]:
 
 
 class Phases:
-    """Timer that adds up wall-clock seconds per named phase. Phases may nest.
+    """Timer that adds up the seconds of named parts of a computation. Parts may nest.
 
     Args:
-        device: The device whose work is waited for at both ends of a phase.
+        device: Device of the computation. At the beginning and the end of a
+            part, the timer waits until this device is idle.
 
     Example:
         >>> phases = Phases()
@@ -97,10 +98,10 @@ class Phases:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Add the seconds of a `with` block to a phase.
+        """Measure the seconds of a `with` block, and add them to those of a part.
 
         Args:
-            name: The name of the phase.
+            name: Name of the part of the computation.
         """
         start = self._now()
         try:
@@ -109,13 +110,13 @@ class Phases:
             self._seconds[name] += self._now() - start
 
     def take(self) -> dict[str, float]:
-        """Return the seconds of each phase since the last call, and start again from zero."""
+        """Return the seconds of each part since the last call, and start again from zero."""
         seconds = dict(self._seconds)
         self._seconds.clear()
         return seconds
 
     def _now(self) -> float:
-        """Return the time in seconds, after the device has done its work."""
+        """Wait until the device is idle, and return the time in seconds."""
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return time.perf_counter()

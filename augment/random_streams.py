@@ -1,4 +1,4 @@
-"""Independent streams of random numbers, one for each key."""
+"""Independent sequences of random numbers, each of which is identified by a key."""
 
 import zlib
 
@@ -7,11 +7,12 @@ import torch
 
 
 def stream_seed(*key: int | str) -> int:
-    """Return the seed of a random stream.
+    """Compute the seed of a sequence of random numbers from a key.
 
     Args:
-        key: What the stream is for, such as (seed of a run, epoch, "order").
-            Different keys give independent streams.
+        key: Numbers and names that tell what the random numbers are for, such as
+            the seed of a run, an epoch and "order". Different keys give
+            independent random numbers.
 
     Returns:
         A seed of 63 bits.
@@ -28,9 +29,10 @@ def stream_seed(*key: int | str) -> int:
 
 
 def generator(*key: int | str) -> torch.Generator:
-    """Return a new CPU generator at the beginning of the random stream of a key.
+    """Return a new CPU generator of random numbers, whose seed is computed from a key.
 
     Args:
-        key: What the stream is for; see `stream_seed`.
+        key: Numbers and names that tell what the random numbers are for, see
+            `stream_seed`.
     """
     return torch.Generator().manual_seed(stream_seed(*key))

@@ -1,7 +1,6 @@
-"""Regenerate labeled renders for a training loop.
+"""Labeled renders for a training loop, which are rendered again from time to time.
 
-In each regeneration, the renders are attacked with the current weights of the network, or their
-lighting is drawn at random.
+Each such regeneration attacks the current weights of the network, or draws the lighting at random.
 """
 
 from __future__ import annotations
@@ -47,27 +46,27 @@ from renderer.validation import (
     require_whole,
 )
 
-# Largest number of successful examples of a regeneration that `select_examples_to_log` keeps for
-# figures.
+# Largest number of successfully attacked renders that are kept for figures each time that the
+# renders of a training run are made.
 SHOWN_EXAMPLES = 4
-# Largest number of random renders of a regeneration that are classified for diagnostics. With this
-# number, the standard error of a success rate is at most 0.032.
+# Largest number of random renders that are classified to estimate the error rate. The standard
+# error of this estimate is at most 0.032.
 CLASSIFIED = 250
 
 
 @dataclass(frozen=True)
 class AttackExamples:
-    """S successful examples of a regeneration, before and after the attack.
+    """S renders for which an attack during training succeeded, to be shown in figures.
 
-    On the first axis of images, lights and predictions, index 0 is before the attack
+    The first axis of images, lights and predictions is the time: index 0 is before the attack,
     and index 1 is after it.
 
     Attributes:
         images: Images in [0, 1], shape (2, S, 3, H, W).
-        lights: Coefficients of the lights, shape (2, S, basis.size, 3).
+        lights: RGB coefficients of the light, shape (2, S, basis.size, 3).
         predictions: Probabilities of the C classes, shape (2, S, C).
         labels: Labels, shape (S,), int64.
-        basis: Basis of the lights.
+        basis: Basis of the light.
     """
 
     images: Tensor
@@ -83,9 +82,9 @@ class AttackExamples:
 
 @dataclass(frozen=True)
 class Renders(Dataset[tuple[Tensor, int]]):
-    """The labeled images of a regeneration, which are also a data set of PyTorch.
+    """Labeled renders for training, as a data set of PyTorch.
 
-    The data set holds pairs of an image on the CPU and a label as an int. It
+    An item is a pair of an image on the CPU and a label as an int. The data set
     can be concatenated with other data whose labels are ints. Labels that are
     tensors, as in a `TensorDataset`, must be converted to ints before, because
     PyTorch's `DataLoader` cannot mix both types in a batch.
@@ -93,9 +92,9 @@ class Renders(Dataset[tuple[Tensor, int]]):
     Attributes:
         images: Images in [0, 1], shape (E, 3, H, W).
         labels: Labels, shape (E,), int64.
-        diagnostics: Plain numbers about the regeneration.
-        attack_examples: A few successful examples before and after the
-            attack. None if nothing is rendered.
+        diagnostics: Numbers about the attack, such as its success rate, by name.
+        attack_examples: A few successfully attacked renders, before and after
+            the attack. None if nothing is rendered.
 
     Example:
         >>> tensors = torch.utils.data.TensorDataset(torch.rand(2, 3, 8, 8), torch.tensor([0, 1]))
@@ -123,26 +122,29 @@ class Renders(Dataset[tuple[Tensor, int]]):
 
 @dataclass(eq=False, repr=False)
 class AugmentationService:
-    """Renders the examples of a scene for a training loop, again in each regeneration.
+    """Source of labeled renders for a training loop.
 
-    With `settings.warm_start`, each attack begins with the result of the
-    previous one.
+    Each call of `regenerate` renders the examples of the scene again, attacked
+    with the current weights of the network or in random lighting. With
+    `settings.warm_start`, each attack starts at the result of the previous one.
 
     Attributes:
         settings: Settings of the augmentation.
-        scene: Scene with one view for each of E examples. None if nothing is
+        scene: Scene of E examples with one view each. None if nothing is
             rendered.
-        labels: Labels, shape (E,), int64, as in `augment.losses`.
+        labels: Labels of the examples, shape (E,), int64. They may be
+            complementary, see `augment.losses`.
         seed: Seed of all random numbers.
         phases: Timer of the attacks.
-        positive_classes: The positive classes. Examples of all other labels, which are
-            hard negatives, are attacked towards one of these classes in turn.
-            Without positive classes, every attack leads away from the class of
-            its example.
+        positive_classes: Classes that the network must tell from all others. The
+            examples of other classes are attacked until they are classified as
+            one of these, which take turns. If the list is empty, every example
+            is attacked until it is misclassified.
         rank: Index of this process among those that train together. Each
-            process attacks its share of the examples and gets all renders.
+            process attacks a part of the examples, and gets all renders.
         world_size: Number of these processes.
-        images: Images of `mode="folder"`, shape (E, 3, H, W), uint8.
+        images: Images of a folder that replace the renders with
+            `mode="folder"`, shape (E, 3, H, W), uint8.
     """
 
     settings: AugmentationSettings
@@ -157,7 +159,7 @@ class AugmentationService:
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Check the arguments, and raise the degree of the lighting to what the settings need.
+        """Check the arguments, and raise the degree of the lighting if the settings need it.
 
         Raises:
             InputError: If an argument has the wrong type or shape, or if the
@@ -175,7 +177,7 @@ class AugmentationService:
         if self.scene is not None and self.labels.shape != (len(self.scene),):
             raise InputError(
                 f"labels has shape {tuple(self.labels.shape)}: "
-                f"give one of each of {len(self.scene)} examples",
+                f"give one label for each of the {len(self.scene)} examples",
             )
         if self.images is not None:
             self.images = self._checked_images(self.images)
@@ -192,13 +194,10 @@ class AugmentationService:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 
     def _checked_images(self, images: Tensor) -> Tensor:
-        """Convert the images of a folder to a tensor, and check dtype and shape.
+        """Convert images to a tensor, and check its dtype and shape.
 
         Args:
             images: Tensor or array, which must be uint8 of shape (E, 3, H, W) for E labels.
-
-        Returns:
-            The images.
 
         Raises:
             InputError: If the images have another dtype or shape.
@@ -221,14 +220,14 @@ class AugmentationService:
         seed: int = 0,
         **of_scene: Any,
     ) -> AugmentationService:
-        """Build a service for any training loop, by default with the renders of the paper.
+        """Build a source of renders for any training loop, with a scene as in the paper.
 
-        There is an example for each mesh, camera and background.
+        There is a render for each mesh, camera and background.
 
         Args:
             meshes: Pairs of a mesh and the index of its class. A mesh is a
                 file, solid:NAME or a `Mesh`.
-            size: Pixels per side.
+            size: Pixels per side of the renders.
             settings: Settings of the augmentation.
             seed: Seed of all random numbers.
             of_scene: Further arguments of `build_scene`. By default, there are
@@ -239,8 +238,8 @@ class AugmentationService:
             The service.
 
         Raises:
-            InputError: If an argument has the wrong type, or as by
-                `build_scene`.
+            InputError: If an argument has the wrong type, or if `build_scene`
+                refuses one.
 
         Example:
             >>> from torch import nn
@@ -277,7 +276,7 @@ class AugmentationService:
         return cls(settings, scene, labels, seed, Phases(labels.device))
 
     def __len__(self) -> int:
-        """Return the number of examples of a regeneration."""
+        """Return the number of renders that `regenerate` returns."""
         if self.images is None:
             return len(self.labels) if self.settings.renders else 0
         if self.settings.examples is None:
@@ -285,22 +284,22 @@ class AugmentationService:
         return self.settings.examples
 
     def regenerate(self, model: nn.Module, number: int) -> Renders:
-        """Generate examples for the current weights of a model.
+        """Make the renders for the current weights of a network.
 
-        The mode, the gradients and the random state of the model are restored
-        afterwards.
+        The mode, the gradient flags and the random state of the network are
+        restored afterwards.
 
         Args:
             model: A network from images (N, 3, size, size) in [0, 1] to logits.
-            number: Index of the regeneration, counted from 0 in a run. The
-                random numbers depend on this index and on the seed alone, so
+            number: How often the renders were made before in this run. The
+                random numbers depend on this number and on the seed alone, so
                 that a resumed run repeats them.
 
         Returns:
-            The examples.
+            The labeled renders.
 
         Raises:
-            InputError: If the model fails, or has no logit for a label.
+            InputError: If the network fails, or has no logit for a label.
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
         require_seed("number", number)
@@ -319,13 +318,14 @@ class AugmentationService:
         return self._adversarial(model, problem, number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the state of the service, with which a run can be resumed.
+        """Return the state of the service, so that a run can be resumed with it.
 
         Returns:
             Dictionary with these entries:
             - "scene": hash of the scene, which `load_state_dict` compares;
-            - "values": with `warm_start`, the D attack values of each example
-              after the last attack, shape (E, D). The next attack starts there.
+            - "values": only with `warm_start`: the D attack values of each
+              example after the last attack, shape (E, D). The next attack
+              starts there.
         """
         state = {"scene": self._scene_hash}
         if self._last_values is not None:
@@ -333,14 +333,14 @@ class AugmentationService:
         return state
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the result of `state_dict`.
+        """Restore a state of the service.
 
         Args:
             state: A result of `state_dict`.
 
         Raises:
-            InputError: If the state is not a result of `state_dict`, or if the
-                scene of its service was another one.
+            InputError: If the state is not a result of `state_dict`, or if it
+                belongs to a service with another scene.
         """
         expected = "the result of state_dict of a service with the same scene"
         require_kind("state", state, Mapping, expected)
@@ -377,21 +377,22 @@ class AugmentationService:
         return torch.tensor(list(digest), dtype=torch.uint8)
 
     def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
-        """Select and classify the images of a regeneration from the images of a folder.
+        """Select the next images of a folder in place of renders, and classify some of them.
 
-        The regenerations go through the folder in passes. A pass shows each image once, in a
-        random order of its own. A regeneration may begin and end within a pass.
+        The images are shown in passes through the folder, each in another random order. A
+        selection may begin in one pass and end in another.
 
         Args:
             model: The network.
             images: All images of the folder, uint8, shape (F, 3, H, W).
-            number: Index of the regeneration.
+            number: How many selections were made before.
 
         Returns:
             The selected images.
         """
         image_count = len(images)
-        # Positions of the first and the last selected image in the sequence of all passes.
+        # Imagine all passes one after the other. These are the positions of the first and the
+        # last selected image.
         first = number * len(self)
         last = first + len(self) - 1
         first_pass = first // image_count
@@ -410,12 +411,12 @@ class AugmentationService:
     def _random(
         self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
     ) -> Renders:
-        """Render all examples with random attack values.
+        """Render all examples with random values of the parameters, such as random lighting.
 
         Args:
             model: The network, which classifies some of the images.
-            problem: The scene of E examples, and the parameters that are drawn.
-            number: Index of the regeneration.
+            problem: The scene of E examples, and the parameters whose values are random.
+            number: How often the renders were made before.
             shard: Indices of the examples that this process renders. The other processes
                 render the other examples.
 
@@ -432,18 +433,18 @@ class AugmentationService:
     def _classify(
         self, model: nn.Module, images: Tensor, labels: Tensor
     ) -> tuple[Tensor, dict[str, float]]:
-        """Classify up to `CLASSIFIED` evenly spaced images.
+        """Classify up to `CLASSIFIED` of the images, evenly spaced, to estimate the error rate.
 
         Args:
             model: The network.
             images: Images in [0, 1], shape (E, 3, H, W).
-            labels: Their labels, shape (E,).
+            labels: Labels of the images, shape (E,).
 
         Returns:
-            Mask of the images that were classified and are misclassified,
-            shape (E,). Also the diagnostics "attack_success", the fraction of
-            the classified images that are misclassified, and "loss", their
-            mean loss.
+            Two values:
+            - A mask of the images that are known to be misclassified, shape (E,).
+            - The diagnostics "attack_success", the fraction of the classified images that are
+              misclassified, and "loss", their mean loss.
         """
         count = min(CLASSIFIED, len(labels))
         rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
@@ -466,7 +467,7 @@ class AugmentationService:
         Args:
             model: The network to attack.
             problem: The scene of E examples, and the parameters that the attack changes.
-            number: Index of the regeneration.
+            number: How often the renders were made before.
             shard: Indices of the examples that this process attacks. The other processes
                 attack the other examples.
 
@@ -503,7 +504,7 @@ class AugmentationService:
             )
         # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, shard)
-        # From here on, the result has the examples of all processes.
+        # Replace the result of this process by the results of all processes.
         parts = [getattr(result, item.name) for item in fields(result)]
         result = DescentResult(*[self._gather(part, shard) for part in parts])
         if self.settings.warm_start:
@@ -528,29 +529,29 @@ class AugmentationService:
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(self, part: Tensor, shard: Tensor) -> Tensor:
-        """Join rows of examples that several processes have computed.
+        """Collect what all processes have computed, each for some of the E examples.
 
         Args:
-            part: Rows of this process, one for each example of its shard, shape (A, ...).
-            shard: Indices of the A examples of this process among all E, shape (A,).
+            part: Results of this process, one row for each of its A examples, shape (A, ...).
+            shard: Index of each of these A examples among all E, shape (A,).
 
         Returns:
-            Rows of all E examples, shape (E, ...).
+            One row for each of the E examples, shape (E, ...).
         """
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
         """Return the source and the target class of each example.
 
-        Without positive classes, an attack leads away from the label. With positive classes, an
-        example of a positive class has no target, and the targets of the other examples are the
-        positive classes in turn.
+        The attack on an example is untargeted (it lowers the probability of the label) if there
+        are no positive classes, or if the label is a positive class. The targets of all other
+        examples are the positive classes in turn.
         """
         if not self.positive_classes:
             return Criterion(self.labels[:, None])
         positive_classes = torch.tensor(self.positive_classes, device=self.labels.device)
-        # A negative label is a complementary label: it says which class the example does
-        # not have. Such an example has no source class.
+        # A negative label says which class an example does not show. Such an example has no
+        # source class.
         source = torch.where(self.labels < 0, NO_CLASS, self.labels)
         indices = torch.arange(len(self.labels), device=self.labels.device)
         target_in_turn = positive_classes[indices % len(positive_classes)]
@@ -559,15 +560,17 @@ class AugmentationService:
         return Criterion(source[:, None], target[:, None])
 
     def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
-        """Return the attack values with which a regeneration begins.
+        """Return the attack values at which the next attack starts.
+
+        With `warm_start`, they are the values at which the previous attack ended. With
+        `init="random"`, they are random. Otherwise they are those of the scene.
 
         Args:
-            problem: The scene of E examples and the attacked parameters.
-            number: Index of the regeneration.
+            problem: The scene of E examples, and the attacked parameters.
+            number: How often the renders were made before.
 
         Returns:
-            The last values of the previous attack with `warm_start`, random values with
-            `init="random"`, or else the start of the problem, shape (E, D).
+            D values of each example, shape (E, D).
         """
         if self._last_values is not None:
             return self._last_values
@@ -576,21 +579,21 @@ class AugmentationService:
         return problem.start
 
     def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        """Draw values of all attacked parameters of a regeneration.
+        """Draw random values of all attacked parameters.
 
         Args:
-            problem: The scene of E examples and the attacked parameters.
-            number: Index of the regeneration.
+            problem: The scene of E examples, and the attacked parameters.
+            number: How often the renders were made before. It selects the random numbers.
 
         Returns:
-            Feasible values in the norm-balls, shape (E, D).
+            D feasible values of each example in the norm-balls, shape (E, D).
         """
         settings = self.settings.random_light
         parts = []
         for parameter, start in problem.split_by_parameter(problem.start):
             if parameter.name == "lighting":
-                # `perturb` adds random changes to a light. Of a light that is zero, only these
-                # changes remain.
+                # `perturb` returns a light plus random changes. Give it a light of zero, to get
+                # the changes alone.
                 no_light = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
                 offsets = perturb(no_light, len(start), settings.amplitude, settings.radius, draws)
@@ -602,7 +605,11 @@ class AugmentationService:
 
 
 def _describe_scene(scene: Scene) -> list[object]:
-    """Describe objects, cameras, backgrounds and lights by plain values and rounded numbers."""
+    """Return a description of a scene that is the same on all machines, to be hashed.
+
+    It contains texts, whole numbers and rounded numbers about objects, cameras, backgrounds and
+    lights.
+    """
     described: list[object] = [scene.settings.size, scene.settings.encoding, str(scene.basis)]
     for item in scene.objects:
         extent = item.mesh.vertices.std(axis=0)
@@ -621,15 +628,15 @@ def _describe_scene(scene: Scene) -> list[object]:
 
 
 def _rounded(values: Iterable[float]) -> list[str]:
-    """Write numbers with three digits, so that rounding errors do not change the text."""
+    """Format numbers with three digits, so that rounding errors do not change the texts."""
     return [f"{float(value):.3g}" for value in values]
 
 
 class CheckedNetwork(nn.Module):
-    """Network of the training loop whose outputs are checked.
+    """Wrap a network, and check that it returns one row of logits for each image.
 
     Attributes:
-        model: The network.
+        model: The network, from images to logits.
     """
 
     def __init__(self, model: nn.Module):
@@ -643,10 +650,10 @@ class CheckedNetwork(nn.Module):
         self._call_network = NetworkCall("model")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of images.
+        """Return the logits of images, shape (N, 3, H, W).
 
         Raises:
-            InputError: If the network fails or its outputs cannot be logits.
+            InputError: If the network fails, or if its outputs cannot be logits.
         """
         return self._call_network(self.model, images)
 
@@ -658,18 +665,22 @@ def select_examples_to_log(
     success: Tensor,
     labels: Tensor,
 ) -> AttackExamples:
-    """Select up to `SHOWN_EXAMPLES` successful examples, and render and classify them.
+    """Select a few successfully attacked examples for a figure, and render and classify them.
+
+    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful
+    examples.
 
     Args:
         model: The network. Its state is restored afterwards.
-        problem: The attack on E examples of one view each.
-        values: The D values of each example after the attack, shape (E, D).
-        success: Whether the attack succeeded, shape (E,), bool.
-        labels: Labels, shape (E,).
+        problem: The scene of E examples with one view each, and the attacked
+            parameters.
+        values: D attack values of each example after the attack, shape (E, D).
+        success: Whether the attack on each example succeeded, shape (E,), bool.
+        labels: Label of each example, shape (E,).
 
     Returns:
-        The selected examples, which are evenly spaced among the successful
-        ones.
+        Images, lights and predictions of the selected examples, before and
+        after the attack.
     """
     successful = torch.nonzero(success).squeeze(1)
     count = min(SHOWN_EXAMPLES, len(successful))
@@ -698,15 +709,15 @@ def select_examples_to_log(
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """Compute how much each condition of the examples changed from before an attack.
+    """Compute by how much an attack changed the light, the vertices and other conditions.
 
     Args:
-        problem: The attack on E examples.
-        values: Attack values after the attack, shape (E, D).
+        problem: The scene of E examples, and the attacked parameters.
+        values: D attack values of each example after the attack, shape (E, D).
 
     Returns:
-        Diagnostics such as "light_change": the L2 norm of the change of an example, averaged
-        over the examples. Conditions that are None are left out.
+        Diagnostics such as "light_change": the L2 norm of the change, averaged over the
+        examples. Conditions that the attack does not change, which are None, are left out.
     """
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)

@@ -39,16 +39,16 @@ MODES = {
 INITS = ("scene", "random")
 UP_AXES = ("auto", "y", "z")
 MAX_EXAMPLES = 10**6
-MAX_INTERVAL = 10**9  # training images between two regenerations
-MAX_PROP_DISTANCE = 10.0  # position and size of props in world units
+MAX_INTERVAL = 10**9  # Training images between two times when the renders are made again.
+MAX_PROP_DISTANCE = 10.0  # Largest distance and size of meshes beside an object, in world units.
 MAX_PROJECTOR_PIXELS = 256  # per side
 MAX_BLUR = 1.5  # pixels
-# Limits of the field of view in degrees. The camera comes nearer as the field of
-# view grows, and beyond 45 degrees it could be inside of a normalized mesh.
+# Limits of a random field of view in degrees. The larger it is, the closer is the camera. Beyond
+# 45 degrees, the camera could be inside of a mesh that spans [-1, 1].
 MIN_FOV = 1.0
 MAX_FOV = 45.0
-UNCHANGED = (1.0, 1.0)  # Default range of factors: the factor is always 1.
-NONE = (0.0, 0.0)  # Default range of amounts: the amount is always 0.
+UNCHANGED = (1.0, 1.0)  # Range of a factor that is always 1.
+NONE = (0.0, 0.0)  # Range of a number that is always 0.
 
 
 @dataclass
@@ -70,19 +70,26 @@ class MeshSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check the gloss and the color of the mesh.
+
+        Raises:
+            InputError: If one of them is not valid.
+        """
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
         super().__post_init__()
         expected = "give [roughness, metallic, specular factor] in [0, 1]"
         if self.gloss == "file" and self.mesh.startswith("solid:"):
-            raise InputError(f"gloss=file: {self.mesh} has none of its own, {expected}", "gloss")
+            raise InputError(
+                f"gloss=file, but {self.mesh} is not a file with a material: {expected}", "gloss"
+            )
         if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
             raise InputError(f"gloss={self.gloss}: {expected}, or file", "gloss")
         require_color("color", self.color)
 
 
 def _is_gloss(values: object) -> bool:
-    """Return whether a value is a list of one to three numbers from 0 to 1."""
+    """Return whether a value is a list of one to three numbers in [0, 1], such as a gloss."""
     if not isinstance(values, Sequence) or isinstance(values, str):
         return False
     return 1 <= len(values) <= 3 and all(is_number(item) and 0 <= item <= 1 for item in values)
@@ -106,7 +113,7 @@ def require_color(name: str, color: Sequence[float] | None) -> None:
 
 @dataclass
 class PropSettings(MeshSettings):
-    """A mesh beside the object, on the same ground."""
+    """A prop: a mesh beside the object, on the same ground. It is never attacked."""
 
     at: list[float] = setting(
         REQUIRED,
@@ -134,8 +141,8 @@ class PropSettings(MeshSettings):
 class ObjectSettings(MeshSettings):
     """One object of a scene.
 
-    Props are in the image, too, and cast and receive the shadows of the object, but they are
-    never attacked.
+    It may have props, which are meshes beside it. They are rendered with their shadows, but they
+    are never attacked.
 
     >>> import norm_balls as nb
     >>> nb.ObjectSettings("solid:orange", label="orange").albedo_scale
@@ -149,21 +156,25 @@ class ObjectSettings(MeshSettings):
     props: list[Any] = setting([], "Meshes beside the object, as mappings or PropSettings.")
 
     def __post_init__(self) -> None:
+        """Convert the props, which are meshes beside the object, to settings.
+
+        Raises:
+            InputError: If a prop is neither a mapping nor `PropSettings`.
+        """
         super().__post_init__()
         for index, prop in enumerate(self.props):
             if isinstance(prop, Mapping):
                 self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
             elif not isinstance(prop, PropSettings):
                 raise InputError(
-                    f"props[{index}] is {describe(prop)}: "
-                    "give mappings, or a list of nb.PropSettings",
+                    f"props[{index}] is {describe(prop)}: give a mapping or nb.PropSettings(...)",
                     "props",
                 )
 
 
 @dataclass
 class ProjectorSettings(Settings):
-    """A projector and the pattern with which attacks start."""
+    """A projector, and the pattern that it shows before an attack."""
 
     pixels: int = setting(
         16, "Pixels per side of its pattern.", minimum=1, maximum=MAX_PROJECTOR_PIXELS
@@ -190,7 +201,7 @@ class ProjectorSettings(Settings):
 
 @dataclass
 class LampsSettings(Settings):
-    """Lamps, which are points or, with a radius, discs."""
+    """Lamps at given positions. They are points or, if they have a radius, discs."""
 
     positions: list[Any] = setting(
         [[2.0, 2.0, 2.0], [2.0, -2.0, 2.0], [-2.0, 2.0, 2.0], [-2.0, -2.0, 2.0]],
@@ -256,13 +267,13 @@ class SceneSettings(Settings):
         "more than 10,000.",
         minimum=0,
         maximum=MAX_VERTICES,
-        checks_type=False,  # Python code may give a float, such as 1e4.
+        checks_type=False,  # A float such as 1e4 is valid, too.
     )
     light: str = setting(
         "grace",
         "Environment lighting: grace, eucalyptus, st_peters, uniform, an environment map "
         "(.npy, .hdr, .exr) or coefficients (.json).",
-        checks_type=False,  # Python code may give a tensor of coefficients.
+        checks_type=False,  # A tensor of coefficients is valid, too.
     )
     degree: int | None = setting(
         None,
@@ -274,7 +285,8 @@ class SceneSettings(Settings):
     exposure: float = setting(
         1.0, "Factor of the lighting.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
     )
-    # OmegaConf cannot set a part of an optional dataclass, so these two are converted below.
+    # `projector` and `lamps` are dictionaries that `__post_init__` converts to settings, because
+    # OmegaConf cannot set a single field of an optional dataclass.
     projector: Any = setting(
         None,
         "A projector: {pixels: 16, polar: 45, azimuth: 45, distance: 4, fov: 30, power: 1, "
@@ -296,7 +308,16 @@ class SceneSettings(Settings):
 
 
 def _as_settings(name: str, value: object, kind: type[Settings]) -> Settings | None:
-    """Convert a mapping to settings. None and settings stay as they are."""
+    """Convert a mapping to settings. None and settings are returned as they are.
+
+    Args:
+        name: Name of the value, for the error.
+        value: Mapping, settings or None.
+        kind: Class of the settings.
+
+    Raises:
+        InputError: If the value is something else.
+    """
     if isinstance(value, Mapping):
         return settings_from(kind, value, name)
     if value is None or isinstance(value, kind):
@@ -311,7 +332,7 @@ class RendererSettings(Settings):
     rasterizer: str = setting(
         "auto",
         "Rasterizer: auto (numba if it is installed, otherwise numpy), opengl, numba or numpy.",
-        checks_type=False,  # Python code may give a `Rasterizer`.
+        checks_type=False,  # A `Rasterizer` is valid, too.
     )
     samples: int | None = setting(
         None,
@@ -332,7 +353,7 @@ class RendererSettings(Settings):
             require_choice("rasterizer", self.rasterizer, RASTERIZERS)
 
     def image(self, size: int) -> ImageSettings:
-        """Return the settings of an image of `size` pixels per side."""
+        """Return the settings of images with a size in pixels per side."""
         return ImageSettings(
             size=size,
             samples=samples_per_side(self.samples, self.silhouettes),
@@ -346,7 +367,7 @@ class RendererSettings(Settings):
 
 @dataclass
 class SpecularLayerSettings(Settings):
-    """A dielectric specular layer on each object, drawn anew for each render."""
+    """Ranges of a random specular layer, such as varnish, that each object gets in each render."""
 
     roughness: list[float] = setting(
         [0.4, 0.8],
@@ -366,10 +387,10 @@ class SpecularLayerSettings(Settings):
 
 @dataclass
 class CameraEffectSettings(Settings):
-    """Random effects of a camera on each render.
+    """Random effects of a camera and of a projected pattern on each render.
 
-    For `white_balance`, `blur` and `noise`, the setting is an upper limit. The
-    strength of each render is drawn uniformly between 0 and this limit.
+    `white_balance`, `blur` and `noise` are upper limits. The strength for each
+    render is drawn uniformly between 0 and the limit.
     """
 
     pattern_fraction: float = setting(
@@ -398,10 +419,10 @@ class CameraEffectSettings(Settings):
 
 @dataclass
 class VariationSettings(Settings):
-    """Ranges from which each regeneration draws pose, lighting and surroundings of a render.
+    """Ranges of the random pose, lighting and surroundings of each render during training.
 
-    By default nothing is drawn, which keeps the grid of the paper. Backgrounds keep the lighting
-    that was drawn, also while an attack changes the lighting of the object.
+    By default nothing is random, as in the paper. An attack changes the lighting of the object
+    only. The background keeps the random lighting.
 
     >>> import norm_balls as nb
     >>> nb.VariationSettings(shift=0.1).moves, nb.VariationSettings(exposure=[0.5, 2.0]).moves
@@ -496,6 +517,11 @@ class VariationSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check the range of the field of view.
+
+        Raises:
+            InputError: If the smallest field of view is too small.
+        """
         super().__post_init__()
         if tuple(self.fov) != NONE and self.fov[0] < MIN_FOV:
             raise InputError(
@@ -506,7 +532,7 @@ class VariationSettings(Settings):
 
     @property
     def moves(self) -> bool:
-        """Return whether views change, so that every regeneration rasterizes them."""
+        """Return whether objects or cameras are random, so that they are rasterized each time."""
         new_objects = self.instances or self.rotation > 0 or any(self.gloss.specular_factor)
         is_scaled = tuple(self.scale) != UNCHANGED
         moved = self.shift > 0 or is_scaled or any((self.azimuth, *self.fov))
@@ -536,9 +562,10 @@ class RandomLightSettings(Settings):
 class TrainingAttackSettings(AttackSettings):
     """Attack during training.
 
-    Unless parameters are named, this is the attack of the paper's appendix C on all coefficients
-    of the lighting: 30 steps of 0.05 along the gradient's direction, with negative lighting
-    permitted, until the classifier errs on images that are not rounded and have no noise.
+    By default, this is the attack of appendix C of the paper, which changes all coefficients of
+    the lighting. It takes 30 steps of length 0.05 along the direction of the gradient, and permits
+    negative radiance. It stops when the classifier is wrong, without sensor noise and without the
+    rounding of images to 8 bits.
     """
 
     step: str = setting_like(StepSettings, "step", "unit")
@@ -551,14 +578,17 @@ class TrainingAttackSettings(AttackSettings):
 
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        """Return the settings of the attacked parameters by name. The default is the lighting."""
+        """Return the settings of the attacked parameters by their names.
+
+        If no parameter is set, the lighting is attacked.
+        """
         lighting = StepSettings(step=self.step, step_size=self.step_size)
         return super().parameters or {"lighting": lighting}
 
 
 @dataclass
 class AugmentationSettings(Settings):
-    """Renders of an augmentation service, and the interval at which they are regenerated.
+    """Renders that augment the training, and how often they are rendered again.
 
     >>> import norm_balls as nb
     >>> random_light = nb.RandomLightSettings(radius=1.5)
@@ -602,10 +632,16 @@ class AugmentationSettings(Settings):
     attack: TrainingAttackSettings = setting(
         TrainingAttackSettings,
         "The attack during training.",
-        checks_type=False,  # Python code may give an `AttackSettings`.
+        checks_type=False,  # `AttackSettings` are valid, too.
     )
 
     def __post_init__(self) -> None:
+        """Check that the settings do not contradict each other.
+
+        Raises:
+            InputError: If the attack changes nothing, if a folder or a radius is missing, or if
+                `warm_start` is combined with random shapes.
+        """
         super().__post_init__()
         if not isinstance(self.attack, AttackSettings):
             raise InputError(
@@ -618,42 +654,49 @@ class AugmentationSettings(Settings):
             )
         if self.mode == "folder" and not self.folder:
             raise InputError(
-                f"folder is {self.folder}, and mode=folder shows its images: name a folder",
+                f"folder is {self.folder}, but mode=folder needs a folder of images: "
+                "set folder, or choose another mode",
                 "folder",
             )
         uses_random_draws = "random" in (self.mode, self.init)
         for name, steps in self.attack.parameters.items():
             if uses_random_draws and name != "lighting" and steps.radius is None:
                 missing = f"attack.{name}.radius"
-                message = f"{missing} is None, which has no random draw: set a radius"
+                message = (
+                    f"{missing} is None, but random values are drawn from the norm-ball: "
+                    "set a radius"
+                )
                 raise InputError(message, missing)
         if self.warm_start and self.vary.instances:
-            message = "warm_start=True keeps the last attack's shapes: set vary.instances=False"
-            raise InputError(message, "warm_start")
+            raise InputError(
+                "warm_start=True continues the last attack, but vary.instances=True changes the "
+                "shapes: set one of them to False",
+                "warm_start",
+            )
 
     @property
     def renders(self) -> bool:
-        """Return whether there are any examples."""
+        """Return whether these settings ask for any renders or other images."""
         return self.mode != "none" and self.examples != 0
 
 
 def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
-    """Compute the views per mesh, so that meshes × views × backgrounds are the examples.
+    """Compute the number of views of each mesh from the number of renders.
 
-    Either count is derived from the other if it is None. The 100 examples of the paper are
-    2 meshes × 10 views × 5 backgrounds.
+    The number of renders is meshes × views × backgrounds. In the paper, these are 2 meshes × 10
+    views × 5 backgrounds = 100 renders.
 
     Args:
-        examples: Number of renders per regeneration.
+        examples: Number of renders. None if it follows from the views.
         objects: Number of meshes.
         backgrounds: Number of backgrounds.
-        views: Number of views per mesh.
+        views: Number of views of each mesh. None if it follows from the renders.
 
     Returns:
-        Number of views per mesh.
+        Number of views of each mesh.
 
     Raises:
-        InputError: If there is no such product.
+        InputError: If the number of renders is not such a product.
     """
     if not objects or not backgrounds:
         raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
@@ -664,7 +707,7 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
         raise InputError(
             f"examples={examples} is not "
             f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds: "
-            "change one of them, or derive one from the other, with None for views or for examples",
+            "change one of these numbers, or set views or examples to None to compute it",
             "examples",
         )
     return derived
@@ -703,19 +746,19 @@ class NormalizedLightSettings(Settings):
     )
 
 
-# Values of `normalize_light`.
+# Type of the argument `normalize_light` of several functions.
 NormalizeLight = bool | Mapping[str, Any] | NormalizedLightSettings | None
 
 
 def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | None:
-    """Read a value of `normalize_light`.
+    """Convert a value of the argument `normalize_light` to settings.
 
     Args:
         value: True for the defaults, a mapping with fields of `NormalizedLightSettings`, or
-            settings. False or None for none.
+            settings. False or None if the light is not to be normalized.
 
     Returns:
-        The settings. None if the light is not normalized.
+        The settings. None if the light is not to be normalized.
 
     Raises:
         InputError: If the value is something else.

@@ -42,6 +42,7 @@ from renderer.surface.texture_bake import with_added_albedo
 from renderer.validation import as_folder
 from renderer.visibility.rasterizers import Rasterizer, choose
 
+# Names of files in the folder of an adversary, and of the images before and after the attack.
 DESCRIPTION = "adversary.json"
 MESH = "mesh.glb"
 LIGHT = "light.json"
@@ -49,31 +50,36 @@ BACKGROUND = "background.png"
 PIXELS = "pixels.npy"
 BEFORE = "before"
 AFTER = "after"
+# Name of the renderer Mitsuba, and of the folder with the scene that it renders.
 MITSUBA = "mitsuba"
+# Height in pixels of the environment maps that are written. The width is twice this number.
 MAP_HEIGHT = 256
 
-# Fraction of the brightest radiance that an .hdr file rounds off.
+# Rounding error of an .hdr file (RGBE), as a fraction of the brightest radiance. Light whose
+# negative radiance is smaller than this counts as not negative.
 RGBE_TOLERANCE = 2.0**-8
 
 
 @dataclass(frozen=True)
 class Adversary:
-    """Example of an attack: V views of one object, with light, shape and images before and after.
+    """All that is needed to render one example after an attack, and its images before and after.
+
+    An example is one object in front of a background, seen from V cameras.
 
     Attributes:
         shown: The object with its attacked shape and colors, in the coordinates
             of the scene.
         cameras: The V cameras.
-        light: Coefficients of the light after the attack, exposure included,
-            shape (size of the basis, 3).
-        basis: Basis of the light.
-        background: Background in [0, 1], shape (3 or 1, size, size).
+        light: RGB coefficients of the light after the attack, multiplied by the
+            exposure, shape (size of the basis, 3).
+        basis: Basis of the light, such as spherical harmonics.
+        background: Background in [0, 1], RGB or gray, shape (3 or 1, size, size).
         settings: Settings of the images.
-        images_in_views_before: Images before the attack, shape
+        images_in_views_before: Images before the attack, in [0, 1], shape
             (V, 3, size, size).
         images_in_views: Images after the attack, of the same shape.
-        pixels: What the attack added to the images, of the same shape. None if
-            it did not change pixels.
+        pixels: Offset of each pixel value by the attack, of the same shape. None
+            if the attack did not change pixels directly.
     """
 
     shown: SceneObject
@@ -88,12 +94,12 @@ class Adversary:
 
     @property
     def images_before(self) -> Tensor:
-        """Images before the attack, (V, 3, size, size), or (3, size, size) of one view."""
+        """Images before the attack, shape (V, 3, size, size), or (3, size, size) if V is 1."""
         return self.images_in_views_before.squeeze(0)
 
     @property
     def images(self) -> Tensor:
-        """Images after the attack, (V, 3, size, size), or (3, size, size) of one view."""
+        """Images after the attack, shape (V, 3, size, size), or (3, size, size) if V is 1."""
         return self.images_in_views.squeeze(0)
 
     @staticmethod
@@ -105,30 +111,33 @@ class Adversary:
         images: Tensor,
         row: int | None = None,
     ) -> Adversary:
-        """Create the adversary of one example of a scene.
+        """Collect one example of a scene after an attack.
 
         Args:
             scene: The attacked scene.
-            example: Index of the example.
-            after: Conditions after the attack.
+            example: Index of the example in the scene.
+            after: Light, shape, colors and pose of some or all examples after
+                the attack.
             before: Images of the V views before the attack, shape
                 (V, 3, size, size).
             images: Images after the attack, of the same shape.
-            row: Row of the example in the conditions. None if the row is the
-                index of the example.
+            row: Index of the example in the first dimension of `after`. None if
+                `after` has all examples of the scene.
 
         Returns:
             The adversary.
         """
         row = example if row is None else row
-        described = scene.examples[example]
-        shown = scene.objects[described.object]
+        scene_example = scene.examples[example]
+        clean_object = scene.objects[scene_example.object]
+        changes = after.row(row, clean_object.mesh)
+        cameras = scene.cameras_under(after, row, example)
         return Adversary(
-            shown=_attacked_object(shown, after.row(row, shown.mesh), scene.settings.encoding),
-            cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
-            light=after.light[row].detach().cpu() * described.exposure,
+            shown=_attacked_object(clean_object, changes, scene.settings.encoding),
+            cameras=tuple(camera.fixed() for camera in cameras),
+            light=after.light[row].detach().cpu() * scene_example.exposure,
             basis=scene.basis_under(after, row),
-            background=scene.backgrounds[described.background].cpu(),
+            background=scene.backgrounds[scene_example.background].cpu(),
             settings=scene.settings,
             images_in_views_before=before.cpu(),
             images_in_views=images.cpu(),
@@ -136,14 +145,11 @@ class Adversary:
         )
 
     def scene(self, rasterizer: Rasterizer, device: torch.device | str = "cpu") -> Scene:
-        """Return a scene with this example only, as it is after the attack.
+        """Build a scene that shows this example after the attack, and nothing else.
 
         Args:
-            rasterizer: The rasterizer of the scene.
-            device: The device of the scene.
-
-        Returns:
-            The scene.
+            rasterizer: Rasterizer with which the scene is rendered.
+            device: Device on which the scene is rendered.
         """
         return Scene(
             objects=[self.shown],
@@ -156,26 +162,26 @@ class Adversary:
         )
 
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
-        """Render the images of the attacked example.
+        """Render the attacked example from its V cameras.
 
         Args:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1] of the V views, shape (V, 3, size, size). If there
-            is one view, the shape is (3, size, size).
+            Images in [0, 1], shape (V, 3, size, size), or (3, size, size) if
+            there is one camera.
         """
         return self.render_views(rasterizer).squeeze(0)
 
     @torch.no_grad()
     def render_views(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
-        """Render the images of the attacked example, see `render`.
+        """Render the attacked example from its V cameras, and keep the dimension of the views.
 
         Args:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1] of the V views, shape (V, 3, size, size), also if V is 1.
+            Images in [0, 1], shape (V, 3, size, size), also if there is one camera.
         """
         if not isinstance(rasterizer, Rasterizer):
             rasterizer = choose(rasterizer or "auto")
@@ -185,17 +191,14 @@ class Adversary:
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
-    """Return a copy of an object after an attack.
+    """Return a copy of an object with the shape, the colors and the gloss after an attack.
 
     Args:
-        item: Object before the attack. Its mesh has V vertices and F faces.
-        changed: Conditions of one example after the attack, without their first dimension:
-            vertices (V, 3), gloss (F, 3), and added albedo (F, 3) with angles of the hue (F,).
-            What is None keeps its value.
-        encoding: Encoding of the images, in which textures are written.
-
-    Returns:
-        The copy.
+        item: Object before the attack. Its mesh has N vertices and F faces.
+        changed: Conditions of one example after the attack: vertices (N, 3), added albedo (F, 3)
+            with the rotation of the hue (F,), and gloss (F, 3). A field that is None changes
+            nothing.
+        encoding: Encoding of the colors of textures, such as "srgb".
     """
     mesh = item.mesh
     albedo_scale = item.albedo_scale
@@ -211,46 +214,36 @@ def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> S
 
 
 def _as_numpy(values: Tensor) -> np.ndarray:
-    """Return values as a float64 array."""
+    """Convert a tensor to an array of float64."""
     return values.detach().cpu().double().numpy()
 
 
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
-    """Write the files of an adversary for `reload`, and a scene for Mitsuba.
+    """Write the files of an adversary: those that `reload` reads, and a scene for Mitsuba.
 
-    The scene for Mitsuba leaves out negative light. Maps are written only of
-    light that is negative nowhere.
+    In the scene for Mitsuba, negative radiance is replaced by 0. Environment
+    maps (.hdr and .exr) are written only if the light is nowhere negative.
 
     Args:
         adversary: The adversary.
         folder: The folder to write.
 
     Returns:
-        "negative_light": the fraction of the energy of the environment light
-        that is negative.
+        A dictionary with the key "negative_light", the fraction of the energy
+        of the environment light that is negative.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = adversary.shown
     settings = adversary.settings
     export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
-    description = {
-        "label": shown.label,
-        "name": Path(shown.name).name,
-        "own_faces": shown.own,
-        "albedo_scale": shown.albedo_scale,
-        "gloss": shown.mesh.gloss is not None,
-        "local_lights": [basis.name for basis, _ in local_lights],
-        "background": _write_background(adversary.background, folder),
-        "cameras": [asdict(camera) for camera in adversary.cameras],
-        ANGLE_UNIT: DEGREES,
-        "image": asdict(settings),
-        "pixels": adversary.pixels is not None,
-    }
+    local_light_names = [basis.name for basis, _ in local_lights]
+    background = _write_background(adversary.background, folder)
     if adversary.pixels is not None:
         write_numbers(folder / PIXELS, adversary.pixels.numpy())
     _write_views(adversary.images_in_views_before, folder, BEFORE)
     _write_views(adversary.images_in_views, folder, AFTER)
+    description = _describe(adversary, local_light_names, background)
     atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     radiance = to_map(light, MAP_HEIGHT)
@@ -270,41 +263,70 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     return {"negative_light": negative_fraction(radiance)}
 
 
+def _describe(
+    adversary: Adversary, local_light_names: list[str], background: float | str
+) -> dict[str, Any]:
+    """Return the content of adversary.json, which has all that is in no other file.
+
+    Args:
+        adversary: The adversary.
+        local_light_names: Names of the local lights, each of which has a file.
+        background: Value of all pixels of the background, or the name of its file.
+    """
+    shown = adversary.shown
+    return {
+        "label": shown.label,
+        "name": Path(shown.name).name,
+        "own_faces": shown.own,
+        "albedo_scale": shown.albedo_scale,
+        "gloss": shown.mesh.gloss is not None,
+        "local_lights": local_light_names,
+        "background": background,
+        "cameras": [asdict(camera) for camera in adversary.cameras],
+        ANGLE_UNIT: DEGREES,
+        "image": asdict(adversary.settings),
+        "pixels": adversary.pixels is not None,
+    }
+
+
 def save_lights(
     folder: Path,
     light: Tensor,
     basis: Basis,
     when: str = "",
 ) -> list[tuple[Any, Tensor]]:
-    """Write light.json, and NAME.json of each local light.
+    """Write the environment light to light.json, and each local light to a file of its name.
+
+    Local lights are the projector and the lamps.
 
     Args:
         folder: The folder to write.
-        light: Coefficients of all lights, shape (size of the basis, 3).
+        light: RGB coefficients of all lights, shape (size of the basis, 3).
         basis: Basis of all lights.
-        when: What follows the name of each file, such as "_before".
+        when: Suffix of the name of each file, such as "_before".
 
     Returns:
         Basis and coefficients of each light, the environment light first.
     """
-    # Each light is a pair of its basis and its coefficients. The environment light is the first.
-    environment, *local_lights = [(part, light[rows]) for rows, part in parts_of(basis)]
-    lights = [environment, *local_lights]
-    names = [Path(LIGHT).stem, *(part.name for part, _ in local_lights)]
-    for name, (part, coefficients) in zip(names, lights, strict=True):
-        save_light(folder / f"{name}{when}.json", coefficients, part)
+    lights = []
+    for rows, basis_of_light in parts_of(basis):
+        coefficients = light[rows]
+        # The first light is the environment.
+        name = basis_of_light.name if lights else Path(LIGHT).stem
+        save_light(folder / f"{name}{when}.json", coefficients, basis_of_light)
+        lights.append((basis_of_light, coefficients))
     return lights
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:
-    """Write a background to a file, unless all of it has one gray value.
+    """Write a background to an image file, except if all its values are the same.
 
     Args:
-        background: Image in [0, 1], shape (3 or 1, size, size).
+        background: RGB or gray image in [0, 1], shape (3 or 1, size, size).
         folder: Folder of the adversary.
 
     Returns:
-        The gray value, or the name of the written file.
+        The value of all pixels, or the name of the written file.
     """
     gray = float(background.flatten()[0])
     if (background == gray).all():
@@ -317,13 +339,13 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
 def _write_views(images: Tensor, folder: Path, name: str) -> None:
     """Write the images of the V views of an adversary.
 
-    One file NAME.npy has the exact values. Files NAME_0.png, NAME_1.png and so on have one
-    view each, with 8 bits per channel.
+    NAME.npy has the exact values of all views. NAME_0.png, NAME_1.png and so on have one view
+    each, with 8 bits per channel.
 
     Args:
         images: Images in [0, 1], shape (V, 3, size, size).
         folder: Folder of the adversary.
-        name: Beginning of the names of the files.
+        name: NAME, such as "before".
     """
     write_numbers(folder / f"{name}.npy", images.numpy())
     for view, image in enumerate(to_bytes(images)):
@@ -356,8 +378,8 @@ def reload(folder: str | Path) -> Adversary:
     try:
         return _read_adversary(folder, json.loads(path.read_text(encoding="utf-8")))
     except InputError as error:
-        # The message may already begin with the file of the folder that is at
-        # fault.
+        # Put the path in front of the message, unless the message begins with a
+        # file of this folder.
         is_named = str(error).startswith(str(folder))
         raise InputError(str(error) if is_named else f"{path}: {error}") from error
     # A damaged file, or JSON of another kind, can raise errors of many types here.
@@ -367,13 +389,21 @@ def reload(folder: str | Path) -> Adversary:
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
-    """Return the adversary of a folder with the given description."""
+    """Read the files of an adversary.
+
+    Args:
+        folder: Folder that `write_adversary` wrote.
+        description: Content of its file adversary.json.
+
+    Raises:
+        InputError: If a file is missing or damaged, or a camera is inside of the mesh.
+    """
     settings = ImageSettings(**description["image"])
     angle_unit = description.get(ANGLE_UNIT)
     cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
     shown = _read_object(folder, description)
     for camera in cameras:
-        # `depths` raises InputError if the camera is inside of the mesh.
+        # This raises InputError if the camera is inside of the mesh.
         camera.depths(shown.mesh.vertices)
     local_lights = []
     for name in description["local_lights"]:
@@ -399,7 +429,13 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 
 
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Create the camera of a description. The keys of the description tell its class."""
+    """Create a camera from its fields in adversary.json.
+
+    Args:
+        description: Fields of a pinhole, perspective or orthographic camera by their names. The
+            names tell the class of the camera.
+        angle_unit: Unit of the angles. None in files of earlier versions.
+    """
     described = angles_in_degrees(description, angle_unit)
     # Earlier versions of the library wrote `clip_range` under the name "reach".
     if "reach" in described:
@@ -411,8 +447,16 @@ def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
 
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
-    """Return the attacked object of a folder with the given description."""
-    from renderer.io.meshes import load_mesh  # trimesh takes half a second
+    """Read the attacked object of an adversary.
+
+    Args:
+        folder: Folder that `write_adversary` wrote.
+        description: Content of its file adversary.json.
+
+    Raises:
+        InputError: If the mesh cannot be read, or a number is out of range.
+    """
+    from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
 
     mesh = load_mesh(folder / MESH, gloss=bool(description.get("gloss")))
     own_faces = description["own_faces"]
@@ -430,14 +474,11 @@ def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
-    """Read images from a file.
+    """Read images from a .npy file.
 
     Args:
-        path: File of a NumPy array.
-        shape: Shape that the array must have.
-
-    Returns:
-        Images of this shape.
+        path: The file.
+        shape: Shape that the images must have.
 
     Raises:
         InputError: If the file is missing or damaged, or has another shape.
@@ -448,7 +489,7 @@ def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
         require_bounded(images=images)
         if images.shape != shape:
             raise InputError(f"it has shape {tuple(images.shape)}, not {shape}")
-    # Python's parser raises many types of errors for a damaged header.
+    # A damaged file may raise many types of errors.
     except Exception as error:
         message = f"{path} cannot be read ({single_line(error)}): write the adversary again"
         raise InputError(message) from error

@@ -10,30 +10,30 @@ from torch import Tensor
 
 from renderer.io.tiles import PAPER, Tile, draw_grid, tiles_of
 
-# Pixels per side of the ball that shows the light. Smaller images are enlarged
-# by a whole factor to at least this width.
+# Pixels per side of the white ball that shows the light. Smaller images are enlarged by a whole
+# factor to at least this width.
 SIDE = 160
-# Larger images are shown with this number of pixels per side, since a .gif file
-# takes up to a byte for each pixel of a frame.
+# Larger images are reduced to this number of pixels per side, because a .gif file takes up to a
+# byte for each pixel of a frame.
 MAX_SIDE = 224
-# Milliseconds for which each frame is shown. The first and the last frame are
-# shown for PAUSE instead.
+# Milliseconds for which a frame is shown, except the first and the last.
 FRAME_TIME = 120
+# Milliseconds for which the first and the last frame of an animation are shown.
 PAUSE = 1200
 
 
 def draw_frames(
     images: Sequence[Tensor], balls: Sequence[Tensor], captions: Sequence[str]
 ) -> list[Image.Image]:
-    """Draw frames of an image with its caption beside a ball in the light.
+    """Draw the frames of an animation: an image with a caption, and a white ball beside it.
 
     Args:
-        images: Image of each frame in [0, 1], shape (3, size, size) each.
-        balls: White ball in the light of each frame, shape (3, SIDE, SIDE) each.
+        images: Image of each frame in [0, 1], each of shape (3, size, size).
+        balls: White ball in the light of each frame, each of shape (3, SIDE, SIDE).
         captions: Line of text below each image.
 
     Returns:
-        Frames of the same size.
+        Frames, all of the same size.
     """
     frames = []
     for image, ball, caption in zip(images, balls, captions, strict=True):
@@ -42,7 +42,9 @@ def draw_frames(
 
 
 def frame_times(frame_count: int) -> list[int]:
-    """Return the time for which each frame is shown in milliseconds.
+    """Return for how many milliseconds each frame of an animation is shown.
+
+    The first and the last frame are shown longer than the others.
 
     Args:
         frame_count: Number of frames, at least 2.
@@ -51,7 +53,12 @@ def frame_times(frame_count: int) -> list[int]:
 
 
 def _tile(image: Tensor, caption: str) -> Tile:
-    """Return the tile of an image (3, size, size) with a caption of one line."""
+    """Return an image with a caption of one line, as a tile of a grid.
+
+    Args:
+        image: Image in [0, 1], shape (3, size, size).
+        caption: The caption.
+    """
     shown = image.detach().cpu().float()
     if image.shape[-1] > MAX_SIDE:
         size = (MAX_SIDE, MAX_SIDE)
@@ -61,7 +68,7 @@ def _tile(image: Tensor, caption: str) -> Tile:
 
 
 def _with_equal_sizes(frames: list[Image.Image]) -> list[Image.Image]:
-    """Return frames that are extended to the right and down to the size of the largest."""
+    """Add empty space at the right and the bottom of frames, so that all have the same size."""
     width = max(frame.width for frame in frames)
     height = max(frame.height for frame in frames)
     extended = []

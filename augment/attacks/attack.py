@@ -18,7 +18,7 @@ from augment.attack_settings import RANDOM_SEARCH, AttackSettings
 from augment.attacks import animation
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import Criterion, DescentResult
-from augment.attacks.eot import NOISE_DRAWS, preprocessed_model, stored
+from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise, preprocessed_model
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
@@ -36,7 +36,7 @@ from augment.parameter_settings import StepSettings
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.conditions import Conditions
-from augment.scene.degree import NOTICED, with_needed_degree
+from augment.scene.degree import MAX_IRRADIANCE_ERROR, with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, is_whole, require_choice, require_range
@@ -55,47 +55,48 @@ from renderer.validation import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Value of the argument `target` of `attack` that stands for the class with the lowest
-# confidence before the attack.
+# `attack(..., target="least_likely")` makes the target the class with the lowest confidence
+# before the attack.
 LEAST_LIKELY = "least_likely"
 # Pixels per side of the white ball with which `AttackResult.plot` shows the light.
 BALL_SIZE = 96
-# `AttackResult.save_animation` writes files of these formats with at most this many frames.
+# File formats that `AttackResult.save_animation` can write.
 ANIMATION_SUFFIXES = (".gif", ".webp")
+# Largest number of frames that `AttackResult.save_animation` writes.
 MAX_FRAME_COUNT = 1000
 
 
 @dataclass(frozen=True)
 class AttackResult:
-    """Result of an attack on E examples of V views, seen by a classifier of C classes.
+    """Result of an attack on E examples of V views, with a classifier of C classes.
 
-    It is a value that `nb.check`, `nb.success_by_radius`,
-    `nb.transfer` and `nb.save` take.
+    `nb.check`, `nb.success_by_radius`, `nb.transfer` and `nb.save` take it as
+    an argument.
 
     Attributes:
         problem: The attacked scene, and the parameters that were changed.
-        classifier: The attacked classifier, without rounding.
+        classifier: The attacked classifier, without the rounding to 8 bits.
         criterion: Source and target class of each view.
         settings: Settings of the attack.
         seed: Seed of the attack.
         images_in_views_before: Images before the attack, in [0, 1] and not
             rounded, shape (E, V, 3, size, size).
-        images_in_views: Images after the attack, with the shadows and bounces of
-            each shape in its own colors. They have the same shape and range.
+        images_in_views: Images after the attack, with the same shape and range.
+            Their shadows and bounces are those of the attacked shape and colors.
         logits_in_views_before: Logits of the preprocessed images before the
             attack, shape (E, V, C).
-        logits_in_views: Logits of the preprocessed images after it, shape
-            (E, V, C).
-        success_in_views: Whether each view counts as a success, as
-            `fooled_in_views` decides, shape (E, V), bool.
-        descent: Values and images at the end of the descent. `descent.success`
-            judges the images of the descent without noise. A descent that
-            changes shape or colors keeps shadows and bounces fixed in its images.
-        queries: Number of forward passes for each example, (E,) int64: images
-            that the search showed to the classifier, and those with the noise
-            of a sensor by which its success is counted. An image that is shown
-            again counts once.
-        seconds: Seconds of the descent, by phase.
+        logits_in_views: Logits of the preprocessed images after the attack,
+            shape (E, V, C).
+        success_in_views: Whether each view meets the criterion without noise and
+            in each draw of sensor noise, shape (E, V), bool.
+        descent: Result of the optimizer, before the final images are rendered. If
+            the attack changes shape or colors, the images of the descent have
+            the shadows and bounces of the original shape. `descent.success` is
+            the success of these images without noise.
+        queries: Number of images of each example that the attack showed to the
+            classifier, (E,) int64. Images with sensor noise, which decide about
+            successes, are included. An image that is shown again counts once.
+        seconds: Seconds of the attack in total, and of its parts by name.
     """
 
     problem: AttackProblem
@@ -114,61 +115,79 @@ class AttackResult:
 
     @property
     def images_before(self) -> Tensor:
-        """Images before the attack, (E, V, 3, size, size), or (E, 3, size, size) of one view."""
+        """Images before the attack in [0, 1], one row for each example.
+
+        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        """
         return self.images_in_views_before.squeeze(1)
 
     @property
     def images(self) -> Tensor:
-        """Images after the attack, (E, V, 3, size, size), or (E, 3, size, size) of one view."""
+        """Images after the attack in [0, 1], one row for each example.
+
+        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        """
         return self.images_in_views.squeeze(1)
 
     @property
     def logits_before(self) -> Tensor:
-        """Logits before the attack, (E, V, C), or (E, C) of one view."""
+        """Logits of the C classes before the attack, one row for each example.
+
+        The shape is (E, V, C), or (E, C) if an example has one view.
+        """
         return self.logits_in_views_before.squeeze(1)
 
     @property
     def logits(self) -> Tensor:
-        """Logits after the attack, (E, V, C), or (E, C) of one view."""
+        """Logits of the C classes after the attack, one row for each example.
+
+        The shape is (E, V, C), or (E, C) if an example has one view.
+        """
         return self.logits_in_views.squeeze(1)
 
     @property
     def preprocessed_model(self) -> nn.Module:
-        """Return the classifier with its preprocessing, see `augment.attacks.eot`."""
+        """Return the attacked classifier with its preprocessing: the rounding to 8 bits, if any."""
         return preprocessed_model(self.settings, self.classifier)
 
     @property
     def success(self) -> Tensor:
-        """Return a mask of the examples (E,) that the attack made meet the criterion, with noise.
+        """Return a mask of the examples for which the attack succeeded, shape (E,).
 
-        All views count. An example that met the criterion before the attack is no success.
+        All views of the example meet the criterion, also with sensor noise. Before the attack,
+        the example did not meet it.
         """
         return self.success_in_views.all(1) & ~self.success_before
 
     @property
     def success_without_noise(self) -> Tensor:
-        """Return a mask of the examples (E,) that the attack made meet the criterion without noise.
+        """Return a mask of the examples for which the attack succeeded without noise, shape (E,).
 
-        All views count. An example that met the criterion before the attack is no success.
+        All views of the example meet the criterion in their images without sensor noise. Before
+        the attack, the example did not meet it.
         """
         return self.criterion.reached(self.logits_in_views.argmax(2)) & ~self.success_before
 
     @property
     def success_with_margin(self) -> Tensor:
-        """Return a mask of the successes (E,) that lead by `settings.margin` in all views."""
+        """Return a mask of the successful examples with a sufficient logit gap, shape (E,).
+
+        The logit gap, see `augment.losses.logit_gap`, is at least `settings.margin` in all views.
+        """
         gaps = logit_gap(self.logits_in_views, self.criterion.source, self.criterion.target)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
-        """Return a mask of the examples (E,) that met the criterion before the attack."""
+        """Return a mask of the examples that met the criterion before the attack, shape (E,)."""
         return self.criterion.reached(self.logits_in_views_before.argmax(2))
 
     @property
     def clean_correct(self) -> Tensor:
-        """Return a mask of the examples (E,) whose views were all correct before the attack.
+        """Return a mask of the examples that were classified correctly before the attack.
 
-        Success rates of attacks count only these examples.
+        All views of such an example are correct. Success rates count only these examples. Shape
+        (E,).
         """
         return (self.logits_in_views_before.argmax(2) == self.criterion.source).all(1)
 
@@ -184,14 +203,15 @@ class AttackResult:
 
     @property
     def conditions(self) -> Conditions:
-        """Light, shape, colors and other conditions of the E examples after the attack."""
+        """Light, shape, colors and pose of the E examples after the attack."""
         return self.problem.conditions(self.descent.values, self.problem.all_examples)
 
     def plot(self, example: int = 0, view: int = 0) -> Figure:
         """Draw a view of an example as a figure with four parts.
 
-        They are the image before the attack, a white ball in the attacked
-        light, the image after the attack, and the probabilities of classes.
+        The parts are the image before the attack, a white ball in the attacked
+        light, the image after the attack, and the most probable classes before
+        and after.
 
         Args:
             example: Index of the example.
@@ -265,27 +285,28 @@ class AttackResult:
         images = [self._image_between(fraction, example, view) for fraction in fractions]
         balls = [self._ball_between(fraction, example) for fraction in fractions]
         logits = logits_of(self.preprocessed_model, torch.stack(images)[:, None], 1)
-        found = predictions(logits[:, 0], self.classifier.classes)
-        pairs = zip(found["predicted"], found["confidence"], strict=True)
-        captions = [f"{name} {confidence:.0%}" for name, confidence in pairs]
+        predicted = predictions(logits[:, 0], self.classifier.classes)
+        captions = []
+        for name, confidence in zip(predicted["predicted"], predicted["confidence"], strict=True):
+            captions.append(f"{name} {confidence:.0%}")
         first, *others = animation.draw_frames(images, balls, captions)
         times = animation.frame_times(frame_count)
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
     def _values_between(self, fraction: float) -> Tensor:
-        """Interpolate between the attack values before and after the attack.
+        """Interpolate linearly between the attack values before and after the attack.
 
         Args:
             fraction: 0 for the values before the attack, 1 for those after it.
 
         Returns:
-            Values of all examples, shape (E, D).
+            D values of each of the E examples, shape (E, D).
         """
         start = self.problem.start
         return start + fraction * (self.descent.values.to(start) - start)
 
     def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
-        """Render an image between those before and after the attack.
+        """Render a view with attack values between those before and after the attack.
 
         Args:
             fraction: 0 for the image before the attack, 1 for the image after it.
@@ -305,7 +326,7 @@ class AttackResult:
         return images[0, view]
 
     def _ball_between(self, fraction: float, example: int) -> Tensor:
-        """Render a white ball in a light between those before and after the attack.
+        """Render a white ball in light between that before and that after the attack.
 
         Args:
             fraction: 0 for the light before the attack, 1 for the light after it.
@@ -316,25 +337,31 @@ class AttackResult:
         """
         examples = self.problem.all_examples[[example]]
         conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
-        # The conditions have a single row, which is row 0.
+        # `conditions` contain one example only, at index 0.
         basis = self.problem.scene.basis_under(conditions, 0)
         return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
 
     def _require_view(self, example: int, view: int) -> None:
-        """Raise InputError if there is no such example or view."""
+        """Raise InputError unless `example` and `view` are indices of the result."""
         example_count, view_count = self.images_in_views.shape[:2]
         _require_index("example", example, example_count)
         _require_index("view", view, view_count)
 
     def _repr_png_(self) -> bytes:
-        """Draw the first view of the first example, which notebooks show."""
+        """Return a PNG file of the first view of the first example. Notebooks display it."""
         content = BytesIO()
         self.plot().savefig(content, format="png")
         return content.getvalue()
 
 
 def _require_index(name: str, index: int, count: int) -> None:
-    """Raise InputError if an index is no whole number from 0 to count - 1."""
+    """Raise InputError unless an index is a whole number from 0 to count - 1.
+
+    Args:
+        name: Name of the argument that has the index, for the message.
+        index: The index.
+        count: Number of things that the index selects from.
+    """
     require_whole(name, index)
     require_range(name, index, 0, count - 1)
 
@@ -343,10 +370,10 @@ def require_result(result: object) -> None:
     """Check that a value is the result of an attack.
 
     Args:
-        result: The value.
+        result: The value, which must be an `AttackResult`.
 
     Raises:
-        InputError: If it is something else.
+        InputError: If the value has another type.
     """
     require_kind("result", result, AttackResult, "the result of nb.attack")
 
@@ -370,14 +397,14 @@ def attack(
 
     Args:
         classifier: The classifier to attack, or a plain network from images of
-            the scene's size to logits, such as a `torch.nn.Module`. The scene
-            lies on its device.
+            the scene's size to logits, such as a `torch.nn.Module`. It must be
+            on the device of the scene.
         scene: The scene, with E examples of V views. Its labels are names or
             indices of classes.
-        target: Class that the attack leads images to. A list has one class for
-            each view, and requires views that share the attacked values.
-            "least_likely" is the class with the lowest confidence. None accepts
-            any misclassification.
+        target: Class as which the images shall be classified. A list has one
+            class for each view, and requires views that share the attacked
+            values. "least_likely" is the class with the lowest confidence. None
+            accepts any misclassification.
         settings: Attacked parameters with their norm-balls, and the steps. By
             default, the light is changed without a limit.
         classes: Names of the classes of a plain network, in the order of its
@@ -389,16 +416,16 @@ def attack(
         value_range: Values of black and white that a plain network takes before
             normalization.
         normalize_light: Whether the light of each image is normalized before
-            the classifier sees it, as `load_classifier` takes it. The attack
-            knows it.
+            the classifier sees it, as in `load_classifier`. The attack computes
+            gradients through this step.
         seed: Seed of the restarts and of the noise.
         force: Whether examples that are misclassified before the attack are
             accepted, and attacked too.
 
     Returns:
         The images, logits and successes of the E examples, before the attack
-        and after it. Images and logits of one view per example have no views
-        dimension.
+        and after it. If each example has one view, images and logits have no
+        dimension for the views.
 
     Raises:
         InputError: If an argument has a wrong type, if an example is
@@ -451,17 +478,26 @@ def _attack(
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Attack a `Classifier`. The arguments and the result are those of `attack`."""
+    """Attack a classifier whose arguments have been checked. See `attack`.
+
+    Args:
+        classifier: The classifier to attack.
+        scene: The scene, with E examples of V views.
+        target: Class, or one class for each view, as which the images shall be classified. None
+            accepts any misclassification.
+        settings: Attacked parameters and steps. None changes the light without a limit.
+        seed: Seed of the restarts and of the noise.
+        force: Whether examples that are misclassified before the attack are accepted.
+    """
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     settings = with_optimizer(settings, classifier)
     if not classifier.has_gradients:
-        # An image that was classified before is not classified again.
+        # Classify each image once only, because a function without gradients may be slow.
         classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
-    # With this stack level, Python shows the user's call of `attack` as the source
-    # of the warning.
+    # `stacklevel` makes Python name the user's call of `attack` in the warning.
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
     model = preprocessed_model(settings, classifier)
 
@@ -506,21 +542,19 @@ def _attack(
 
 
 def with_optimizer(settings: AttackSettings, classifier: Classifier) -> AttackSettings:
-    """Choose the optimizer of an attack, if the settings do not.
+    """Choose random search for a classifier without gradients, and warn.
 
     Args:
-        settings: Settings of the attack.
+        settings: Settings of the attack. An optimizer that they name is kept.
         classifier: The classifier to attack.
 
     Returns:
-        The settings or, if the classifier has no gradients, settings with
-        random search, of which a warning tells.
+        The given settings, or a copy with random search as the optimizer.
     """
     if settings.optimizer is not None or classifier.has_gradients:
         return settings
     chosen = replace(settings, optimizer=RANDOM_SEARCH)
-    # With stacklevel=4, Python shows the user's call of `attack` as the source of
-    # the warning.
+    # `stacklevel` makes Python name the user's call of `attack` in the warning.
     warnings.warn(
         f"classifier {classifier.name} has no gradients: random search attacks it with at most "
         f"{chosen.query_limit} queries for each example (max_queries, optimizer)",
@@ -536,12 +570,12 @@ def _count_queries(
     criterion: Criterion,
     settings: AttackSettings,
 ) -> Tensor:
-    """Count the different images of each example that an attack classified.
+    """Count the different images of each example that an attack showed to the classifier.
 
     Args:
-        descent: Result of the descent, with its queries.
+        descent: Result of the descent, which counted its own images.
         images: Images after the attack, shape (E, V, 3, size, size).
-        predicted: Classes of these images, shape (E, V).
+        predicted: Predicted classes of these images, shape (E, V).
         criterion: Source and target class of each view.
         settings: Settings of the attack.
 
@@ -550,52 +584,56 @@ def _count_queries(
     """
     view_count = images.shape[1]
     queries = descent.queries.clone()
-    # `final_images` has rendered other images than the descent, which were classified, too.
+    # `final_images` may render images again that differ from those of the descent. The
+    # classifier saw them, too.
     if images is not descent.images:
         queries += view_count
     if settings.sensor_noise:
-        # `fooled_in_views` classifies each view of these examples again, once for
-        # each draw of noise.
+        # `fooled_in_views` tests an example with noise if at least one view meets the
+        # criterion. It then classifies all views of the example in each draw of the noise.
         is_tested = criterion.reached_in_views(predicted).any(1)
         queries += NOISE_DRAWS * view_count * is_tested
     return queries
 
 
 def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) -> None:
-    """Warn if making light physical changes its irradiance by more than 5 %.
+    """Warn if the removal of negative radiance changes the irradiance by more than 5 %.
 
-    The change is the rms error of irradiance over normals and channels,
-    relative to the rms irradiance of the given environment light
-    (`irradiance_error`). The largest change of all examples counts.
+    The change is the rms error of the irradiance over all normals and channels,
+    divided by the rms irradiance of the given environment light. The largest
+    change of all examples counts.
 
     Args:
-        given: The scene before `AttackSettings.problem`.
-        physical: The scene of that problem.
-        stacklevel: Number of calls from `warnings.warn` to the line that the
-            warning names, as there.
+        given: Scene whose environment light may have negative radiance.
+        physical: The same scene after `build_problem` has removed the negative
+            radiance.
+        stacklevel: Argument of `warnings.warn`: number of calls up to the line
+            that the warning names.
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
     rows, harmonics = environment_light(given)
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
-    if error > NOTICED:
-        problem = "the light is negative in places, and without that its irradiance is off by"
-        advice = "a higher degree is closer, and allow_negative=True leaves the light"
-        message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice} as it is"
+    if error > MAX_IRRADIANCE_ERROR:
+        message = (
+            "the light is negative in places, and without that its irradiance is off by "
+            f"{error:.0%} (rms) in {harmonics}: a higher degree is closer, "
+            "and allow_negative=True leaves the light as it is"
+        )
         warnings.warn(message, stacklevel=stacklevel)
 
 
 @torch.no_grad()
 def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
-    """Compute the logits of the views of examples.
+    """Compute the logits of all views of examples, batch by batch.
 
     Args:
         model: Classifier with its preprocessing.
-        images: Images in [0, 1], shape (E, V, 3, H, W).
-        batch_size: Images per pass, fewer where memory runs out.
+        images: Images in [0, 1] of V views of E examples, shape (E, V, 3, H, W).
+        batch_size: Number of images of a batch. It is reduced if memory runs out.
 
     Returns:
-        Logits, shape (E, V, C).
+        Logits of the C classes, shape (E, V, C).
     """
     all_images = images.flatten(0, 1)
     batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
@@ -604,18 +642,18 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
 
 
 def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tensor:
-    """Return the true class of each view.
+    """Return the true class of each view as an index of the classifier.
 
     Args:
         scene: The scene, with E examples of V views.
-        logits: Logits of these views, which lie on the device of the result.
+        logits: Logits of the images. The result is put on their device.
         classifier: The classifier that has the classes.
 
     Returns:
-        Classes, shape (E, V), int64.
+        Indices of classes, shape (E, V), int64.
 
     Raises:
-        InputError: If the classifier lacks a class.
+        InputError: If the classifier lacks a class of the scene.
     """
     labels = [classifier.label(label) for label in scene.labels]
     return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)
@@ -627,12 +665,12 @@ def require_clean_correct(
     source: Tensor,
     classifier: Classifier,
 ) -> None:
-    """Check that every image is classified correctly.
+    """Check that every image of a scene is classified correctly.
 
     Args:
         scene: The scene, with E examples of V views.
         logits: Logits of the images, shape (E, V, C).
-        source: Right class of each image, shape (E, V).
+        source: True class of each image, shape (E, V).
         classifier: The classifier that has the classes.
 
     Raises:
@@ -664,21 +702,21 @@ def target_labels(
     logits: Tensor,
     classifier: Classifier,
 ) -> Tensor | None:
-    """Return the class that an attack leads each view to.
+    """Return the target class of each view as an index of the classifier.
 
     Args:
-        target: A class, a class for each view, or "least_likely". None for any
-            error.
-        source: Right class of each view, shape (E, V).
+        target: A class, a list with a class for each view, or "least_likely".
+            None for an untargeted attack.
+        source: True class of each view, shape (E, V).
         logits: Logits before the attack, shape (E, V, C).
         classifier: The classifier that has the classes.
 
     Returns:
-        Classes, shape (E, V), int64. None for any error.
+        Indices of classes, shape (E, V), int64. None for an untargeted attack.
 
     Raises:
-        InputError: If the classifier lacks a class, the number of classes is
-            not that of the views, or a target is the right class.
+        InputError: If the classifier lacks a class, if the list does not have
+            one class for each view, or if a target is the true class.
     """
     if target is None:
         return None
@@ -703,21 +741,22 @@ def target_labels(
 
 
 def _target_names(target: object) -> list[str]:
-    """Return the names in a list of target classes, or raise InputError if it is no list."""
+    """Convert a list of target classes to strings, or raise InputError if it is not a list."""
     advice = "the name or the index of a class, or one for each view"
     return [str(name) for name in as_list("target", target, str | Integral, advice)]
 
 
 def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Tensor]:
-    """Draw the initial attack values of restarts.
+    """Draw the initial attack values of restarts from the norm-balls.
 
     Args:
         problem: The attacked parameters, each with a radius.
-        count: The number of restarts.
+        count: Number of restarts.
         seed: Seed of the attack.
 
     Yields:
-        Values of all examples, shape (E, D).
+        D random values of each of the E examples, shape (E, D). Each item
+        belongs to one restart.
     """
     for number in range(1, count + 1):
         yield problem.sample(generator(seed, number, "restart"))
@@ -731,15 +770,15 @@ def final_images(
 ) -> Tensor:
     """Return the images after a descent, with the shadows and bounces of the attacked shape.
 
-    A descent that changes shape, colors or gloss keeps shadows and bounces
-    fixed. This function renders the images of such a descent again. It returns
-    all other images as they are.
+    A descent that changes shape, colors or gloss computes shadows and bounces
+    once, for the original shape. This function renders its images again. The
+    images of all other descents are returned as they are.
 
     Args:
         problem: The attacked scene and the parameters that were changed.
-        values: Values of the A examples, shape (A, D).
-        examples: Indices of the examples in the problem, shape (A,).
-        images: Images of the descent under these values,
+        values: D attack values of each of A examples, shape (A, D).
+        examples: Index of each of the A examples in the problem, shape (A,).
+        images: Images that the descent rendered with these values,
             shape (A, V, 3, size, size).
 
     Returns:
@@ -748,13 +787,14 @@ def final_images(
     scene = problem.scene
     conditions = problem.conditions(values, examples)
     surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-    has_fixed_bounces = any(values is not None for values in surface_changes)
-    if not has_fixed_bounces or not len(examples) or not scene.settings.global_illumination:
+    has_changed_surface = any(change is not None for change in surface_changes)
+    needs_renders = has_changed_surface and scene.settings.global_illumination
+    if not needs_renders or not len(examples):
         return images
     rendered = []
     for row, example in enumerate(progress(examples.tolist(), "final images")):
-        image = images[row]
-        adversary = Adversary.of(scene, example, conditions, image, image, row)
+        # The images of an adversary are not used for rendering.
+        adversary = Adversary.of(scene, example, conditions, images[row], images[row], row)
         rendered.append(adversary.render_views(scene.rasterizer))
     return torch.stack(rendered).to(images)
 
@@ -768,20 +808,19 @@ def fooled_in_views(
     settings: AttackSettings,
     seed: int,
 ) -> Tensor:
-    """Decide which views count as a success.
+    """Decide which views count as a success of an attack.
 
-    Attacks, their checks, sweeps, transfers and files all use this function. A
-    view is a success if it meets the criterion without noise and in each image
-    that a camera stores (`augment.attacks.eot.stored`). The noise of an example
-    depends only on the seed and its index. A search with many tries therefore
-    cannot succeed by drawing the noise again.
+    A view is a success if it meets the criterion without noise and with each of
+    `NOISE_DRAWS` draws of sensor noise. The noise of an example depends only on
+    the seed and on the index of the example. An attack that tries many images
+    therefore cannot succeed by drawing the noise again.
 
     Args:
         model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
             [0, 1] to logits.
         images: Images in [0, 1] without noise, shape (A, V, 3, H, W).
-        predicted: Classes of these images, shape (A, V), int64.
-        examples: Indices of the A examples, on which their noise depends,
+        predicted: Predicted classes of these images, shape (A, V), int64.
+        examples: Index of each of the A examples, on which its noise depends,
             shape (A,), int64.
         criterion: Source and target classes of the A examples.
         settings: Settings of the attack. With `sensor_noise=0`, only the images
@@ -793,18 +832,15 @@ def fooled_in_views(
         `predicted`.
     """
     is_fooled = criterion.reached_in_views(predicted)
-    # Only the B examples with a success without noise are tested with noise. Their indices
-    # among the A examples have shape (B,).
-    rows = torch.nonzero(is_fooled.any(1)).squeeze(1)
-    if not settings.sensor_noise or not len(rows):
+    # Noise is tested only in examples with a view that is fooled without noise.
+    tested = torch.nonzero(is_fooled.any(1)).squeeze(1)
+    if not settings.sensor_noise or not len(tested):
         return is_fooled
-    images_of_rows = images[rows.to(images.device)]
-    examples_of_rows = examples.to(rows.device)[rows]
-    criterion_of_rows = criterion.select(rows)
-    noisy_versions = stored(
-        images_of_rows,
+    tested_criterion = criterion.select(tested)
+    noisy_versions = add_sensor_noise(
+        images[tested.to(images.device)],
         settings.sensor_noise,
-        examples_of_rows,
+        examples.to(tested.device)[tested],
         seed,
         "sensor noise",
     )
@@ -812,20 +848,20 @@ def fooled_in_views(
         logits = logits_of(model, noisy_images, settings.batch_size)
         noisy_predicted = logits.argmax(2).to(is_fooled.device)
         # A view must be fooled in every draw of the noise.
-        is_fooled[rows] &= criterion_of_rows.reached_in_views(noisy_predicted)
+        is_fooled[tested] &= tested_criterion.reached_in_views(noisy_predicted)
     return is_fooled
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
-    """Return the predicted classes by name, and their probabilities, for JSON.
+    """Return the names and the probabilities of the predicted classes, for a JSON file.
 
     Args:
-        logits: Logits, shape (..., C).
+        logits: Logits of images in any number of dimensions, shape (..., C).
         classes: Names of the C classes.
 
     Returns:
-        Nested lists of shape (...): "predicted" of names, and "confidence" of
-        probabilities.
+        Dictionary of nested lists of shape (...). "predicted" has the names of
+        the predicted classes, and "confidence" their probabilities.
     """
     highest = logits.softmax(-1).max(-1)
     names = np.asarray(classes)[highest.indices.cpu().numpy()]

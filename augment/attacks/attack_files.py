@@ -30,15 +30,14 @@ from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind
 from renderer.visibility.rasterizers import Rasterizer
 
-# Name of the file that `save` writes in addition to the examples. It has one JSON line for each
-# example, and a last line with the checks.
+# File in which `save` writes one JSON line for each example, and a last line with the checks.
 LINES = "attack.jsonl"
-# Quality of the JPEG version of the images that `save` classifies.
+# `save` also classifies the attacked images after JPEG compression with this quality.
 JPEG_QUALITY = 90
-# Values of the argument `verify` of `save`.
+# Renderers that `save` may use to render the saved files again.
 RENDERERS = ("reload", MITSUBA)
 
-# Least width in pixels of an image in the figure of an example. Smaller images are enlarged by
+# Smallest width in pixels of an image in the figure of an example. Smaller images are enlarged by
 # a whole factor.
 SIDE = 192
 
@@ -49,25 +48,26 @@ def save(
     checks: dict[str, Any] | None = None,
     verify: Sequence[str] = ("reload",),
 ) -> list[dict[str, Any]]:
-    """Write a figure and a folder with the whole adversary of each example, and attack.jsonl.
+    """Write the files of an attack to a folder.
 
-    `nb.reload` reads such a folder.
+    The files are a figure and a folder for each example, and attack.jsonl with
+    a line of numbers for each example. `nb.reload` reads the folder of an
+    example.
 
     Args:
         result: The result of `nb.attack`.
         folder: The folder to write.
-        checks: The result of `nb.check`, for the last line of
-            attack.jsonl.
-        verify: Renderers that render the adversaries again from the folders:
-            "reload", "mitsuba" or both. The illumination of Mitsuba is direct,
-            and concave meshes shade themselves in it.
+        checks: The result of `nb.check`, which becomes the last line of
+            attack.jsonl. None for no such line.
+        verify: Renderers that render the examples again from their files:
+            "reload" (this library), "mitsuba" or both. Mitsuba renders direct
+            light with the shadows that a mesh casts on itself.
 
     Returns:
-        The line of each example. Its "versions" are the predictions of the
-        images as floats, with 8 bits, as JPEG and as rendered again, and the
-        differences of pixel values. "success" is with the noise of a sensor,
-        also of the versions, and "success_without_noise" by the images as they
-        are.
+        A dictionary for each example, as in attack.jsonl. "versions" has the
+        predictions for the images as floats, with 8 bits, as JPEG and as each
+        renderer renders them, and their differences from the floats. "success"
+        is measured with sensor noise, and "success_without_noise" without.
 
     Raises:
         InputError: If an argument is of another type, or a renderer is unknown
@@ -108,10 +108,10 @@ def save(
 
 
 def require_renderers(names: Sequence[str]) -> None:
-    """Check that renderers are known and installed.
+    """Check that the renderers of the argument `verify` are known and installed.
 
     Args:
-        names: Names of renderers.
+        names: Names of renderers: "reload" or "mitsuba".
 
     Raises:
         InputError: If a name is unknown, or if Mitsuba is not installed.
@@ -119,7 +119,7 @@ def require_renderers(names: Sequence[str]) -> None:
     for name in names:
         require_choice("verify", name, RENDERERS)
     if MITSUBA in names:
-        # Entering this context imports Mitsuba, or raises an error.
+        # The context imports Mitsuba, or raises InputError if it is not installed.
         with mitsuba():
             pass
 
@@ -129,10 +129,11 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
 
     Args:
         result: The attack on E examples.
-        paths: Folder of each of the E examples. Its figure has the same name with ".png".
+        paths: Folder of each of the E examples. The figure of an example has the name of its
+            folder with the suffix ".png".
 
     Returns:
-        Line of each example in attack.jsonl, without the key "versions".
+        Numbers of each example for attack.jsonl, without the key "versions".
     """
     problem = result.problem
     scene = problem.scene
@@ -141,8 +142,13 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
     lines = []
     for example, path in enumerate(progress(paths, "saving")):
         write_image(path.with_suffix(".png"), figure(result, example))
-        images = result.images_in_views_before[example], result.images_in_views[example]
-        adversary = Adversary.of(scene, example, conditions_after, *images)
+        adversary = Adversary.of(
+            scene,
+            example,
+            conditions_after,
+            before=result.images_in_views_before[example],
+            images=result.images_in_views[example],
+        )
         light_numbers = write_adversary(adversary, path)
         exposure = scene.examples[example].exposure
         light_before = conditions_before.light[example].cpu() * exposure
@@ -161,11 +167,12 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     descent = result.descent
     classes = result.classifier.classes
     before = predictions(result.logits_in_views_before[example], classes)
-    # Change of the attack values of this example, shape (1, D).
+    # Change of each of the D attack values of this example, shape (1, D).
     change = descent.values[[example]] - result.problem.start[[example]]
-    changes = result.problem.split_by_parameter(change)
-    # The keys are the names of the attacked parameters.
-    largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
+    # Largest change of a value of each attacked parameter, such as "pose".
+    largest_change = {}
+    for parameter, part in result.problem.split_by_parameter(change):
+        largest_change[parameter.name] = float(part.abs().max())
     return {
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
@@ -191,33 +198,34 @@ def _versions(
     paths: Sequence[Path],
     renderers: Sequence[str],
 ) -> dict[str, list[dict[str, Any]]]:
-    """Evaluate several versions of the images after an attack.
+    """Classify several versions of the images after an attack.
 
     The versions are the images as floats, with 8 bits, as JPEG, and as each
     renderer renders them from the saved files.
 
     Args:
-        result: The attack.
-        paths: Folder of each of the E examples.
-        renderers: Names of the renderers that render the examples again from
-            these folders.
+        result: The attack on E examples.
+        paths: Folder with the files of each example.
+        renderers: Names of the renderers that read these files.
 
     Returns:
-        For each name of a version, the numbers of the E examples (see
-        `_numbers_of_version`).
+        For each name of a version, a list with a dictionary for each example:
+        its successes, predictions, and differences from the floats.
     """
-    # Each version has shape (E, V, 3, size, size).
+    # Images of all examples and views, shape (E, V, 3, size, size) in each version.
     images = result.images_in_views.cpu()
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
         f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
     }
-    to_verify = progress(paths if renderers else [], "rendering the saved files")
-    rasterizer = result.problem.scene.rasterizer
-    again = [render_again(path, renderers, rasterizer) for path in to_verify]
-    for name in renderers:
-        versions[name] = torch.stack([images_by_renderer[name] for images_by_renderer in again])
+    if renderers:
+        rasterizer = result.problem.scene.rasterizer
+        rendered = []
+        for path in progress(paths, "rendering the saved files"):
+            rendered.append(render_again(path, renderers, rasterizer))
+        for name in renderers:
+            versions[name] = torch.stack([by_renderer[name] for by_renderer in rendered])
     numbers = {}
     for name, version in versions.items():
         numbers[name] = _numbers_of_version(result, version.to(result.images_in_views))
@@ -225,15 +233,16 @@ def _versions(
 
 
 def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
-    """Evaluate another version of the attacked images, such as renders of Mitsuba.
+    """Classify another version of the attacked images, such as renders of Mitsuba.
 
     Args:
-        result: The result of the attack.
-        images: The version of its images, shape (E, V, 3, size, size).
+        result: The result of the attack on E examples of V views.
+        images: The other version of the images after the attack, shape
+            (E, V, 3, size, size).
 
     Returns:
-        For each example, successes, predictions, and differences from the
-        images of the result.
+        For each example, a dictionary with successes, predictions, and
+        differences from the images of the result.
     """
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     predicted = logits.argmax(2)
@@ -268,15 +277,15 @@ def render_again(
     renderers: Sequence[str],
     rasterizer: Rasterizer,
 ) -> dict[str, Tensor]:
-    """Render the images of an example from its files alone.
+    """Render the V views of an example from its saved files alone.
 
     Args:
         folder: Folder of the example.
-        renderers: "reload", "mitsuba" or both.
-        rasterizer: Rasterizer of "reload".
+        renderers: Names of the renderers: "reload" (this library), "mitsuba" or both.
+        rasterizer: Rasterizer with which "reload" renders.
 
     Returns:
-        Images in [0, 1] by renderer, shape (V, 3, size, size).
+        Images in [0, 1] of each renderer by its name, shape (V, 3, size, size).
     """
     adversary = reload(folder)
     images = {}
@@ -285,8 +294,9 @@ def render_again(
     if MITSUBA in renderers:
         encoding = adversary.settings.encoding
         rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
-        behind = background_term(rgba[:, 3:], adversary.background, encoding)
-        rendered = encode(clamp(rgba[:, :3] + behind), encoding)
+        # The fourth channel is the coverage of each pixel by the object.
+        background = background_term(rgba[:, 3:], adversary.background, encoding)
+        rendered = encode(clamp(rgba[:, :3] + background), encoding)
         if adversary.pixels is not None:
             rendered = clamp(rendered + adversary.pixels)
         images[MITSUBA] = rendered
@@ -296,22 +306,20 @@ def render_again(
 def figure(result: AttackResult, example: int) -> Image.Image:
     """Draw an example before and after the attack, with a row for each view.
 
-    The columns show the images with their predictions, their difference and, if
-    the light changed, the light. Pixels without a difference are gray. All
-    differences have the same scale, with which the largest is black or white.
+    The columns show the two images with their predictions, their difference
+    and, if the attack changed the light, a white ball in the light before and
+    after. In the difference, unchanged values are gray, and the largest change
+    of all views is black or white.
 
     Args:
         result: The result of an attack.
-        example: The number of the example.
-
-    Returns:
-        The figure.
+        example: Index of the example.
     """
     before = result.images_in_views_before[example]
     after = result.images_in_views[example]
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
-    # Differences of less than a step of 8 bits stay as small as they are.
+    # Differences are enlarged by this factor, at most 255, to fill the range of an image.
     scale = 1 / max(1 / 255, *largest)
     captions = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
     predicted_before = _captions(result, result.logits_in_views_before, example)
@@ -326,22 +334,22 @@ def figure(result: AttackResult, example: int) -> Image.Image:
 
 
 def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
-    """Draw a white ball in the light before and after an attack, as each view sees it.
+    """Draw a white ball in the light before and after an attack, as each camera sees it.
 
     Args:
         result: The attack.
         example: Index of the example.
 
     Returns:
-        Two columns of the figure by their titles, with a tile for each view. Without a change
-        of the light, there are no columns.
+        Two columns of a figure by their titles. A column has a picture for each of the V
+        cameras. If the attack did not change the light, the dictionary is empty.
     """
     problem = result.problem
     scene = problem.scene
     examples = problem.all_examples[[example]]
     conditions_before = problem.conditions(problem.start[examples], examples)
     conditions_after = problem.conditions(result.descent.values[examples], examples)
-    # The conditions have a single row, which is row 0.
+    # Both conditions contain one example only, at index 0.
     basis_before = scene.basis_under(conditions_before, 0)
     basis_after = scene.basis_under(conditions_after, 0)
     is_same_light = torch.equal(conditions_before.light, conditions_after.light)
@@ -361,7 +369,7 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
 
 
 def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[str, ...]]:
-    """Write the captions of the views of an example.
+    """Return the captions of the V views of an example in the figure of an attack.
 
     Args:
         result: The attack.
@@ -369,14 +377,16 @@ def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[
         example: Index of the example.
 
     Returns:
-        The lines of each view: confidence and name of the predicted class. If this class is
-        wrong, a second line has confidence and name of the right class.
+        The lines of each caption. The first line has the probability and the name of the
+        predicted class. If this class is wrong, a second line has those of the true class.
     """
     classes = result.classifier.classes
     labels = result.criterion.source[example].tolist()
     captions = []
     for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
-        # A dictionary names each class once, in this order.
-        shown = dict.fromkeys([int(probabilities.argmax()), label])
-        captions.append(tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown))
+        shown_classes = [int(probabilities.argmax())]
+        if label not in shown_classes:
+            shown_classes.append(label)
+        lines = [f"{probabilities[index]:.1%} {classes[index]}" for index in shown_classes]
+        captions.append(tuple(lines))
     return captions

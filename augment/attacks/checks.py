@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 import torch.nn.functional as F
@@ -40,10 +40,10 @@ from augment.scene.objects import SceneObject
 from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
 from renderer.validation import as_list, require_number
 
-# `check` repeats the attack with these multiples of its number of steps.
+# `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
 
-# Keys of the result of `check` that `warnings` reads. `nb.save` refuses a result without them.
+# Keys of the result of `check` that `warnings` reads. `nb.save` refuses checks without them.
 CHECKED = {
     "success",
     "success_without_noise",
@@ -54,28 +54,35 @@ CHECKED = {
 
 
 def check(result: AttackResult) -> dict[str, Any]:
-    """Compare an attack with random draws and with longer descents.
+    """Compare an attack with random draws and with longer attacks.
 
-    Random search has one draw for each step of the attack or, if the classifier
-    has no gradients, for each query. It draws uniformly from the norm-balls.
-    Without a radius, it draws values at the same distance from the start as the
-    values that the attack found. The longer searches have 3 and 10 times as many
-    steps or queries. All successes are counted with the noise of a camera, as in
-    the result.
+    Random search draws values uniformly from the norm-balls. It has one draw for
+    each step of the attack or, if the classifier has no gradients, for each
+    query. If a parameter has no radius, its draws are as far from the start as
+    the values that the attack found. The longer attacks have 3 and 10 times as
+    many steps or queries.
 
     Args:
         result: The result of `nb.attack`.
 
     Returns:
-        Fractions of examples, and mean costs. "cost_fell" is a fraction of the
-        examples without success before the attack, and "zero_gradient" one of
-        all examples. "success", "success_with_margin", "random_search",
-        "success_by_steps" (by number of steps, or of queries without
-        gradients), and the same names with "_without_noise", are fractions of
-        the clean-correct examples.
+        A dictionary with these entries:
+
+        - "cost_before", "cost": mean cost of all examples.
+        - "cost_fell": fraction of the examples whose cost fell or that succeeded,
+          among those without success before the attack.
+        - "zero_gradient": fraction of all examples whose first gradient is 0.
+        - "success", "success_with_margin", "random_search": success rates of the
+          attack, of the attack with the required margin, and of random search.
+        - "success_by_steps": success rate by the number of steps, or of queries
+          if the classifier has no gradients.
+
+        A success rate is the fraction of successes with sensor noise among the
+        examples that are classified correctly before the attack. The same keys
+        with "_without_noise" have the rates without sensor noise.
 
     Raises:
-        InputError: If `result` is no result of an attack.
+        InputError: If `result` is not the result of an attack.
 
     Example:
         >>> import norm_balls as nb
@@ -85,10 +92,10 @@ def check(result: AttackResult) -> dict[str, Any]:
     """
     require_result(result)
     descent = result.descent
-    # Each of these masks has shape (E,) for E examples.
+    # Masks of the E examples, shape (E,) each.
     is_clean = result.clean_correct
     is_no_success_before = ~result.success_before
-    # A success counts as a lower cost, whatever its cost is.
+    # A successful example counts as one with a lower cost, even if its cost is higher.
     has_lower_cost = (descent.cost < descent.cost_before) | result.success_without_noise
 
     cost_fell = 1.0
@@ -98,12 +105,12 @@ def check(result: AttackResult) -> dict[str, Any]:
     draws = generator(result.seed, "random search")
     draw = partial(result.problem.sample, draws, descent.values)
     random = _success_by_draws(result, Successes.before(result), draw)
-    # Fractions of the clean-correct examples, by number of steps or queries.
-    counted_by_steps = {}
-    without_noise_by_steps = {}
+    # Success rates with and without sensor noise. The keys are numbers of steps or of queries.
+    rate_by_steps = {}
+    rate_by_steps_without_noise = {}
     for steps, successes in _success_by_steps(result).items():
-        counted_by_steps[steps] = _fraction(successes.counted[is_clean])
-        without_noise_by_steps[steps] = _fraction(successes.without_noise[is_clean])
+        rate_by_steps[steps] = _fraction(successes.with_noise[is_clean])
+        rate_by_steps_without_noise[steps] = _fraction(successes.without_noise[is_clean])
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
@@ -112,21 +119,21 @@ def check(result: AttackResult) -> dict[str, Any]:
         "success": _fraction(result.success[is_clean]),
         "success_without_noise": _fraction(result.success_without_noise[is_clean]),
         "success_with_margin": _fraction(result.success_with_margin[is_clean]),
-        "random_search": _fraction(random.counted[is_clean]),
+        "random_search": _fraction(random.with_noise[is_clean]),
         "random_search_without_noise": _fraction(random.without_noise[is_clean]),
-        "success_by_steps": counted_by_steps,
-        "success_by_steps_without_noise": without_noise_by_steps,
+        "success_by_steps": rate_by_steps,
+        "success_by_steps_without_noise": rate_by_steps_without_noise,
     }
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:
-    """Return reasons to doubt an attack.
+    """Return reasons to doubt the strength of an attack.
 
     Args:
         checks: The result of `check`.
 
     Returns:
-        A sentence for each reason.
+        A sentence for each reason, such as that random search does better.
     """
     success = checks["success"]
     lost_to_noise = checks["success_without_noise"] - success
@@ -145,28 +152,32 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
 
 
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
-    """Search norm-balls around the start of an attack, from the smallest to the largest.
+    """Measure how the success of an attack depends on the radius of the norm-balls.
 
-    Each ball is searched by descent and by uniform random draws. A success at
-    one radius counts at all larger radii. The remaining examples are attacked
-    again at the next radius. They start from their values at the previous
-    radius, take `max_steps` more steps, and get as many random draws.
+    The examples are attacked in balls of growing radius, once by descent and
+    once by uniform random draws. A success in a ball counts in all larger
+    balls. The other examples are attacked again in the next ball, for
+    `max_steps` steps from the values that they have reached, and with as many
+    random draws.
 
     Args:
         result: The result of `nb.attack`.
-        scales: Factors of radii and steps or, for parameters without a radius,
-            the radii.
+        scales: Factors by which radii and step sizes are multiplied. For
+            parameters without a radius, they are the radii.
 
     Returns:
-        A dict for each scale, in ascending order. "radii" are by parameter.
-        "adversarial" and "random", (N,) bool, tell of each of the N
-        clean-correct examples whether a descent or a random search succeeds. A
-        success counts as in the result, with the noise of a sensor.
-        "adversarial_without_noise" and "random_without_noise" are without it.
+        A dictionary for each scale, in ascending order:
+
+        - "radii": radius of each attacked parameter by its name.
+        - "adversarial", "random": whether the descent or the random search
+          succeeds with sensor noise, for each of the N examples that are
+          classified correctly before the attack, shape (N,), bool.
+        - "adversarial_without_noise", "random_without_noise": the same without
+          sensor noise.
 
     Raises:
-        InputError: If `result` is no result of an attack, or `scales` are not
-            positive numbers.
+        InputError: If `result` is not the result of an attack, or `scales` are
+            not positive numbers.
 
     Example:
         >>> import norm_balls as nb
@@ -177,7 +188,8 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     require_result(result)
     scales = _as_scales(scales)
     draws = generator(result.seed, "sweep")
-    # `_descend_further` moves these values (E, D) and adds to `adversarial` in place.
+    # `_descend_further` changes both of the following in place: the D attack values of each of
+    # the E examples, shape (E, D), and the successes of the descent.
     values = result.problem.start.clone()
     adversarial = Successes.before(result)
     random = adversarial.clone()
@@ -208,35 +220,43 @@ def transfer(
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
 ) -> list[dict[str, Any]]:
-    """Evaluate adversaries with other classifiers, other cameras and other objects.
+    """Test whether successful attacks also fool other classifiers, or from other cameras.
 
-    The A adversaries are the successful examples that were classified correctly
-    before the attack. For a classifier of another image size, backgrounds and
-    pixel offsets are resized.
+    An adversary is an example that was classified correctly before the attack
+    and for which the attack succeeded. The A adversaries are classified by each
+    other classifier, seen from each turned camera, and with each other object
+    in place of their own.
 
     Args:
         result: The result of `nb.attack`.
-        classifiers: Other classifiers, for each of which the adversaries are
-            rendered at its size, or plain networks that take the images and
-            have the classes of the attacked classifier.
-        azimuths: Degrees by which all cameras are turned around the vertical.
-        objects: Objects that take the place of the attacked ones.
-        normalization: What plain networks need in front of them, as `attack`
-            takes it.
-        value_range: Values of black and white that they take before it.
+        classifiers: Other classifiers, or plain networks with the image size and
+            the classes of the attacked classifier. For a `Classifier` of
+            another image size, the adversaries are rendered at that size, and
+            backgrounds and pixel offsets are resized.
+        azimuths: Degrees by which all cameras are turned around the vertical
+            axis.
+        objects: Objects that replace the attacked ones.
+        normalization: Normalization of images for plain networks, as in
+            `attack`.
+        value_range: Values of black and white that plain networks take before
+            normalization.
 
     Returns:
-        A dict for each, for JSON. "network", "azimuth" or "mesh" tells which.
-        "clean_correct" and "success", A values each, tell whether every view is
-        classified correctly before the attack, and whether every view reaches
-        the criterion after it, which counts as in the result, with the noise of a
-        sensor. "success_without_noise" is by the images as they are.
-        "predicted_before", "confidence_before", "predicted" and "confidence"
-        have A × V values.
+        A dictionary for each classifier, azimuth and object, for JSON. It has
+        its name under the key "network", "azimuth" or "mesh", and these lists:
+
+        - "clean_correct": whether each adversary is classified correctly in all
+          views before the attack, A values.
+        - "success": whether each adversary meets the criterion in all views
+          after the attack, with sensor noise, A values.
+        - "success_without_noise": the same without sensor noise.
+        - "predicted_before", "confidence_before", "predicted", "confidence":
+          predicted class and its probability, before and after the attack, for
+          each of the V views of each adversary.
 
     Raises:
-        InputError: See `require_transferable`. Also if a classifier lacks a
-            class.
+        InputError: If an attacked parameter cannot be transferred to other views
+            or meshes, or if a classifier lacks a class.
 
     Example:
         >>> import norm_balls as nb
@@ -269,13 +289,13 @@ def transfer(
             argument = f"classifiers[{index}]"
             classifier = _as_classifier(network, result, normalization, value_range, argument)
             resized = adversaries.changed(partial(_resized, size=classifier.size))
-            rows.append({"network": classifier.name, **resized.shown_to(classifier)})
+            rows.append({"network": classifier.name, **resized.classify(classifier)})
     for azimuth in azimuths:
         turned = adversaries.changed(partial(_turned, angle=azimuth))
-        rows.append({"azimuth": f"{azimuth:+g}°", **turned.shown_to(result.classifier)})
+        rows.append({"azimuth": f"{azimuth:+g}°", **turned.classify(result.classifier)})
     for item in objects:
         exchanged = adversaries.changed(partial(replace, shown=item))
-        rows.append({"mesh": Path(item.name).name, **exchanged.shown_to(result.classifier)})
+        rows.append({"mesh": Path(item.name).name, **exchanged.classify(result.classifier)})
     return rows
 
 
@@ -286,25 +306,28 @@ def _as_classifier(
     value_range: tuple[float, float],
     argument: str,
 ) -> Classifier:
-    """Convert a plain network to a classifier. A classifier is returned as it is.
+    """Convert a plain network to a classifier like the attacked one. Return a classifier as it is.
 
     Args:
         network: Classifier or plain network.
-        result: Result of an attack. The plain network has the image size, the classes and the
-            device of the attacked classifier.
-        normalization: Normalization of images for a plain network, as `attack` takes it.
+        result: Result of an attack. A plain network must have the image size, the classes and
+            the device of the attacked classifier.
+        normalization: Normalization of images for a plain network, as in `attack`.
         value_range: Values of black and white that a plain network takes.
         argument: Name of the network in error messages.
-
-    Returns:
-        The classifier.
     """
     if isinstance(network, Classifier):
         return network
     attacked = result.classifier
-    device = result.images_in_views.device
-    options = (attacked.size, attacked.classes, normalization, value_range, device)
-    return as_classifier(network, *options, argument)
+    return as_classifier(
+        network,
+        attacked.size,
+        attacked.classes,
+        normalization,
+        value_range,
+        result.images_in_views.device,
+        argument,
+    )
 
 
 def require_transferable(
@@ -312,62 +335,76 @@ def require_transferable(
     azimuths: Collection[float],
     objects: Collection[Any],
 ) -> None:
-    """Check that what an attack changed can be shown in other views and on other meshes.
+    """Check that the result of an attack can be rendered from other views and on other meshes.
+
+    For example, changed pixels belong to one view, and changed vertices belong to one mesh.
 
     Args:
         parameters: Names of the attacked parameters.
-        azimuths: Degrees by which cameras are turned.
-        objects: Other meshes.
+        azimuths: Degrees by which cameras are to be turned.
+        objects: Other meshes that are to be rendered.
 
     Raises:
-        InputError: If a parameter belongs to its view or its mesh alone.
+        InputError: If other views or other meshes are given, and the values of a parameter
+            belong to one view or one mesh.
     """
-    bound_to_view = [name for name in parameters if not parameter_class(name).fits_other_views]
-    bound_to_mesh = [name for name in parameters if not parameter_class(name).fits_other_meshes]
-    for argument, requested, bound_parameters in (
-        ("azimuths", azimuths, bound_to_view),
-        ("meshes", objects, bound_to_mesh),
-    ):
-        if requested and bound_parameters:
-            raise InputError(
-                f"{argument}: attacked {bound_parameters[0]} cannot be transferred to others, "
-                "leave one of them out",
-            )
+    for name in parameters:
+        kind = parameter_class(name)
+        if azimuths and not kind.fits_other_views:
+            _refuse_transfer("azimuths", name, "views")
+        if objects and not kind.fits_other_meshes:
+            _refuse_transfer("meshes", name, "meshes")
+
+
+def _refuse_transfer(argument: str, parameter: str, others: str) -> NoReturn:
+    """Raise the error that an attacked parameter does not fit other views or meshes.
+
+    Args:
+        argument: Name of the argument that has the other views or meshes.
+        parameter: Name of the attacked parameter.
+        others: "views" or "meshes".
+
+    Raises:
+        InputError: Always.
+    """
+    raise InputError(
+        f"{argument}: attacked {parameter} cannot be transferred to other {others}: "
+        f"remove {argument}, or attack another parameter",
+    )
 
 
 @dataclass(frozen=True)
 class Successes:
-    """Masks of the E examples that are a success. `add` adds successes in place.
+    """Masks of the examples for which an attack has succeeded. `add` changes them in place.
 
     Attributes:
-        counted: With the noise of a sensor, as `fooled_in_views` counts,
-            shape (E,), bool.
-        without_noise: By the images as they are, shape (E,), bool.
+        with_noise: Whether each of the E examples meets the criterion, also with
+            sensor noise, shape (E,), bool.
+        without_noise: Whether each example meets the criterion without sensor
+            noise, shape (E,), bool.
     """
 
-    counted: Tensor
+    with_noise: Tensor
     without_noise: Tensor
 
     @staticmethod
     def before(result: AttackResult) -> Successes:
-        """Return the examples that meet the criterion before an attack.
+        """Return the masks of the examples that meet the criterion before an attack.
 
         Args:
             result: The result of the attack.
-
-        Returns:
-            Masks that `add` may change.
         """
+        # The masks are copied, because `add` changes them.
         return Successes(result.success_before.clone(), result.success_before.clone())
 
     def clone(self) -> Successes:
         """Return an independent copy."""
-        return Successes(self.counted.clone(), self.without_noise.clone())
+        return Successes(self.with_noise.clone(), self.without_noise.clone())
 
     @property
-    def left(self) -> Tensor:
-        """Return the indices of the A examples that are no success with noise, shape (A,)."""
-        return torch.nonzero(~self.counted).squeeze(1)
+    def unsuccessful(self) -> Tensor:
+        """Return the indices of the examples without a success with sensor noise, shape (A,)."""
+        return torch.nonzero(~self.with_noise).squeeze(1)
 
     def add(
         self,
@@ -377,42 +414,48 @@ class Successes:
         examples: Tensor,
         images: Tensor,
     ) -> None:
-        """Mark the examples that are a success under some values.
+        """Add the examples that meet the criterion with some attack values.
 
-        An example is tested further if its images are a success. The images of
-        `final_images` then decide, whose shadows and bounces fit the values.
+        An example is first judged by its given images. If they meet the
+        criterion, it is rendered again with exact shadows and bounces, and
+        these images decide, without and with sensor noise.
 
         Args:
             result: The attack, with its criterion and classifier.
             problem: Scene and parameters to which the values belong.
-            values: Values of the A examples, shape (A, D).
-            examples: Indices of the A examples among all E, shape (A,).
-            images: Images of these examples that the problem rendered under
-                the values, shape (A, V, 3, H, W).
+            values: D attack values of each of A examples, shape (A, D).
+            examples: Index of each of the A examples among all E, shape (A,).
+            images: Images that the problem rendered with these values, shape
+                (A, V, 3, H, W).
         """
         is_reached = result.criterion.select(examples).reached(_predicted(result, images))
-        rows = torch.nonzero(is_reached).squeeze(1)
-        if not len(rows):
+        candidates = torch.nonzero(is_reached).squeeze(1)
+        if not len(candidates):
             return
-        chosen = examples[rows]
-        criterion = result.criterion.select(chosen)
-        final = final_images(problem, values[rows], chosen, images[rows])
+        candidate_examples = examples[candidates]
+        criterion = result.criterion.select(candidate_examples)
+        final = final_images(problem, values[candidates], candidate_examples, images[candidates])
         predicted = _predicted(result, final)
         fooled = fooled_in_views(
             result.preprocessed_model,
             final,
             predicted,
-            chosen,
+            candidate_examples,
             criterion,
             result.settings,
             result.seed,
         )
-        self.without_noise[chosen] |= criterion.reached(predicted)
-        self.counted[chosen] |= fooled.all(1)
+        self.without_noise[candidate_examples] |= criterion.reached(predicted)
+        self.with_noise[candidate_examples] |= fooled.all(1)
 
 
 def _predicted(result: AttackResult, images: Tensor) -> Tensor:
-    """Return the classes (A, V) that the attacked classifier sees in images (A, V, 3, H, W)."""
+    """Return the classes that the attacked classifier predicts, shape (A, V).
+
+    Args:
+        result: The attack.
+        images: Images of V views of A examples, shape (A, V, 3, H, W).
+    """
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     return logits.argmax(2)
 
@@ -425,55 +468,57 @@ def _success_by_draws(
     """Search for successes by random draws of the attack values.
 
     Args:
-        result: The attack. There is one draw for each of its steps, or as many as its queries
-            allow if the classifier has no gradients.
-        found: Successes so far. Examples with a success are not searched.
-        draw: Function that draws values of all E examples, shape (E, D).
+        result: The attack with which the draws are compared. The number of draws depends on the
+            number of its steps or queries.
+        found: Successes so far. Only the other examples are searched.
+        draw: Function that draws D values for each of the E examples, shape (E, D).
 
     Returns:
-        A copy of the successes, with those of the draws.
+        A copy of `found` with the additional successes.
     """
     found = found.clone()
     for _ in progress(range(_count_draws(result)), "random search"):
-        # Indices of the examples without a success so far.
-        left = found.left
-        if not len(left):
+        examples = found.unsuccessful
+        if not len(examples):
             break
-        values = draw()[left]
+        values = draw()[examples]
         with torch.no_grad():
-            images = result.problem.render(values, left)
-        found.add(result, result.problem, values=values, examples=left, images=images)
+            images = result.problem.render(values, examples)
+        found.add(result, result.problem, values=values, examples=examples, images=images)
     return found
 
 
 def _count_draws(result: AttackResult) -> int:
-    """Return the number of random draws with which the attack is compared.
+    """Return the number of random draws with which an attack is compared.
 
-    With gradients, it is the number of steps. Without, the draws need as many forward passes
-    as the attack may use.
+    It is the largest number of steps of an attack with gradients. An attack without gradients is
+    compared with draws that show as many images to the classifier.
+
+    Args:
+        result: The attack.
     """
     settings = result.settings
     if settings.uses_gradients:
         return settings.max_steps
-    # A draw needs passes of the image of each view and of its transformations.
+    # The classifier sees each view of a draw as it is and in its random transformations.
     view_count = result.images_in_views.shape[1]
     passes_per_draw = view_count * (1 + settings.eot.draws)
     return max(1, settings.step_limit // passes_per_draw)
 
 
 def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
-    """Repeat an attack with 3 and 10 times its budget, and count the successes.
+    """Repeat an attack with 3 and 10 times as many steps, and find the successes.
 
-    The budget is a number of steps or, without gradients, a number of queries.
+    An attack without gradients is repeated with 3 and 10 times as many queries.
     Only the examples without a success so far are attacked again, each from its
     start.
 
     Args:
-        result: Result of the attack with its own budget.
+        result: Result of the attack.
 
     Returns:
-        Successes by budget: those of the attack, and those of each repetition.
-        The successes of a smaller budget count for a larger budget, too.
+        Successes by the number of steps or queries: those of the attack, and
+        those of the repetitions. Successes with fewer steps are included.
     """
     settings = result.settings
     successes = Successes(result.success, result.success_without_noise)
@@ -481,7 +526,7 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
     for factor in GROWTH:
         longer_settings = settings.with_budget(factor)
         successes = successes.clone()
-        unsuccessful = successes.left
+        unsuccessful = successes.unsuccessful
         if len(unsuccessful):
             descent = descend(
                 result.preprocessed_model,
@@ -503,15 +548,15 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
 
 
 def _fraction(values: Tensor) -> float:
-    """Return the mean of values (N,), or 0 if there are none."""
+    """Return the fraction of true entries of a mask (N,), or 0 if it is empty."""
     return float(values.double().mean()) if len(values) else 0.0
 
 
 def _as_scales(scales: Sequence[float]) -> list[float]:
-    """Return factors of radii as a list, or raise InputError."""
+    """Convert the argument `scales` of `success_by_radius` to a list, or raise InputError."""
     listed = as_list("scales", scales, object, "a list of factors of the radii")
     if not listed:
-        raise InputError("scales is empty: give factors of the radii")
+        raise InputError("scales is empty: give factors of the radii, such as [0.5, 1, 2]")
     for scale in listed:
         require_number("scales", scale)
         require_range("scales", scale, 1 / MAX_SCALE, MAX_SCALE)
@@ -519,15 +564,12 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
 
 
 def _scaled(settings: StepSettings, scale: float) -> StepSettings:
-    """Return settings of a parameter with a scaled norm-ball.
+    """Return a copy of the settings of a parameter with a scaled norm-ball.
 
     Args:
         settings: Norm-ball and steps of the parameter.
-        scale: Factor of the radius and of the step size. If there is no radius, the scale
+        scale: Factor of the radius and of the step size. If the settings have no radius, it
             becomes the radius, and the step size stays as it is.
-
-    Returns:
-        Changed copy of the settings.
     """
     if settings.radius is None:
         return replace(settings, radius=scale)
@@ -540,58 +582,57 @@ def _descend_further(
     values: Tensor,
     found: Successes,
 ) -> None:
-    """Attack the examples without a success further, from the values that they have reached.
+    """Continue the descent of the examples without a success, in larger norm-balls.
 
     Args:
         result: The attack, with its classifier and settings.
-        problem: The scene, and the parameters with their present norm-balls.
-        values: Values of all E examples, shape (E, D). Those of the attacked examples are
-            replaced by the values at the end of the descent.
-        found: Successes so far, to which the new ones are added.
+        problem: The scene, and its attacked parameters with the larger norm-balls.
+        values: D values that each of the E examples has reached, shape (E, D). They are replaced
+            by the values at the end of the descent.
+        found: Successes so far. New ones are added in place.
     """
-    # Indices of the examples without a success so far.
-    left = found.left
-    if not len(left):
+    examples = found.unsuccessful
+    if not len(examples):
         return
     end = descend(
         result.preprocessed_model,
         problem,
-        result.criterion.select(left),
+        result.criterion.select(examples),
         result.settings,
-        examples=left,
-        start=values[left],
+        examples=examples,
+        start=values[examples],
         seed=result.seed,
     )
-    values[left] = end.values
-    found.add(result, problem, values=end.values, examples=left, images=end.images)
+    values[examples] = end.values
+    found.add(result, problem, values=end.values, examples=examples, images=end.images)
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
-    """Select the successes of the N clean-correct examples.
+    """Select the successes among the N examples that are correct before the attack.
 
     Args:
-        method: Key of the result: "adversarial" or "random".
+        method: METHOD, "adversarial" or "random".
         found: Successes of all E examples.
-        result: The attack, which tells the clean-correct examples.
+        result: The attack.
 
     Returns:
-        Masks (N,) of the examples that are a success: with sensor noise under the key METHOD,
-        and without under the key METHOD_without_noise.
+        Masks of the N examples, shape (N,): successes with sensor noise under the key METHOD,
+        and without noise under the key METHOD_without_noise.
     """
     is_clean = result.clean_correct
     return {
-        method: found.counted[is_clean].cpu(),
+        method: found.with_noise[is_clean].cpu(),
         f"{method}_without_noise": found.without_noise[is_clean].cpu(),
     }
 
 
 @dataclass(frozen=True)
 class _Adversaries:
-    """The A adversaries of an attack, and the same examples before the attack.
+    """The A examples that an attack turned from correct to misclassified.
 
     Attributes:
         result: The attack.
-        examples: Index of each of the A adversaries among the examples.
+        examples: Index of each of the A examples in the attacked scene.
         before: The A examples before the attack.
         after: The A examples after the attack.
     """
@@ -603,46 +644,49 @@ class _Adversaries:
 
     @staticmethod
     def of(result: AttackResult) -> _Adversaries:
-        """Collect the clean-correct examples for which an attack succeeded.
+        """Collect the examples that were correct before an attack and for which it succeeded.
 
         Args:
             result: The attack.
         """
         problem = result.problem
-        chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
+        is_adversary = result.clean_correct & result.success
+        examples = torch.nonzero(is_adversary).flatten().tolist()
         conditions_before = problem.conditions(problem.start, problem.all_examples)
         conditions_after = result.conditions
         before = []
         after = []
-        for example in chosen:
+        for example in examples:
             images = result.images_in_views_before[example], result.images_in_views[example]
             before.append(Adversary.of(problem.scene, example, conditions_before, *images))
             after.append(Adversary.of(problem.scene, example, conditions_after, *images))
-        return _Adversaries(result, chosen, before, after)
+        return _Adversaries(result, examples, before, after)
 
     def changed(self, change: Callable[[Adversary], Adversary]) -> _Adversaries:
-        """Return a copy in which a function has changed each example before and after the attack.
+        """Return a copy whose examples have other cameras, objects or image sizes.
 
         Args:
-            change: Function that changes the cameras, the object or the image size.
+            change: Function that returns a changed copy of an example. It is applied to the
+                examples before and after the attack.
         """
         before = [change(adversary) for adversary in self.before]
         after = [change(adversary) for adversary in self.after]
         return replace(self, before=before, after=after)
 
-    def shown_to(self, classifier: Classifier) -> dict[str, Any]:
-        """Render the adversaries and classify them.
+    def classify(self, classifier: Classifier) -> dict[str, Any]:
+        """Render the examples before and after the attack, and classify the images.
 
         Args:
-            classifier: Classifier, which has the classes of the adversaries.
+            classifier: Classifier that has the classes of the examples.
 
         Returns:
-            Predictions and successes by name, as `transfer` describes them.
+            The entries "clean_correct", "success", "predicted" and others that `transfer`
+            describes.
         """
         settings = self.result.settings
-        criterion = self._criterion_in(classifier)
-        logits_before = self._logits(self._rendered(self.before, classifier), classifier)
-        images = self._rendered(self.after, classifier)
+        criterion = self._criterion_for(classifier)
+        logits_before = self._logits(self._render(self.before, classifier.size), classifier)
+        images = self._render(self.after, classifier.size)
         logits = self._logits(images, classifier)
         predicted_before = predictions(logits_before, classifier.classes)
         success_in_views = fooled_in_views(
@@ -663,11 +707,13 @@ class _Adversaries:
             **predictions(logits, classifier.classes),
         }
 
-    def _criterion_in(self, classifier: Classifier) -> Criterion:
-        """Return the criterion of the adversaries with class indices of another classifier.
+    def _criterion_for(self, classifier: Classifier) -> Criterion:
+        """Return the source and target classes of the A examples for another classifier.
 
-        The attacked classifier may have the same classes in another order, so class names are
-        compared.
+        The other classifier may have the classes in another order, so classes are found by name.
+
+        Args:
+            classifier: The other classifier.
         """
         view_count = self.result.problem.scene.views
         sources = [[adversary.shown.label] * view_count for adversary in self.after]
@@ -682,11 +728,11 @@ class _Adversaries:
         return Criterion(source, self._labels(targets, classifier))
 
     def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
-        """Convert class names to indices.
+        """Convert class names to indices of a classifier.
 
         Args:
-            names: V class names for each of the A adversaries.
-            classifier: Classifier whose indices are returned.
+            names: For each of the A examples, the class names of its V views.
+            classifier: The classifier.
 
         Returns:
             Indices, shape (A, V).
@@ -694,18 +740,17 @@ class _Adversaries:
         indices = [classifier.label(name) for views in names for name in views]
         return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
 
-    def _rendered(self, adversaries: list[Adversary], classifier: Classifier) -> Tensor:
-        """Render adversaries.
+    def _render(self, adversaries: list[Adversary], size: int) -> Tensor:
+        """Render the V views of adversaries.
 
         Args:
-            adversaries: A adversaries, whose images have the size of the classifier.
-            classifier: Classifier that gets the images.
+            adversaries: The A adversaries. The size of their images is `size`.
+            size: Pixels per side of the images.
 
         Returns:
             Images in [0, 1], shape (A, V, 3, size, size).
         """
         scene = self.result.problem.scene
-        size = classifier.size
         if not adversaries:
             return self.result.images_in_views.new_empty(0, scene.views, 3, size, size)
         images = []
@@ -714,7 +759,15 @@ class _Adversaries:
         return torch.stack(images).to(self.result.images_in_views)
 
     def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
-        """Return the logits (A, V, C) of images (A, V, 3, size, size), on the CPU."""
+        """Compute the logits of images with the preprocessing of the attack.
+
+        Args:
+            images: Images of V views of A examples, shape (A, V, 3, size, size).
+            classifier: Classifier of C classes.
+
+        Returns:
+            Logits on the CPU, shape (A, V, C).
+        """
         settings = self.result.settings
         if not len(images):
             return torch.empty(0, images.shape[1], len(classifier.classes))
@@ -723,7 +776,12 @@ class _Adversaries:
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:
-    """Return an adversary whose images have another size in pixels."""
+    """Return a copy of an adversary whose images have another size.
+
+    Args:
+        adversary: The adversary. Its background and its pixel offsets are resized.
+        size: Pixels per side of the images of the copy.
+    """
     if adversary.settings.size == size:
         return adversary
     background = _with_size(adversary.background[None], size)[0].clamp(0, 1)
@@ -733,11 +791,21 @@ def _resized(adversary: Adversary, size: int) -> Adversary:
 
 
 def _with_size(images: Tensor, size: int) -> Tensor:
-    """Return images (N, C, H, W) in another size in pixels."""
+    """Resize images by bilinear interpolation with antialiasing.
+
+    Args:
+        images: Images, shape (N, C, H, W).
+        size: Pixels per side of the resized images.
+    """
     return F.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    """Return an adversary seen by cameras that are turned around the vertical, in degrees."""
+    """Return a copy of an adversary whose cameras are turned around the vertical axis.
+
+    Args:
+        adversary: The adversary.
+        angle: Angle in degrees, which is added to the azimuth of each camera.
+    """
     cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
     return replace(adversary, cameras=tuple(cameras))

@@ -1,13 +1,14 @@
 """CMA-ES: an attack that needs no gradients, by the library `cma` (Hansen 2016).
 
-Each example has an evolution strategy of its own. It draws a generation of
-candidates from a normal distribution, and adapts the mean and the covariance to
-the best of them. At first, the mean is at the initial values, and the standard
-deviations reach across the norm-ball (`Parameter.search_scale`). Candidates are
-projected onto the feasible values in the norm-ball before they are evaluated.
-A penalty keeps the distribution near these values: the interquartile range of
-the costs times the mean squared distance from the projection, in units of the
-first standard deviations (as Hansen et al. 2009 scale it).
+Each example has an evolution strategy of its own. In a step, it draws a
+generation of candidates from a normal distribution, and adapts the mean and the
+covariance to the best of them. At first, the mean is at the initial values, and
+the standard deviations reach across the norm-ball (`Parameter.search_scale`).
+Candidates are projected onto the feasible values in the norm-ball before they
+are evaluated. A penalty keeps the distribution near these values: the
+interquartile range of the costs times the mean squared distance from the
+projection, in units of the first standard deviations (as Hansen et al. 2009
+scale it).
 """
 
 from __future__ import annotations
@@ -26,22 +27,23 @@ from augment.attacks.gradient_free import GradientFree
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 
-# With more values, the covariance is diagonal (Ros and Hansen 2008), because its
-# memory and time grow with the square of their number.
+# CMA-ES with more values than this uses a diagonal covariance (Ros and Hansen
+# 2008), because the size of a full covariance is the square of their number.
 MAX_FULL_COVARIANCE = 1000
 
 
 @dataclass
 class Population:
-    """Evolution strategy of one example.
+    """CMA-ES of one example, with P candidates in each step.
 
-    Its points are offsets from the start in units of `Parameter.search_scale`.
+    The strategy draws points. A point p stands for the candidate with the
+    attack values start + scale · p.
 
     Attributes:
-        strategy: Evolution strategy, a `cma.CMAEvolutionStrategy`.
+        strategy: A `cma.CMAEvolutionStrategy`.
         start: The D attack values at which the strategy began, shape (D,).
         scale: Unit of each value, shape (D,). It is 0 for values without effect.
-        drawn: The P points of the present generation, shape (P, D).
+        drawn: The P points that were drawn last, shape (P, D).
     """
 
     strategy: Any
@@ -50,30 +52,31 @@ class Population:
     drawn: np.ndarray = field(init=False)
 
     def ask(self) -> Tensor:
-        """Draw a new generation of P points.
+        """Draw P new candidates.
 
         Returns:
-            Attack values of the points, which may be outside of the norm-ball, shape (P, D).
+            Their attack values, which may be outside of the norm-ball, shape (P, D).
         """
         self.drawn = np.stack(self.strategy.ask())
         return self._unprojected()
 
     def _unprojected(self) -> Tensor:
-        """Convert the points of the generation to attack values, shape (P, D)."""
+        """Return the attack values of the points that were drawn last, shape (P, D)."""
         return self.start + self.scale * torch.from_numpy(self.drawn).to(self.scale)
 
     def tell(self, values: Tensor, costs: Tensor) -> None:
-        """Adapt the strategy to the costs of its generation.
+        """Adapt the strategy to the costs of the P candidates that were drawn last.
 
-        The penalty that the module describes is added to each cost.
+        A candidate outside of the norm-ball was evaluated at the nearest values inside. A penalty
+        is added to its cost: the interquartile range of the costs times the mean squared distance
+        to these values, in units of `scale`.
 
         Args:
-            values: Feasible attack values in the norm-ball that are nearest to the P points of
-                the generation, shape (P, D).
-            costs: Cost of each of these values, shape (P,).
+            values: Values at which the candidates were evaluated, shape (P, D).
+            costs: Cost of each candidate, shape (P,).
         """
         offsets = self._unprojected() - values
-        # Offsets in units of the first standard deviations, shape (P, D).
+        # Distance of each value from the norm-ball in units of `scale`, shape (P, D).
         relative_offsets = torch.where(self.scale > 0, offsets / self.scale, 0.0)
         lower, upper = costs.double().quantile(costs.new_tensor([0.25, 0.75]).double())
         interquartile_range = upper - lower
@@ -83,41 +86,68 @@ class Population:
 
 @dataclass(frozen=True)
 class CMAES(GradientFree):
-    """CMA-ES against one classifier, see the module.
+    """Attack with CMA-ES (covariance matrix adaptation evolution strategy, Hansen 2016).
+
+    In each step, an evolution strategy draws P candidates for each example, and adapts to their
+    costs.
 
     Attributes:
         populations: Evolution strategy of each example. The key is the row of the
             example in the state of the search.
-        generations: Projected values of the present generation of each example, P points of
-            D values, shape (P, D). The key is the same.
+        generations: D attack values of the P candidates that are evaluated next, projected to
+            the norm-ball, shape (P, D). The key is the row of the example, too.
     """
 
     populations: dict[int, Population] = field(default_factory=dict, init=False)
     generations: dict[int, Tensor] = field(default_factory=dict, init=False)
 
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Search until all examples are finished or have used up their queries."""
+        """Attack A examples from one set of initial values, with new evolution strategies.
+
+        Args:
+            criterion: Source and target classes of the A examples.
+            examples: Index of each attacked example in the problem, shape (A,).
+            start: Initial values, shape (A, D).
+
+        Returns:
+            Result of the A examples.
+        """
         self.populations.clear()
         self.generations.clear()
         return super().run(criterion, examples, start)
 
     def _candidates_per_step(self, state: State) -> int:
-        """Return the number P of candidates in a generation, which is the default of `cma`."""
+        """Return how many candidates of each example a step evaluates.
+
+        For D values, these are 4 + ⌊3 ln D⌋, the default of `cma`.
+
+        Args:
+            state: State of the search, with D values of each example.
+        """
         return 4 + int(3 * math.log(state.values.shape[1]))
 
     def _step(self, state: State) -> None:
-        """Draw the next generation of each active example, and project it."""
+        """Draw the next candidates of each active example, and project them to the norm-balls.
+
+        Args:
+            state: State of the search. Its step counts are updated.
+        """
         for row in state.active_rows.tolist():
             if row not in self.populations:
                 self.populations[row] = self._begin(state, row)
             values = self.populations[row].ask()
-            # All P candidates belong to the same example, shape (P,).
+            # `project` needs the example of each of the P candidates, which is the same for all.
             examples = state.examples[row].expand(len(values))
             self.generations[row] = self.problem.project(values, examples)
         state.result.steps[state.active_rows] += 1
 
     def _begin(self, state: State, row: int) -> Population:
-        """Start the evolution strategy of an example at its accepted values."""
+        """Start the evolution strategy of an example at its accepted values.
+
+        Args:
+            state: State of the search.
+            row: Row of the example in the state.
+        """
         example = state.examples[[row]]
         value_count = state.values.shape[1]
         strategy = start_strategy(
@@ -129,25 +159,28 @@ class CMAES(GradientFree):
         return Population(strategy, state.values[row].clone(), scale)
 
     def _candidates(self, state: State) -> Tensor:
-        """Return the candidates that are evaluated next for each of the N active examples.
+        """Return the candidates to evaluate next.
+
+        Args:
+            state: State of the search, with N active examples.
 
         Returns:
-            Projected values of the present generation, shape (N, P, D). Before the first
-            generation, they are the initial values, and P is 1.
+            D attack values of P candidates of each active example, shape (N, P, D). In the first
+            evaluation, the only candidate of an example has its initial values.
         """
         if not self.generations:
             return super()._candidates(state)
         return torch.stack([self.generations[row] for row in state.active_rows.tolist()])
 
     def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Adapt the evolution strategies of the N active examples to their generations.
+        """Adapt the evolution strategy of each active example to the costs of its candidates.
 
         Args:
-            state: State of the search.
-            candidates: Projected values of each generation, shape (N, P, D).
+            state: State of the search, with N active examples.
+            candidates: D attack values of P candidates of each active example, shape (N, P, D).
             costs: Cost of each candidate, shape (N, P).
         """
-        # The initial values do not belong to a generation.
+        # No strategy drew the initial values, which are evaluated before the first step.
         if not self.generations:
             return
         for index, row in enumerate(state.active_rows.tolist()):
@@ -158,9 +191,9 @@ def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
     """Start an evolution strategy at 0 with standard deviation 1.
 
     Args:
-        value_count: Number of values D.
-        population_size: Number of points of a generation.
-        seed: Seed of its random numbers, which leave those of NumPy alone.
+        value_count: Number of values of a point.
+        population_size: Number of points that the strategy draws in each step.
+        seed: Seed of its random numbers. The global generator of NumPy is not used.
 
     Returns:
         `cma.CMAEvolutionStrategy`.

@@ -20,11 +20,12 @@ undone and tried again at half its length.
 
 One forward and backward pass of the classifier gives the cost, its gradient and
 the predictions. An example succeeds when the predictions reach its criterion in
-every view. It is finished when the logits also lead by `AttackSettings.margin`
-in every view and, if the settings ask for it, by more than the noise of a
-sensor changes them. Until then it stays active: it takes further steps, and its
-successful values of lowest cost are kept. Whether a success counts is decided
-after the descent (`augment.attacks.attack.fooled_in_views`).
+every view. It is finished when the logit gap (`augment.losses.logit_gap`) is
+also at least `AttackSettings.margin` in every view and, if the settings ask for
+it, larger than its changes by the noise of a sensor. Until then it stays active:
+it takes further steps, and its successful values of lowest cost are kept.
+Whether a success counts is decided after the descent
+(`augment.attacks.attack.fooled_in_views`).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, stored
+from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, add_sensor_noise
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.model_passes import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
@@ -59,10 +60,12 @@ class Criterion:
     source. An example reaches the criterion when all its views do.
 
     Attributes:
-        source: Source class of each view. NO_CLASS removes the source from the
-            cost of a view, so that only its target counts.
-        target: Target class of each view. NO_CLASS makes the attack on a view
-            untargeted. None makes the attack on all views untargeted.
+        source: Source class of each view, one row for each example. NO_CLASS
+            removes the source from the cost of a view, so that only its target
+            counts.
+        target: Target class of each view, one row for each example. NO_CLASS
+            makes the attack on a view untargeted. None makes the attack on all
+            views untargeted.
 
     Example:
         >>> criterion = Criterion(source=torch.tensor([[0, 0]]))
@@ -77,27 +80,39 @@ class Criterion:
         """Return the criterion of some of the examples.
 
         Args:
-            examples: Indices of the A examples, shape (A,), or a slice.
+            examples: Rows of the selected examples in `source` and `target`,
+                as indices or as a slice.
 
         Returns:
-            Source and target classes of the A examples.
+            Source and target classes of the selected examples.
         """
         if self.target is None:
             return Criterion(self.source[examples])
         return Criterion(self.source[examples], self.target[examples])
 
     def flatten(self) -> Criterion:
-        """Return a criterion with an entry for each view of each example, in shape (E · V,)."""
+        """Return the classes of all V views of all E examples as one list, shape (E · V,)."""
         if self.target is None:
             return Criterion(self.source.flatten())
         return Criterion(self.source.flatten(), self.target.flatten())
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
-        """Return whether all views of each example are predicted as its criterion demands."""
+        """Return a mask of the examples that reach the criterion in all their views.
+
+        Args:
+            predicted: Predicted class of each of the V views of each example.
+        """
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
-        """Return whether each view is predicted as its criterion demands."""
+        """Return a mask of the views that reach the criterion.
+
+        A view reaches it if its predicted class is the target class or, without
+        a target, is not the source class.
+
+        Args:
+            predicted: Predicted class of each of the V views of each example.
+        """
         is_misclassified = predicted != self.source
         if self.target is None:
             return is_misclassified
@@ -109,23 +124,28 @@ class Criterion:
 class DescentResult:
     """Values that a descent found for E examples, with their images and costs.
 
-    A candidate is a vector of values that the descent evaluated. For each
-    example, one candidate is returned: the one that reached the margin, else
-    the successful one of lowest cost, else the last one from which a step was
-    taken. All tensors lie on the device of the attacked values.
+    A candidate is a vector of D values that the descent evaluated. For each
+    example, one candidate is returned. It is
+
+    - the candidate that reached the criterion with the required margin,
+    - if there is none, the candidate of lowest cost that reached the criterion,
+    - if there is none, the last candidate from which a step was taken.
+
+    Each tensor has one row for each example, and lies on the device of the
+    attacked values.
 
     Attributes:
         values: Values of the returned candidate.
-        images: Images of the returned candidate, in [0, 1].
+        images: Images of the V views of the returned candidate, in [0, 1].
         steps: Number of steps taken, including those of restarts.
-        queries: Number of forward passes: images of the example that the
-            classifier was shown, including those of restarts.
+        queries: Number of images of the example that the classifier was shown,
+            including those of restarts.
         backward_passes: Number of these images for which a gradient was
             computed.
         success_before: Whether the initial values reach the criterion.
         success: Whether the returned candidate reaches the criterion, without noise.
-        cost_before: Cost of the initial values (equation 1).
-        cost: Cost of the returned candidate (equation 1).
+        cost_before: Cost of the initial values (equation 1 of the paper).
+        cost: Cost of the returned candidate (equation 1 of the paper).
         predicted: Class predicted for each view of the returned candidate.
         zero_gradient: Whether the gradient at the initial values is exactly
             zero. False if no gradient was computed.
@@ -144,13 +164,13 @@ class DescentResult:
     zero_gradient: Bool[Tensor, " E"]
 
     def allocate(self, example_count: int) -> DescentResult:
-        """Return an uninitialized result with rows for `example_count` examples.
+        """Return a result with uninitialized tensors for another number of examples.
 
-        The tensors have the dtypes, devices and remaining dimensions of the
-        tensors of this result.
+        Apart from the number of rows, each tensor has the shape, the dtype and
+        the device of the same tensor of this result.
 
         Args:
-            example_count: Number of examples. Each tensor has one row for each example.
+            example_count: Number of examples, and of rows of each tensor.
         """
         tensors = {}
         for item in fields(self):
@@ -169,11 +189,15 @@ class DescentResult:
             getattr(self, item.name)[rows] = getattr(group, item.name)
 
     def add_restart(self, rows: Tensor, restart: DescentResult) -> None:
-        """Add the steps and passes of a restart, and take over its result wherever it succeeds.
+        """Add a restart, which attacks some examples again from other initial values.
+
+        Its steps and passes are added to the counts. Where the restart
+        succeeds, its values, images, cost and predictions replace those of the
+        example.
 
         Args:
-            rows: Row of each restarted example, shape (A,). None of these
-                examples has succeeded before.
+            rows: Row of each restarted example in this result, shape (A,).
+                None of these examples has succeeded before.
             restart: Result of the restart of these A examples.
         """
         is_success = restart.success
@@ -194,12 +218,13 @@ class Descent:
 
     Attributes:
         model: Classifier with its preprocessing.
-        problem: Attacked parameters and the scene that renders them.
+        problem: Scene, and the parameters of it that are attacked. It renders images from
+            values of the parameters.
         settings: Number of steps, margin, backtracking and batch size.
         expectation: Average of the model output over random transformations of
             an image.
         phases: Timer of the classifier passes.
-        seed: Seed of the noise with which leads are compared.
+        seed: Seed of the sensor noise with which `noise_margin` is checked.
     """
 
     model: nn.Module
@@ -212,14 +237,15 @@ class Descent:
     def run_with_restarts(
         self, criterion: Criterion, examples: Tensor, start: Tensor, restarts: Iterable[Tensor]
     ) -> DescentResult:
-        """Attack examples from their start, and from each restart until they succeed.
+        """Attack A examples from one or more initial values, until they succeed.
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Indices of the attacked examples in the problem,
+            examples: Index of each attacked example in the problem,
                 shape (A,).
-            start: Initial values, shape (A, D).
-            restarts: Further initial values, each of shape (A, D).
+            start: First initial values, shape (A, D).
+            restarts: Further initial values, each of shape (A, D). They are
+                used for the examples that have not succeeded.
 
         Returns:
             Result of the A examples.
@@ -236,13 +262,14 @@ class Descent:
 
     @torch.enable_grad()
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Take steps until all examples are finished or have used up their budget.
+        """Attack A examples from one set of initial values.
 
-        Only these examples are rendered and classified.
+        Each example takes steps until it reaches its criterion with the
+        required margin, or has used up its steps or queries.
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Indices of the attacked examples in the problem,
+            examples: Index of each attacked example in the problem,
                 shape (A,).
             start: Initial values, shape (A, D).
 
@@ -268,19 +295,35 @@ class Descent:
         return state.result
 
     def _count_passes(self, state: State, evaluation: Evaluation) -> None:
-        """Add the passes of an evaluation to those of the N active examples."""
+        """Count the images that an evaluation showed to the classifier.
+
+        Args:
+            state: State of the descent. The counts of its active examples are increased.
+            evaluation: Evaluation of the candidates of the active examples.
+        """
         pass_count = evaluation.candidate_count * self._passes_of_candidate(state)
         state.result.queries[state.active_rows] += pass_count
         if evaluation.gradient is not None:
             state.result.backward_passes[state.active_rows] += pass_count
 
     def _passes_of_candidate(self, state: State) -> int:
-        """Return the number of images by which a candidate is evaluated."""
+        """Return how many images the classifier sees to evaluate one candidate of an example.
+
+        These are all views of the example, each as it is and in each of its
+        random transformations.
+
+        Args:
+            state: State of the descent, whose criterion has the number of views.
+        """
         view_count = state.criterion.source.shape[1]
         return view_count * (1 + self.settings.eot.draws)
 
     def _drop_examples_without_budget(self, state: State) -> None:
-        """Remove the examples for which the next step would need too many queries."""
+        """Make examples inactive whose next step would exceed the limit of queries.
+
+        Args:
+            state: State of the descent. Its active examples are updated.
+        """
         limit = self.settings.query_limit
         if limit is None or not len(state.active_rows):
             return
@@ -289,18 +332,30 @@ class Descent:
         state.active_rows = state.active_rows[is_affordable]
 
     def _candidates_per_step(self, state: State) -> int:
-        """Return the number of candidates of an example that a step evaluates."""
+        """Return how many candidates of each example a step evaluates.
+
+        Args:
+            state: State of the descent. Only subclasses use it.
+        """
         return 1
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify the candidates of the N active examples."""
+        """Render and classify one candidate of each active example.
+
+        Args:
+            state: State of the descent, with N active examples and their candidates.
+
+        Returns:
+            Images and scores of the N candidates, and the gradients of their costs.
+        """
         candidate = state.candidate[state.active_rows].requires_grad_(True)
         criterion = state.criterion.select(state.active_rows)
         rendered = self.problem.render(candidate, state.examples[state.active_rows])
         images = rendered.detach()
         with self.phases("attack_classifier"):
             score, image_gradient = self._score(images, criterion, state.batch_size)
-        # The chain rule continues the gradient from the images to the values.
+        # Chain rule: the gradient with respect to the images gives the gradient with
+        # respect to the candidate values.
         (gradient,) = torch.autograd.grad(rendered, candidate, image_gradient)
         return Evaluation(
             values=candidate.detach(),
@@ -316,9 +371,10 @@ class Descent:
         """Compute the costs, logit gaps and predictions of N examples, batch by batch.
 
         Args:
-            images: Rendered images, shape (N, V, 3, H, W).
+            images: Rendered images of the V views of each example, shape
+                (N, V, 3, H, W).
             criterion: Source and target classes of the N examples.
-            batch_size: Images per classifier pass.
+            batch_size: Number of images that the classifier sees at a time.
 
         Returns:
             The score of each example, and the gradient of its cost with respect
@@ -361,8 +417,8 @@ class Descent:
         expected_logits = self.expectation(self.model, batch, logits)
         cost = adversarial_cost(expected_logits, classes.source, classes.target)
         (batch_gradient,) = torch.autograd.grad(cost.sum(), batch)
-        # Copying keeps the memory layout of the images, whichever layout the
-        # network prefers.
+        # The network may return its gradient in another memory layout. The copy has the
+        # layout of the images.
         all_gradients[batch_rows] = batch_gradient
         return Score(
             cost=cost.detach(),
@@ -371,16 +427,25 @@ class Descent:
         )
 
     def _decide(self, state: State, evaluation: Evaluation) -> Decision:
-        """Decide which candidates are finished, accepted and kept (see `Decision`)."""
+        """Decide what happens to the candidates of the active examples.
+
+        Args:
+            state: State of the descent, with N active examples.
+            evaluation: Images and scores of their N candidates.
+
+        Returns:
+            Whether each example is finished, whether its next step starts from
+            its candidate, and whether the candidate becomes its result.
+        """
         active_rows = state.active_rows
         is_success = evaluation.is_criterion_met
         cost = evaluation.score.cost
         is_finished = is_success & (evaluation.score.gap >= self.settings.margin)
-        if self.settings.lead_over_noise:
-            is_finished = self._with_lead_over_noise(is_finished, state, evaluation)
+        if self.settings.applied_noise_margin:
+            is_finished = self._finished_despite_noise(is_finished, state, evaluation)
         is_accepted = is_finished | self._is_accepted(state, evaluation)
-        # Until an example succeeds, its result is its last accepted candidate. A
-        # success replaces it. After that, only a success of lower cost does.
+        # An example without a success takes each accepted candidate as its result. An
+        # example with a success takes only successful candidates of lower cost.
         is_cheaper_success = is_success & (cost < state.result.cost[active_rows])
         has_succeeded = state.result.success[active_rows]
         is_better = torch.where(has_succeeded, is_cheaper_success, is_success | is_accepted)
@@ -394,62 +459,63 @@ class Descent:
     def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
         """Return a mask of the candidates from which the next step may start, shape (N,).
 
-        Without backtracking, a step may start from every candidate. With backtracking, it may
-        start only from candidates with a lower cost than the accepted values.
+        Without backtracking, these are all candidates. With backtracking, these are the
+        candidates that lower the cost.
 
         Args:
-            state: State of the descent, with N active examples.
-            evaluation: Scores of their candidates.
+            state: State of the descent, with the costs before the last step.
+            evaluation: Scores of one candidate for each of the N active examples.
         """
         is_cheaper = evaluation.score.cost < state.cost[state.active_rows]
         if self.settings.backtracking:
             return is_cheaper
         return torch.ones_like(is_cheaper)
 
-    def _with_lead_over_noise(
+    def _finished_despite_noise(
         self,
         is_finished: Tensor,
         state: State,
         evaluation: Evaluation,
     ) -> Tensor:
-        """Return a mask of the finished examples whose lead survives the noise of a camera.
+        """Return a mask of the finished examples that remain successes with sensor noise.
 
-        The lead of a view is its logit gap, see `augment.losses.logit_gap`.
+        The images that the classifier sees for this are counted as queries.
 
         Args:
-            is_finished: Mask of the examples that lead by the margin,
-                shape (N,).
-            state: State of the descent.
-            evaluation: Images of the N active examples.
+            is_finished: Mask of the active examples that are finished if noise is
+                ignored, shape (N,).
+            state: State of the descent, with N active examples.
+            evaluation: Images of the N candidates.
 
         Returns:
-            Mask, shape (N,).
+            Mask of the active examples, shape (N,).
         """
         # Indices of the finished examples among the N active examples.
-        chosen = is_finished.nonzero()[:, 0]
-        rows = state.active_rows[chosen]
+        finished = is_finished.nonzero()[:, 0]
+        rows = state.active_rows[finished]
         state.result.queries[rows] += NOISE_DRAWS * evaluation.images.shape[1]
         with self.phases("attack_classifier"):
-            is_leading = self._leads_over_noise(
-                evaluation.images[chosen],
+            is_robust = self._is_robust_to_noise(
+                evaluation.images[finished],
                 state.examples[rows],
                 state.criterion.select(rows),
             )
-        return is_finished.index_copy(0, chosen, is_leading)
+        return is_finished.index_copy(0, finished, is_robust)
 
     @torch.no_grad()
-    def _leads_over_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
-        """Return a mask of the examples whose views all lead by more than noise changes.
+    def _is_robust_to_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
+        """Return a mask of the examples whose logit gaps change little with sensor noise.
 
-        The lead of a view is its logit gap. It is computed without noise and
-        with several draws of noise. The smallest of these leads must be at
-        least `AttackSettings.lead_over_noise` times the difference between the
-        largest and the smallest. Other noise decides later whether a success
-        counts.
+        The logit gap tells by how much a view reaches the criterion. It is
+        computed without noise and with several draws of noise. In every view,
+        the smallest of these gaps must be at least
+        `AttackSettings.applied_noise_margin` times the difference between the
+        largest and the smallest. This noise differs from the noise that later
+        decides whether a success counts.
 
         Args:
-            images: Images of the A examples, shape (A, V, 3, H, W).
-            examples: Indices of the examples in the problem, shape (A,).
+            images: Images of V views of the A examples, shape (A, V, 3, H, W).
+            examples: Index of each example in the problem, shape (A,).
             criterion: Source and target classes of the A examples.
 
         Returns:
@@ -457,28 +523,32 @@ class Descent:
         """
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
-        noisy_versions = stored(
+        noisy_versions = add_sensor_noise(
             images,
             self.settings.sensor_noise,
             examples,
             self.seed,
             "noise margin",
         )
-        leads = []
+        gaps = []
         for version in (images, *noisy_versions):
             batches = version.flatten(0, 1).split(self.settings.batch_size)
             logits = torch.cat([self.model(batch) for batch in batches])
             logits_of_views = logits.unflatten(0, version.shape[:2])
-            leads.append(logit_gap(logits_of_views, criterion.source, criterion.target))
-        # Shape (A, V) each.
-        smallest, largest = torch.stack(leads).aminmax(dim=0)
-        needed_lead = self.settings.lead_over_noise * (largest - smallest)
-        return (smallest >= needed_lead).all(1)
+            gaps.append(logit_gap(logits_of_views, criterion.source, criterion.target))
+        # Smallest and largest logit gap of each view, each of shape (A, V).
+        smallest, largest = torch.stack(gaps).aminmax(dim=0)
+        needed_gap = self.settings.applied_noise_margin * (largest - smallest)
+        return (smallest >= needed_gap).all(1)
 
     def _step(self, state: State) -> None:
-        """Move each active example from its accepted values to a new candidate.
+        """Compute the next candidate of each active example by a step along its gradient.
 
-        The state keeps the accepted values until the candidate is evaluated.
+        The step starts from the accepted values, which the state keeps until
+        the candidate is evaluated.
+
+        Args:
+            state: State of the descent. Its candidates and step counts are updated.
         """
         active_rows = state.active_rows
         state.candidate[active_rows] = self.problem.take_step(
@@ -495,13 +565,14 @@ class Score:
     """Cost, logit gap and predicted classes of N examples, or of N single images.
 
     Attributes:
-        cost: Cost (equation 1), summed over the views of an example,
-            shape (N,).
-        gap: Lead of the wanted class in the logits, shape (N,). For an example,
-            it is the smallest lead among the views. It is negative if the criterion
-            is not reached.
-        predicted: Predicted classes of the images without EOT transformations.
-            Shape (N, V) for examples, (N,) for single images.
+        cost: Cost that the attack lowers (equation 1 of the paper), shape (N,).
+            For an example, it is the sum over its views.
+        gap: Logit gap, shape (N,). It tells by how much the criterion is reached,
+            and is negative if the criterion is not reached. For an example, it is
+            the smallest gap of its views.
+        predicted: Predicted classes of the images before any random
+            transformation. Shape (N, V) for examples with V views, (N,) for
+            single images.
     """
 
     cost: Tensor
@@ -510,11 +581,16 @@ class Score:
 
     @classmethod
     def of_examples(cls, batches: Sequence[Score], view_count: int) -> Score:
-        """Return the score of examples from the scores of batches of single images.
+        """Combine the scores of single images to scores of examples.
 
         Args:
-            batches: Scores of all images, in order.
+            batches: Scores of batches of images, in order. The views of an
+                example follow each other.
             view_count: Number of views of each example.
+
+        Returns:
+            For each example, the sum of the costs, the smallest logit gap, and
+            the predictions of all views.
         """
         cost = torch.cat([score.cost for score in batches]).unflatten(0, (-1, view_count))
         gap = torch.cat([score.gap for score in batches]).unflatten(0, (-1, view_count))
@@ -524,18 +600,20 @@ class Score:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Images, scores and gradients of the candidates of the N active examples.
+    """Images, scores and gradients of one candidate of each of the N active examples.
+
+    A candidate is a vector of D attack values that is evaluated.
 
     Attributes:
         values: The candidates, shape (N, D).
-        images: Rendered images, shape (N, V, 3, H, W).
-        score: Cost, logit gap and predictions of the N examples.
-        is_criterion_met: Mask of the examples whose predictions reach the criterion
-            in every view, shape (N,).
-        gradient: Gradient of the cost with respect to the candidates,
-            shape (N, D). None if none was computed.
+        images: Rendered images of the V views, shape (N, V, 3, H, W).
+        score: Cost, logit gap and predictions of each candidate.
+        is_criterion_met: Mask of the candidates whose predictions reach the
+            criterion in every view, shape (N,).
+        gradient: Gradient of the cost with respect to the values, shape (N, D).
+            None if no gradient was computed.
         candidate_count: Number of candidates of each example that were
-            evaluated. The other attributes are those of the best one.
+            evaluated. The other attributes describe the best of them.
     """
 
     values: Tensor
@@ -558,12 +636,12 @@ class Decision:
     """Decisions about the candidates of the N active examples, as tensors of shape (N,).
 
     Attributes:
-        is_finished: The candidate reaches the criterion with the required margin,
-            also over noise.
-        is_accepted: The next step starts from the candidate.
-        is_kept: The candidate is the result of its example unless a later
-            candidate replaces it.
-        length_factor: Factor of the length of the next step.
+        is_finished: Whether the candidate reaches the criterion with the required
+            margin, so that its example takes no further step.
+        is_accepted: Whether the next step starts from the candidate.
+        is_kept: Whether the candidate becomes the result of its example, until a
+            later candidate replaces it.
+        length_factor: Factor by which the length of the next step is multiplied.
     """
 
     is_finished: Tensor
@@ -577,22 +655,22 @@ class State:
     """State of a descent of A examples, of which N are still active.
 
     A step starts from the accepted values and leads to the candidate, which is
-    evaluated next. A row is the position of an example in the tensors of the
-    state and the result.
+    evaluated next. The tensors of the state and of its result have one row for
+    each of the A examples.
 
     Attributes:
         criterion: Source and target classes of the A examples.
-        examples: Indices of the examples in the problem, shape (A,).
-        batch_size: Images per classifier pass. It is halved when memory runs
-            out.
-        active_rows: Rows of the examples that are not finished, shape (N,).
+        examples: Index of each example in the problem, shape (A,).
+        batch_size: Number of images that the classifier sees at a time. It is
+            halved when memory runs out.
+        active_rows: Rows of the examples that still take steps, shape (N,).
         values: Accepted values, shape (A, D).
         gradient: Gradient of the cost at the accepted values, shape (A, D).
         cost: Cost of the accepted values, shape (A,).
         length: Length of the next step, shape (A, 1).
         candidate: Values to evaluate next, shape (A, D).
-        result: Result if the descent ended now. It exists after the first
-            evaluation.
+        result: What the descent returns if it takes no further step. It exists
+            after the first evaluation.
     """
 
     criterion: Criterion
@@ -610,14 +688,14 @@ class State:
     def at_start(
         cls, criterion: Criterion, examples: Tensor, start: Tensor, batch_size: int
     ) -> State:
-        """Create the state before the first evaluation. The initial values are its candidates.
+        """Create the state before the first evaluation, with the initial values as candidates.
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Indices of the attacked examples in the problem,
+            examples: Index of each attacked example in the problem,
                 shape (A,).
             start: Initial values, shape (A, D).
-            batch_size: Images per classifier pass.
+            batch_size: Number of images that the classifier sees at a time.
         """
         values = start.detach().clone()
         return cls(
@@ -635,12 +713,12 @@ class State:
     def begin_result(self, evaluation: Evaluation) -> None:
         """Create `result` from the evaluation of the initial values.
 
-        The result has 0 steps and no success. All A examples are still active
-        here. `record` then decides about the initial values as about every
-        candidate.
+        The result has 0 steps and no success. A call of `record` must follow,
+        which treats the initial values like every candidate.
 
         Args:
-            evaluation: Evaluation of the initial values of the A examples.
+            evaluation: Evaluation of the initial values of the A examples, which
+                are all active.
         """
         zeros = torch.zeros_like(self.active_rows)
         self.result = DescentResult(
@@ -674,39 +752,44 @@ class State:
         self._keep(kept, evaluation)
         self.active_rows = self.active_rows[unfinished]
 
-    def _accept(self, chosen: Tensor, evaluation: Evaluation) -> None:
-        """Make the chosen candidates the values from which the next step starts.
+    def _accept(self, accepted: Tensor, evaluation: Evaluation) -> None:
+        """Let the next step of some examples start from their evaluated candidates.
 
         Args:
-            chosen: Indices of candidates among those of the evaluation.
-            evaluation: Images, scores and gradients of the N candidates.
+            accepted: Indices of these candidates among the N of the evaluation.
+            evaluation: Values, gradients and scores of the candidates of the N
+                active examples.
         """
-        rows = self.active_rows[chosen]
-        self.values[rows] = evaluation.values[chosen]
+        rows = self.active_rows[accepted]
+        self.values[rows] = evaluation.values[accepted]
         if evaluation.gradient is not None:
-            self.gradient[rows] = evaluation.gradient[chosen]
-        self.cost[rows] = evaluation.score.cost[chosen]
+            self.gradient[rows] = evaluation.gradient[accepted]
+        self.cost[rows] = evaluation.score.cost[accepted]
 
-    def _keep(self, chosen: Tensor, evaluation: Evaluation) -> None:
-        """Write the chosen candidates to the result.
+    def _keep(self, kept: Tensor, evaluation: Evaluation) -> None:
+        """Make the candidates of some examples their present results.
 
         Args:
-            chosen: Indices of candidates among those of the evaluation.
-            evaluation: Images, scores and gradients of the N candidates.
+            kept: Indices of these candidates among the N of the evaluation.
+            evaluation: Values, images and scores of the candidates of the N
+                active examples.
         """
-        rows = self.active_rows[chosen]
-        self.result.values[rows] = evaluation.values[chosen]
-        self.result.images[rows] = evaluation.images[chosen]
-        self.result.success[rows] = evaluation.is_criterion_met[chosen]
-        self.result.cost[rows] = evaluation.score.cost[chosen]
-        self.result.predicted[rows] = evaluation.score.predicted[chosen]
+        rows = self.active_rows[kept]
+        self.result.values[rows] = evaluation.values[kept]
+        self.result.images[rows] = evaluation.images[kept]
+        self.result.success[rows] = evaluation.is_criterion_met[kept]
+        self.result.cost[rows] = evaluation.score.cost[kept]
+        self.result.predicted[rows] = evaluation.score.predicted[kept]
 
 
 def _indices_of_masks(*masks: Tensor) -> list[Tensor]:
-    """Return the indices of the true entries of each mask of shape (N,).
+    """Return the indices of the true entries of each mask.
 
-    All masks are copied to the CPU at once, because each copy waits for the
-    GPU.
+    All masks are copied from the GPU to the CPU at once, because each copy
+    waits until the GPU is idle.
+
+    Args:
+        masks: Masks, each of shape (N,).
     """
     device = masks[0].device
     masks_on_cpu = torch.stack(masks).cpu()

@@ -13,13 +13,16 @@ from augment.attack_settings import AttackSettings, EOTSettings
 from augment.random_streams import generator
 from renderer.image import clamp, to_bytes, to_unit
 
-# Number of images with sensor noise that `stored` yields for each image. An attack counts as a
-# success only if the classifier is wrong in all of them.
+# Number of noisy versions of an image that `add_sensor_noise` yields. An attack counts as a success
+# only if the classifier is wrong in all of them.
 NOISE_DRAWS = 3
 
 
 class Quantized(nn.Module):
-    """Model whose images are rounded to 8 bits per channel. The derivative passes straight through.
+    """Round images to 8 bits per channel before a model.
+
+    The gradient is computed as if the images were not rounded (straight-through
+    estimator).
 
     Args:
         model: Model of images in [0, 1].
@@ -30,7 +33,7 @@ class Quantized(nn.Module):
         self.model = model
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the output of the model for rounded images (N, 3, H, W) in [0, 1]."""
+        """Round images in [0, 1], shape (N, 3, H, W), and return the output of the model."""
         return self.model(straight_through(images, _round_to_bytes))
 
 
@@ -40,53 +43,56 @@ def _round_to_bytes(images: Tensor) -> Tensor:
 
 
 def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
-    """Put the rounding of images to 8 bits before a classifier, if the settings ask for it.
+    """Return a classifier that rounds images to 8 bits, if `settings.quantized` asks for it.
 
     Args:
         settings: Settings of the attack.
         classifier: A model from images in [0, 1] to logits.
 
     Returns:
-        A model from images in [0, 1] to logits. It is the classifier itself
-        without `settings.quantized`.
+        A model from images in [0, 1] to logits. It is the given classifier if
+        `settings.quantized` is False.
     """
     return Quantized(classifier) if settings.quantized else classifier
 
 
-def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) -> Iterator[Tensor]:
-    """Yield images as a camera stores them, once for each draw of its noise.
+def add_sensor_noise(
+    images: Tensor, deviation: float, examples: Tensor, *key: int | str
+) -> Iterator[Tensor]:
+    """Add sensor noise to images and round them to 8 bits, as a camera does.
 
-    A sensor adds its noise before the values are rounded, and so does this
-    function. The noise of an example depends on the key and its index alone,
-    not on the other examples or the device. No other random stream changes.
+    This is repeated `NOISE_DRAWS` times with different noise. The noise of an
+    example depends only on the key and on the index of the example.
 
     Args:
-        images: Images in [0, 1], shape (A, V, 3, H, W).
-        deviation: Standard deviation of the Gaussian noise, in steps of 8 bits
-            (1/255).
-        examples: Indices of the examples, shape (A,), int64.
-        key: Key of the random stream, such as the seed of an attack; see
-            `augment.random_streams.stream_seed`.
+        images: Images in [0, 1] of V views of A examples, shape (A, V, 3, H, W).
+        deviation: Standard deviation of the Gaussian noise, in units of 1/255.
+        examples: Index of each example in its scene, shape (A,), int64.
+        key: Numbers and names that identify the random numbers, such as the
+            seed of an attack and "noise".
 
     Yields:
-        Images of 8 bits as values in [0, 1], of the type of `images`, shape
-        (A, V, 3, H, W), in each of `NOISE_DRAWS` draws.
+        Noisy images in [0, 1], rounded to multiples of 1/255, with the shape
+        and dtype of `images`.
     """
-    draws = [generator(*key, example) for example in examples.tolist()]
+    generators = [generator(*key, example) for example in examples.tolist()]
     for _ in range(NOISE_DRAWS):
-        noise = torch.stack([torch.randn(images.shape[1:], generator=draw) for draw in draws])
+        noise = torch.stack(
+            [torch.randn(images.shape[1:], generator=draws) for draws in generators]
+        )
         noisy = images + deviation / 255 * noise.to(images)
         yield to_unit(to_bytes(clamp(noisy))).to(images)
 
 
 class ExpectationOverTransformations:
-    """Average of the log-probabilities of a model over an image and random transformations of it.
+    """Average predictions over random transformations of an image (EOT, Athalye et al. 2018).
 
-    The transformations are drawn anew in each call. The derivative passes
-    straight through their compression.
+    The log-probabilities of the image and of its transformed copies are
+    averaged. Each call draws new transformations. Gradients ignore the JPEG
+    compression (straight-through estimator).
 
     Args:
-        settings: How many transformations, and how strong they are.
+        settings: Number and strength of the transformations.
         draws: CPU generator of the random numbers.
     """
 
@@ -95,16 +101,16 @@ class ExpectationOverTransformations:
         self._draws = draws
 
     def __call__(self, model: nn.Module, images: Tensor, logits: Tensor) -> Tensor:
-        """Return the average log-probabilities.
+        """Average the log-probabilities of images and of their random transformations.
 
         Args:
             model: Classifier with its preprocessing.
             images: Images in [0, 1], shape (N, 3, H, W).
-            logits: Logits of these images, shape (N, C).
+            logits: Logits that the model returned for these images, shape (N, C).
 
         Returns:
-            Average log-probabilities, shape (N, C). They are the logits
-            themselves if nothing is to be drawn.
+            Average log-probabilities, shape (N, C). With 0 transformations, the
+            logits are returned as they are.
         """
         if not self.settings.draws:
             return logits
@@ -118,8 +124,9 @@ class ExpectationOverTransformations:
         """Transform each image at random.
 
         A transformation shifts, rotates and scales the image, changes the
-        exposure, adds noise and compresses the image as JPEG. All images are
-        compressed with the same quality. The rest is drawn for each image.
+        exposure, adds noise and compresses the image as JPEG. The quality of
+        the compression is the same for all images of a call. Everything else
+        differs between images.
 
         Args:
             images: Images in [0, 1], shape (N, 3, H, W).
@@ -128,10 +135,10 @@ class ExpectationOverTransformations:
             Transformed images in [0, 1], shape (N, 3, H, W).
         """
         settings = self.settings
-        # Two shifts, an angle and a growth for each image, shape (N, 4).
+        # Two shifts, a rotation and a relative change of size for each image, shape (N, 4).
         movements = settings.jitter * self._uniform(len(images), 4)
         moved = _moved(images, movements.to(images))
-        # One stop is a factor of 2.
+        # Change of the exposure in stops. One stop doubles the exposure.
         stops = settings.exposure * self._uniform(len(images), 1, 1, 1)
         exposed = clamp(moved * (2**stops).to(images))
         noise = settings.noise * torch.randn(images.shape, generator=self._draws)
@@ -145,7 +152,7 @@ class ExpectationOverTransformations:
 
 
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Change images, but compute gradients as if the images had not been changed.
+    """Apply a function to images, with the gradient of the identity (straight-through estimator).
 
     Args:
         images: Images, of any shape.
@@ -153,15 +160,16 @@ def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tens
             differentiable.
 
     Returns:
-        Changed images. Their derivative with respect to `images` is the identity.
+        Changed images. Their gradient passes to `images` as it is.
     """
-    # The difference has no gradient, because it is computed from detached images.
-    exact = images.detach()
-    return images + (change(exact) - exact)
+    # The difference is computed from detached images, so it has no gradient.
+    detached = images.detach()
+    difference = change(detached) - detached
+    return images + difference
 
 
 def as_jpeg(images: Tensor, quality: int) -> Tensor:
-    """Compress images and read them back.
+    """Compress images as JPEG and decompress them.
 
     Args:
         images: Images in [0, 1] on the CPU, shape (..., 3, H, W).
@@ -170,24 +178,28 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
     Returns:
         Images in [0, 1], shape (..., 3, H, W), float32.
     """
-    compressed = []
+    decompressed = []
     for image in to_bytes(images).flatten(0, -4):
         file = io.BytesIO()
+        # pillow has the channels last.
         Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
         with Image.open(file) as read:
-            compressed.append(torch.from_numpy(np.array(read)).permute(2, 0, 1))
-    return to_unit(torch.stack(compressed)).view(images.shape)
+            decompressed.append(torch.from_numpy(np.array(read)).permute(2, 0, 1))
+    return to_unit(torch.stack(decompressed)).view(images.shape)
 
 
 def _moved(images: Tensor, movements: Tensor) -> Tensor:
     """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
+    Each new pixel takes its value from a position in the given image. The
+    movement is that of these positions, so the content of the image moves in
+    the opposite direction.
+
     Args:
         images: Images, shape (N, 3, H, W).
-        movements: Shift across and down as fractions of the width, angle in
-            radians, and growth as a fraction of the size, shape (N, 4). They
-            describe where the new pixels lie in the given image, so the content
-            of the image moves in the opposite direction.
+        movements: For each image the shift across and the shift down as
+            fractions of the size, the rotation in radians, and the increase of
+            the size as a fraction of the size, shape (N, 4).
 
     Returns:
         Moved images, shape (N, 3, H, W).
@@ -195,8 +207,10 @@ def _moved(images: Tensor, movements: Tensor) -> Tensor:
     across, down, angle, growth = movements.unbind(1)
     cos = (1 + growth) * angle.cos()
     sin = (1 + growth) * angle.sin()
-    # The affine map of each image as two rows of three numbers, shape (N, 6).
-    # `affine_grid` uses coordinates from -1 to 1, so an image is 2 units wide.
-    rows = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1)
-    grid = F.affine_grid(rows.view(-1, 2, 3), list(images.shape), align_corners=False)
+    # `affine_grid` uses coordinates from -1 to 1. A shift by the whole image is therefore 2.
+    first_row = torch.stack([cos, -sin, 2 * across], dim=1)
+    second_row = torch.stack([sin, cos, 2 * down], dim=1)
+    # Affine maps of the N images, shape (N, 2, 3).
+    matrices = torch.stack([first_row, second_row], dim=1)
+    grid = F.affine_grid(matrices, list(images.shape), align_corners=False)
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False)

@@ -1,4 +1,4 @@
-"""What random search and CMA-ES share: candidates are evaluated by forward passes alone."""
+"""Base class of random search and CMA-ES, which need no gradients of the classifier."""
 
 from __future__ import annotations
 
@@ -16,26 +16,38 @@ from augment.random_streams import generator
 
 @dataclass(frozen=True)
 class GradientFree(Descent):
-    """Search of an example by forward passes, with random numbers of its own.
+    """Base class of searches that need forward passes of the classifier only.
 
-    A step evaluates one or several candidates of each example. The best of them
-    is accepted if its cost is lower.
+    In a step, one or several candidates (vectors of attack values) of each
+    example are evaluated. The best one is accepted if it lowers the cost.
 
     Attributes:
-        draws: Generators of the random numbers, by the index of the example.
-            They go on in the restarts.
+        draws: Generator of the random numbers of each example. The key is the
+            index of the example. Restarts continue with the same generator.
     """
 
     draws: dict[int, torch.Generator] = field(default_factory=dict, init=False)
 
     @torch.no_grad()
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Search until all examples are finished or have used up their queries."""
-        # This method exists for its decorator: `Descent.run` would enable gradients.
+        """Attack A examples from one set of initial values, without gradients.
+
+        Args:
+            criterion: Source and target classes of the A examples.
+            examples: Index of each attacked example in the problem, shape (A,).
+            start: Initial values, shape (A, D).
+
+        Returns:
+            Result of the A examples.
+        """
+        # This method exists for its decorator `no_grad`: `Descent.run` enables gradients.
         return super().run(criterion, examples, start)
 
     def _draw_normal(self, state: State, count: int) -> Tensor:
-        """Draw normal numbers, each example with a generator of its own.
+        """Draw vectors of normal numbers for each active example.
+
+        Each example has a generator of its own, so that its numbers do not
+        depend on the other examples.
 
         Args:
             state: State of the search, with N active examples of D values.
@@ -53,26 +65,28 @@ class GradientFree(Descent):
         return torch.stack(numbers).to(state.values)
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify the candidates of the active examples.
+        """Render and classify several candidates of each active example.
 
         Args:
             state: State of the search, with N active examples.
 
         Returns:
-            The best candidate of each of the N examples, as `_best_rows` chooses it.
+            Images and score of the best candidate of each of the N examples.
         """
-        # Shape (N, P, D): P candidates of D values for each example. Below, they are one list of
-        # N · P candidates.
+        # P candidates of D values for each example, shape (N, P, D).
         candidates = self._candidates(state)
         count = candidates.shape[1]
-        criterion = state.criterion.select(state.active_rows.repeat_interleave(count))
-        examples = state.examples[state.active_rows].repeat_interleave(count)
-        images, score = self._score_values(candidates.flatten(0, 1), examples, criterion, state)
+        # The candidates of all examples as one list, shape (N · P, D).
+        all_candidates = candidates.flatten(0, 1)
+        # Row of the example to which each candidate belongs, shape (N · P,).
+        rows = state.active_rows.repeat_interleave(count)
+        criterion = state.criterion.select(rows)
+        images, score = self._score_values(all_candidates, state.examples[rows], criterion, state)
         is_met = criterion.reached(score.predicted)
         self._learn(state, candidates, score.cost.unflatten(0, (-1, count)))
-        best = _best_rows(score.cost, is_met, count)
+        best = _best_candidates(score.cost, is_met, count)
         return Evaluation(
-            values=candidates.flatten(0, 1)[best],
+            values=all_candidates[best],
             images=images[best],
             score=Score(score.cost[best], score.gap[best], score.predicted[best]),
             is_criterion_met=is_met[best],
@@ -80,50 +94,49 @@ class GradientFree(Descent):
         )
 
     def _candidates(self, state: State) -> Tensor:
-        """Return the P candidates that are evaluated next for each of the N active examples.
-
-        By default, P is 1.
+        """Return the candidates to evaluate next. By default, each example has one.
 
         Args:
-            state: State of the search.
+            state: State of the search, with N active examples.
 
         Returns:
-            Attack values, shape (N, P, D).
+            D attack values of P candidates of each active example, shape (N, P, D).
         """
         return state.candidate[state.active_rows][:, None]
 
     def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Use the costs of the candidates for later steps. By default, do nothing.
+        """Adapt the search to the costs of the candidates. By default, do nothing.
 
         Args:
-            state: State of the search.
-            candidates: P candidates of each of the N active examples, shape (N, P, D).
+            state: State of the search, with N active examples.
+            candidates: D attack values of P candidates of each active example, shape (N, P, D).
             costs: Cost of each candidate, shape (N, P).
         """
 
     def _score_values(
         self, values: Tensor, examples: Tensor, criterion: Criterion, state: State
     ) -> tuple[Tensor, Score]:
-        """Render and classify candidates, as many at a time as memory permits.
+        """Render and classify candidates, in groups that fit in memory.
 
         Args:
             values: Attack values of A candidates, shape (A, D).
-            examples: Index of the example of each candidate, shape (A,).
+            examples: Index of the example to which each candidate belongs, shape (A,).
             criterion: Source and target classes of the A candidates.
             state: State of the search, which has the batch size.
 
         Returns:
-            Images of the V views, shape (A, V, 3, H, W), and the scores of the A candidates.
+            Images of the V views of each candidate, shape (A, V, 3, H, W), and the scores of the
+            candidates.
         """
-        images = []
+        image_groups = []
         scores = []
-        for rows in torch.arange(len(values)).split(self.problem.group_size):
-            part = self.problem.render(values[rows], examples[rows])
-            images.append(part)
+        for group in torch.arange(len(values)).split(self.problem.group_size):
+            images = self.problem.render(values[group], examples[group])
+            image_groups.append(images)
             with self.phases("attack_classifier"):
-                scores += self._score_images(part, criterion.select(rows), state.batch_size)
+                scores += self._score_images(images, criterion.select(group), state.batch_size)
         view_count = criterion.source.shape[1]
-        return torch.cat(images), Score.of_examples(scores, view_count)
+        return torch.cat(image_groups), Score.of_examples(scores, view_count)
 
     def _score_images(
         self, images: Tensor, criterion: Criterion, batch_size: BatchSize
@@ -157,8 +170,8 @@ class GradientFree(Descent):
         classes = criterion.select(rows)
         logits = self.model(batch)
         expected_logits = self.expectation(self.model, batch, logits)
-        # In float32, the cross entropy rounds to zero for logit gaps above 17, so
-        # candidates could not be compared. In float64, they can.
+        # Use float64, because the cross entropy in float32 rounds to zero for logit gaps above
+        # 17, and candidates could not be compared.
         cost = adversarial_cost(expected_logits.double(), classes.source, classes.target)
         return Score(
             cost=cost.to(batch),
@@ -167,28 +180,35 @@ class GradientFree(Descent):
         )
 
     def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
-        """Return whether each candidate has a lower cost than the accepted values, shape (N,)."""
+        """Return a mask of the candidates that lower the cost of their examples, shape (N,).
+
+        Args:
+            state: State of the search, with the costs before the last step.
+            evaluation: Scores of one candidate for each of the N active examples.
+        """
         return evaluation.score.cost < state.cost[state.active_rows]
 
 
-def _best_rows(cost: Tensor, is_met: Tensor, count: int) -> Tensor:
+def _best_candidates(cost: Tensor, is_met: Tensor, count: int) -> Tensor:
     """Choose the best candidate of each of N examples.
 
-    If some candidates of an example reach the criterion, the best is the one
-    with the lowest cost among these. Otherwise it is the one with the lowest
-    cost of all candidates of the example.
+    It is the candidate of lowest cost among those that reach the criterion. If
+    none reaches the criterion, it is the candidate of lowest cost.
 
     Args:
-        cost: Cost of each candidate, shape (N · count,).
+        cost: Cost of each candidate. The candidates of an example follow each
+            other, shape (N · count,).
         is_met: Mask of the candidates that reach the criterion, shape (N · count,).
         count: Number of candidates of each example.
 
     Returns:
         Index of the best candidate of each example among all N · count, shape (N,).
     """
+    # One row for each example, one column for each of its candidates.
     costs = cost.unflatten(0, (-1, count))
     is_met = is_met.unflatten(0, (-1, count))
-    is_excluded = is_met.any(1, keepdim=True) & ~is_met
-    # Index among the candidates of the same example, shape (N,).
-    chosen = costs.masked_fill(is_excluded, torch.inf).argmin(1)
-    return torch.arange(len(costs), device=cost.device) * count + chosen
+    has_success = is_met.any(1, keepdim=True)
+    is_excluded = has_success & ~is_met
+    best_column = costs.masked_fill(is_excluded, torch.inf).argmin(1)
+    first_of_row = torch.arange(len(costs), device=cost.device) * count
+    return first_of_row + best_column

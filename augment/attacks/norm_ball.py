@@ -1,4 +1,4 @@
-"""Norm-balls in a space of parameters, and the draws and steps of attacks within them."""
+"""Norm-balls of attack values: projections, gradient steps and random draws."""
 
 import math
 from collections.abc import Callable
@@ -11,21 +11,23 @@ from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import Ball, nearest_in_box
 
-# A convex set of vectors of D values, given as a function. The function takes values (A, D) and
-# returns the nearest points of the set, shape (A, D). Its argument `within` is a ball that must
-# contain these points, too. The center of the ball is in the set. An example is `unconstrained`.
+# A convex set of vectors, given by its projection. This function takes vectors, shape (A, D), and
+# returns the nearest vectors of the set. With the argument `within`, a `Ball` whose center is in
+# the set, it returns the nearest vectors that lie in both. `unconstrained` is such a function.
 Domain = Callable[..., Tensor]
 
 
 def unconstrained(values: Tensor, within: Ball | None = None) -> Tensor:
-    """Find the nearest points in the domain of all values.
+    """Project values onto a ball. Without a ball, return them unchanged.
+
+    This is the projection of attacks whose values are all feasible.
 
     Args:
-        values: Values, shape (A, D).
-        within: Ball in which the points must lie. None for no ball.
+        values: A vectors of D values, shape (A, D).
+        within: Ball that must contain the result. None for no ball.
 
     Returns:
-        The nearest points, shape (A, D).
+        The nearest vectors in the ball, shape (A, D).
     """
     return nearest_in_box(values, -math.inf, math.inf, within)
 
@@ -40,21 +42,23 @@ def take_step(
 ) -> Tensor:
     """Take a step of projected gradient descent.
 
-    Attacks on scenes and adversarial training on images (PGD, Madry et al.
-    2018) both take this step.
+    The values move against the gradient. Then they are replaced by the nearest
+    values that are feasible and lie in the norm-ball. Attacks on scenes and
+    adversarial training on images (PGD, Madry et al. 2018) both take this step.
 
     Args:
-        settings: Norm-ball and steps.
-        values: Values, shape (A, D). With the norm "linf" and a step
-            "sign" or "raw", the shape may also be (A, ...).
+        settings: Norm and radius of the ball, and the kind and size of the step.
+        values: A vectors of D values, shape (A, D). With the norm "linf" and a
+            step "sign" or "raw", the shape may also be (A, ...).
         gradient: Gradient of the cost with respect to the values, of the
             same shape.
-        center: Centers of the balls, of the same shape.
-        domain: Feasible values, which contain the centers.
-        length: Factor of the step, a number or shape (A, 1).
+        center: Center of the ball of each vector, of the same shape.
+        domain: Projection onto the feasible values, which contain the centers.
+            By default, all values are feasible.
+        length: Factor of the length of the step, a number or shape (A, 1).
 
     Returns:
-        Values after the step, which are feasible and lie in the ball.
+        Values after the step, of the same shape.
 
     Example:
         >>> settings = StepSettings("linf", radius=0.1, step="sign", step_size=0.3)
@@ -67,14 +71,17 @@ def take_step(
 
 
 def scale_gradient(settings: StepSettings, gradient: Tensor) -> Tensor:
-    """Scale a gradient to a step, which is to be subtracted.
+    """Compute the step that gradient descent subtracts from the values.
+
+    The step is the gradient ("raw"), its sign ("sign") or its direction
+    ("unit"), times the step size.
 
     Args:
-        settings: Norm-ball and steps.
-        gradient: Gradient of the cost, shape (A, D).
+        settings: Kind and size of the step.
+        gradient: Gradients of A costs with respect to D values each, shape (A, D).
 
     Returns:
-        Step, shape (A, D). It is zero where the gradient is zero.
+        Steps, shape (A, D). A step is zero if its gradient is zero.
     """
     if settings.step == "raw":
         return settings.step_size * gradient
@@ -92,16 +99,17 @@ def scale_gradient(settings: StepSettings, gradient: Tensor) -> Tensor:
 def project(
     settings: StepSettings, values: Tensor, center: Tensor, domain: Domain = unconstrained
 ) -> Tensor:
-    """Find the nearest points that are feasible and lie in the ball.
+    """Find the nearest values that are feasible and lie in the norm-ball.
 
     Args:
-        settings: Norm-ball and steps.
-        values: Values, shape (A, D).
-        center: Centers of the balls, shape (A, D).
-        domain: Feasible values, which contain the centers.
+        settings: Norm and radius of the ball. A radius of None means no ball.
+        values: A vectors of D values, shape (A, D).
+        center: Center of the ball of each vector, shape (A, D).
+        domain: Projection onto the feasible values, which contain the centers.
+            By default, all values are feasible.
 
     Returns:
-        The nearest points, shape (A, D).
+        The nearest values, shape (A, D).
     """
     ball = None if settings.radius is None else Ball(center, settings.radius, settings.norm)
     return domain(values, within=ball)
@@ -113,23 +121,25 @@ def sample(
     generator: torch.Generator,
     used: Tensor | None = None,
 ) -> Tensor:
-    """Draw values uniformly from the ball around each center.
+    """Draw a vector of values uniformly from the norm-ball around each center.
 
     Args:
-        settings: Norm-ball and steps.
-        center: Centers of the balls, shape (A, D).
+        settings: Norm and radius of the balls.
+        center: Centers of A balls of D dimensions, shape (A, D).
         generator: CPU generator of the random numbers.
-        used: Mask of the axes along which values are drawn, shape (A, D).
-            None for all axes.
+        used: Mask of the values that are drawn, shape (A, D). The others are
+            those of the center. None draws all values.
 
     Returns:
-        Values, shape (A, D).
+        Drawn values, shape (A, D).
 
     Raises:
         InputError: If there is no radius.
     """
     if settings.radius is None:
-        raise InputError("random values are drawn from the norm-ball, but radius is None: set it")
+        raise InputError(
+            "radius is None, but random values are drawn from the norm-ball: set radius"
+        )
     used_on_cpu = None if used is None else used.cpu()
     if settings.norm == "linf":
         offset = 2 * torch.rand(center.shape, generator=generator) - 1
@@ -141,23 +151,23 @@ def sample(
 
 
 def _sample_unit_ball(shape: torch.Size, generator: torch.Generator, used: Tensor | None) -> Tensor:
-    """Draw points uniformly from the unit ball of the L2 norm.
+    """Draw points uniformly from unit balls of the L2 norm.
 
     Args:
-        shape: Shape (A, D) of the points.
+        shape: Shape (A, D): A points with D coordinates each.
         generator: CPU generator of the random numbers.
-        used: Mask of the axes along which points are drawn, shape (A, D). Coordinates along
-            the other axes are 0. None for all axes.
+        used: Mask of the coordinates that are drawn, shape (A, D). The others are 0, so that the
+            ball of a point may have fewer dimensions. None draws all coordinates.
 
     Returns:
         Points, shape (A, D).
     """
     direction = torch.randn(shape, generator=generator)
-    axis_count: int | Tensor = shape[1]
+    dimension_count: int | Tensor = shape[1]
     if used is not None:
         direction = direction * used
-        axis_count = used.sum(1, keepdim=True)
-    # With n axes, a ball of radius r has r^n of the volume of the unit ball. The distance of a
-    # uniformly drawn point is therefore the n-th root of a uniform number in [0, 1].
-    distance = torch.rand(shape[0], 1, generator=generator) ** (1 / axis_count)
+        dimension_count = used.sum(1, keepdim=True)
+    # A uniform point of the unit ball in n dimensions has a distance below r with probability
+    # r^n. Its distance is therefore distributed like the n-th root of a uniform number in [0, 1].
+    distance = torch.rand(shape[0], 1, generator=generator) ** (1 / dimension_count)
     return direction / direction.norm(dim=1, keepdim=True) * distance

@@ -40,29 +40,31 @@ def descend(
     restarts: Iterable[Tensor] = (),
     seed: int = 0,
 ) -> DescentResult:
-    """Attack examples with the optimizer of the settings, with restarts.
+    """Attack examples with the optimizer that the settings choose.
 
-    Examples are attacked in groups of at most `problem.group_size`, which limits
-    the memory that the gradients take. The model runs in evaluation mode, and
-    its state is restored afterwards.
+    The examples are attacked in groups of at most `problem.group_size`, so that
+    the gradients fit in memory. The model runs in evaluation mode, and its state
+    is restored afterwards.
 
     Args:
         model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
             [0, 1] to logits (N, C).
-        problem: Attacked parameters and the scene that renders them.
-        criterion: Source and target classes of the A examples.
+        problem: Scene, and the parameters of it that are attacked.
+        criterion: Source and target classes of the A attacked examples.
         settings: Optimizer and its budget, margin, backtracking, batch size,
             and the random transformations of EOT (expectation over
             transformations).
         phases: Timer to which the seconds of the classifier passes are added.
             None for no timer.
-        examples: Indices of the attacked examples in the problem, shape (A,).
+        examples: Index of each attacked example in the problem, shape (A,).
             None attacks all examples.
-        start: Initial values, shape (A, D). None starts at `problem.start`.
+        start: Initial attack values, shape (A, D). None starts at
+            `problem.start`.
         restarts: Further initial values, each of shape (A, D). They are tried
             in turn for the examples that have not succeeded.
-        seed: Seed of the EOT transformations, of the noise with which leads
-            are compared, and of the optimizers that draw random numbers.
+        seed: Seed of the EOT transformations, of the sensor noise that
+            successes must survive, and of the optimizers that draw random
+            numbers.
 
     Returns:
         Result of the A examples.
@@ -85,7 +87,7 @@ def descend(
     if len(rows_by_group) == 1:
         return descent.run_with_restarts(criterion, examples, start, restarts)
 
-    # Every group needs all restarts, but an iterator yields them only once.
+    # Each group of examples uses all restarts, and an iterator would be empty after the first.
     restarts = list(restarts)
     result = None
     for rows in progress(rows_by_group, "groups of examples"):

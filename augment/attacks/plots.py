@@ -26,18 +26,18 @@ def draw_attack(
     probabilities_after: Tensor,
     classes: Sequence[str],
 ) -> Figure:
-    """Draw one view of an attack.
+    """Draw one view before and after an attack, with the light and the most probable classes.
 
     Args:
         before: Image before the attack, in [0, 1], shape (3, size, size).
         ball: White ball in the light after the attack, shape (3, size, size).
         after: Image after the attack, in [0, 1], shape (3, size, size).
-        probabilities_before: Probability of each class before, shape (C,).
-        probabilities_after: Probability of each class after, shape (C,).
+        probabilities_before: Probability of each class before the attack, shape (C,).
+        probabilities_after: Probability of each class after the attack, shape (C,).
         classes: Names of the C classes.
 
     Returns:
-        The figure. It belongs to no window: `figure.savefig(path)` writes it.
+        The figure. `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     axes_before, axes_light, axes_after, axes_bars = figure.subplots(
@@ -51,7 +51,13 @@ def draw_attack(
 
 
 def _show(axes: Axes, image: Tensor, title: str) -> None:
-    """Draw an image (3, size, size) below a title."""
+    """Draw an image with a title above it.
+
+    Args:
+        axes: Part of the figure to draw in.
+        image: Image, shape (3, size, size).
+        title: The title.
+    """
     pixels = image.permute(1, 2, 0).clamp(0, 1).numpy()
     axes.imshow(pixels, interpolation="nearest")
     axes.set_title(title, fontsize=9)
@@ -59,7 +65,12 @@ def _show(axes: Axes, image: Tensor, title: str) -> None:
 
 
 def _most_probable(probabilities: Tensor, classes: Sequence[str]) -> str:
-    """Name the most probable class and its probability."""
+    """Return a text with the most probable class and its probability.
+
+    Args:
+        probabilities: Probability of each class, shape (C,).
+        classes: Names of the C classes.
+    """
     probability, index = probabilities.max(0)
     return f"{classes[int(index)]} {float(probability):.0%}"
 
@@ -74,9 +85,10 @@ def _draw_probabilities(axes: Axes, before: Tensor, after: Tensor, classes: Sequ
         classes: Names of the C classes.
     """
     shown_count = min(SHOWN_CLASSES, len(classes))
-    # Classes are ordered by the larger of their two probabilities. `flip` puts the most probable
-    # class last, because matplotlib draws bars from the bottom to the top.
-    ranked = before.maximum(after).topk(shown_count).indices.flip(0)
+    # Order the classes by the larger of their two probabilities.
+    by_probability = before.maximum(after).topk(shown_count).indices
+    # matplotlib draws bars from the bottom to the top, so the most probable class comes last.
+    ranked = by_probability.flip(0)
     names = [classes[index] for index in ranked.tolist()]
     above = [row + 0.2 for row in range(shown_count)]
     below = [row - 0.2 for row in range(shown_count)]

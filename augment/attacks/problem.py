@@ -1,6 +1,6 @@
 """All parameters that an attack changes, as one vector of values."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -15,10 +15,11 @@ from augment.scene.scene import Scene
 
 
 class AttackProblem:
-    """Scene and the parameters that an attack changes.
+    """A scene, and the parameters of it that an attack changes, such as lighting and pose.
 
-    Each of the E examples of the scene has a vector of D values. It contains
-    the values of the first parameter, then those of the second, and so on.
+    Each of the E examples of the scene has a vector of D attack values. It
+    contains the values of the first parameter, then those of the second, and so
+    on.
 
     Args:
         scene: Scene to attack.
@@ -27,13 +28,14 @@ class AttackProblem:
     Attributes:
         scene: Scene to attack.
         parameters: Parameters to change, made for this scene.
-        start: Values at which attacks start, shape (E, D).
+        start: Values at which attacks start, one row for each example, shape (E, D).
         all_examples: Indices of all examples, shape (E,).
         group_size: Largest number of examples that are rendered at the same time,
-            which limits the memory.
+            so that they fit in memory.
     """
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
+        """Join the initial values of all parameters. See the class for the arguments."""
         self.scene = scene
         self.parameters = parameters
         self.group_size = scene.group_size
@@ -43,15 +45,15 @@ class AttackProblem:
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
     def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
-        """Return the conditions of the scene in which the parameters have the given values.
+        """Convert attack values to the light, shapes and colors with which examples are rendered.
 
         Args:
-            values: Values of A examples, shape (A, D).
-            examples: Indices of the examples in the scene, shape (A,).
+            values: D attack values of each of A examples, shape (A, D).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
-            Light, shape, colors and other conditions of the A examples,
-            differentiable with respect to the values.
+            Conditions of the A examples, differentiable with respect to the
+            values. What no parameter changes is that of the scene.
         """
         conditions = self.scene.conditions(examples)
         for parameter, parameter_values in self.split_by_parameter(values):
@@ -59,11 +61,11 @@ class AttackProblem:
         return conditions
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Render the V views of each example with the given values of the parameters.
+        """Render the V views of each example with the given attack values.
 
         Args:
-            values: Values of A examples, shape (A, D).
-            examples: Indices of the examples in the scene, shape (A,).
+            values: D attack values of each of A examples, shape (A, D).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Images in [0, 1], shape (A, V, 3, size, size), differentiable with
@@ -73,12 +75,12 @@ class AttackProblem:
 
     @torch.no_grad()
     def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
-        """Render examples without gradients, at most `group_size` of them at a time.
+        """Render the V views of examples without gradients, `group_size` examples at a time.
 
         Args:
-            values: Values of all E examples, shape (E, D).
-            examples: Indices of the examples to render, shape (A,). None
-                renders all examples.
+            values: D attack values of each of all E examples, shape (E, D).
+            examples: Index of each example to render, shape (A,). None renders
+                all examples.
 
         Returns:
             Images in [0, 1], shape (A, V, 3, size, size).
@@ -89,8 +91,11 @@ class AttackProblem:
         images = values.new_empty(len(examples), self.scene.views, 3, size, size)
         image_parts = images.split(self.group_size)
         example_parts = examples.split(self.group_size)
-        parts = list(zip(image_parts, example_parts, strict=True))
-        for image_part, example_part in progress(parts, "images") if len(parts) > 1 else parts:
+        parts: Iterable[tuple[Tensor, Tensor]] = zip(image_parts, example_parts, strict=True)
+        if len(image_parts) > 1:
+            parts = progress(list(parts), "images")
+        for image_part, example_part in parts:
+            # A part of the images is a view of `images`, so this fills `images`.
             image_part.copy_(self.render(values[example_part], example_part))
         return images
 
@@ -104,33 +109,33 @@ class AttackProblem:
         """Take a step of projected gradient descent with each parameter.
 
         Args:
-            values: Values of A examples, shape (A, D).
+            values: D attack values of each of A examples, shape (A, D).
             gradient: Gradient of the cost with respect to the values,
                 shape (A, D).
-            examples: Indices of the examples in the scene, shape (A,).
-            length: Factor of the steps of each example, shape (A, 1).
+            examples: Index of each of the A examples in the scene, shape (A,).
+            length: Factor of the step of each example, shape (A, 1).
 
         Returns:
             Values after the step, which are feasible and lie in the
             norm-balls, shape (A, D).
         """
-        value_parts = self.split_by_parameter(values)
-        gradient_parts = self.split_by_parameter(gradient)
+        gradient_parts = gradient.split(self._value_counts, dim=1)
         moved = []
-        for (parameter, value_part), (_, gradient_part) in zip(
-            value_parts, gradient_parts, strict=True
+        for (parameter, value_part), gradient_part in zip(
+            self.split_by_parameter(values), gradient_parts, strict=True
         ):
             moved.append(parameter.take_step(value_part, gradient_part, examples, length))
         return torch.cat(moved, dim=1)
 
     def search_scale(self, examples: Tensor) -> Tensor:
-        """Return standard deviations of random changes, see `Parameter.search_scale`.
+        """Return how much random search should change each attack value at first.
 
         Args:
-            examples: Indices of the examples in the scene, shape (A,).
+            examples: Index of each of A examples in the scene, shape (A,).
 
         Returns:
-            Standard deviation of each value, shape (A, D).
+            Standard deviation of the first random changes of each value, shape
+            (A, D). See `Parameter.search_scale`.
         """
         scales = [parameter.search_scale(examples) for parameter in self.parameters]
         return torch.cat(scales, dim=1).to(self.start)
@@ -138,10 +143,11 @@ class AttackProblem:
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls.
 
+        The values of each parameter are projected by themselves.
+
         Args:
-            values: Values of A examples, shape (A, D). The values of each
-                parameter are projected by `Parameter.project`.
-            examples: Indices of the examples in the scene, shape (A,).
+            values: D attack values of each of A examples, shape (A, D).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Projected values, shape (A, D).
@@ -151,19 +157,21 @@ class AttackProblem:
         return torch.cat(projected, dim=1)
 
     def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
-        """Draw random feasible values for all examples, one parameter after the other.
+        """Draw random feasible attack values for all examples.
+
+        A parameter with a radius draws from its norm-ball. A parameter without
+        one draws changes that are as long as those of an attack.
 
         Args:
             generator: CPU generator of the random numbers.
-            reached: Values that an attack reached, shape (E, D). Parameters
-                with a radius ignore them.
+            reached: Values that an attack reached, shape (E, D). Needed if a
+                parameter has no radius.
 
         Returns:
-            Random values, shape (E, D). See `Parameter.sample`.
+            Random values, shape (E, D).
 
         Raises:
             InputError: If a parameter has no radius and `reached` is None.
-                `StepSettings.sample` raises it.
         """
         if reached is None:
             samples = [parameter.sample(generator) for parameter in self.parameters]
@@ -173,28 +181,29 @@ class AttackProblem:
         return torch.cat([sample.to(self.start) for sample in samples], dim=1)
 
     def split_by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
-        """Split the values of examples into those of each parameter.
+        """Split the attack values of examples into the values of each parameter.
 
         Args:
-            values: Values of A examples, shape (A, D).
+            values: D attack values of each of A examples, shape (A, D).
 
         Returns:
-            Pairs of a parameter and its d of the D values, shape (A, d).
+            Pairs of a parameter and its values. A parameter with d of the D
+            values has shape (A, d).
         """
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
-    """Create the parameters that an attack changes of a scene.
+    """Prepare an attack on a scene.
 
     Args:
-        settings: Settings of the attack.
+        settings: Settings of the attack, with the parameters to attack.
         scene: The scene to attack.
 
     Returns:
-        The scene and its parameters. Without `settings.allow_negative`, negative radiance is
-        first removed from the light of the scene.
+        The scene and its attacked parameters. If `settings.allow_negative` is False, negative
+        radiance is first removed from the light of the scene.
     """
     if not settings.allow_negative:
         scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))

@@ -17,19 +17,27 @@ import torch
 from augment.attacks.descent import Decision, Evaluation, State
 from augment.attacks.gradient_free import GradientFree
 
-# The length of the random changes is multiplied by GROWTH after an accepted
-# candidate and by SHRINKAGE after a rejected one. Four rejections undo one
-# acceptance (the 1/5 success rule of evolution strategies).
+# Random search multiplies the length of its random changes by GROWTH after an
+# accepted candidate and by SHRINKAGE after a rejected one. Four rejections undo
+# one acceptance (the 1/5 success rule of evolution strategies).
 GROWTH = 1.5
 SHRINKAGE = GROWTH**-0.25
 
 
 @dataclass(frozen=True)
 class RandomSearch(GradientFree):
-    """Random search against one classifier, as the docstring of the module describes it."""
+    """Random search against one classifier: the (1+1) evolution strategy.
+
+    In a step, each example has one candidate: a random change of its accepted
+    values, which is accepted if it lowers the cost.
+    """
 
     def _step(self, state: State) -> None:
-        """Set the candidates of the active examples to random changes of their accepted values."""
+        """Compute the next candidate of each active example by a random change of its values.
+
+        Args:
+            state: State of the search. Its candidates and step counts are updated.
+        """
         rows = state.active_rows
         examples = state.examples[rows]
         # Standard deviation of each change, shape (N, D) for N active examples.
@@ -40,7 +48,16 @@ class RandomSearch(GradientFree):
         state.result.steps[rows] += 1
 
     def _decide(self, state: State, evaluation: Evaluation) -> Decision:
-        """Decide as the descent does, and adapt the lengths of the next changes."""
+        """Decide which candidates are accepted, and adapt the length of the next changes.
+
+        Args:
+            state: State of the search, with N active examples.
+            evaluation: Scores of their N candidates.
+
+        Returns:
+            Decisions of `Descent`, with a longer change after an accepted candidate and a
+            shorter change after a rejected one.
+        """
         decision = super()._decide(state, evaluation)
         factor = torch.where(decision.is_accepted, GROWTH, SHRINKAGE)
         return replace(decision, length_factor=factor)

@@ -19,8 +19,8 @@ from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
-# `_with_random_camera` draws the polar angle of a camera from the first range, in degrees, and
-# the visible width from the second range, in world units.
+# `_with_random_camera` draws the polar angle of a camera from the range `POLAR`, in degrees, and
+# the width of the visible region from the range `WIDTH`, in world units.
 POLAR = (20.0, 100.0)
 WIDTH = (1.8, 3.5)
 
@@ -28,17 +28,18 @@ WIDTH = (1.8, 3.5)
 # normalized mesh lies within this distance, so the camera is outside of the mesh.
 CLOSEST = 2.0
 
-# Field of view in degrees. If the camera of the scene is orthographic, every
-# second candidate has a perspective camera with this field of view.
+# If the camera of the scene is orthographic, every second camera that the search tries is a
+# perspective camera with this field of view in degrees.
 FOV = 45.0
 
-# Gray value of a background like in product photographs.
+# Gray value of the background that the search tries, like that of product photographs.
 LIGHT_GRAY = 0.9
 
 # Exposures that are tried, as factors of the exposure of the scene.
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
 
-# The search ends when the confidence is at least this high in all images.
+# The search for a scene ends when the classifier gives the true class at least this probability
+# in all images.
 CONFIDENCE_TO_STOP = 0.5
 
 Settings = TypeVar("Settings", bound=SceneSettings)
@@ -56,22 +57,24 @@ def find_scene(
 
     The search tries several cameras. Each is tried in the light of the scene, in
     the built-in environments and in uniform light, with several exposures, and
-    also in front of a light gray background.
+    also in front of a light gray background. It ends when the classifier gives
+    the true class a probability of at least `CONFIDENCE_TO_STOP` in all images.
 
     Args:
         classifier: The classifier to attack.
-        settings: Settings of a scene.
+        settings: Settings of the scene with which the search starts.
         attack: Settings of the attack.
         build: A function from settings of a scene to the scene.
         cameras: Number of cameras to try.
         draws: CPU generator of the random cameras.
 
     Returns:
-        Settings of the scene with the highest confidence. The given settings,
-        if all images are correct with them, or if no candidate is better.
+        Settings of the scene with the highest confidence. These are the given
+        settings if the classifier is right in all their images, or if no other
+        scene is recognized.
     """
     [confidence] = _confidences(build(settings), attack, classifier)
-    # The confidence is 0 if an image is misclassified.
+    # `_confidences` returns 0 if an image is misclassified.
     if confidence > 0:
         return settings
     highest = 0.0
@@ -87,10 +90,10 @@ def find_scene(
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """Yield settings of a scene with different cameras.
+    """Yield copies of the settings of a scene with different cameras and backgrounds.
 
-    If the only background is a gray value, each candidate is followed by the
-    same candidate in front of light gray.
+    If the only background is a gray value, each camera is used twice: with this
+    background and with a light gray one.
 
     Args:
         settings: Settings of the scene.
@@ -99,14 +102,14 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
         draws: CPU generator of the random cameras.
 
     Yields:
-        Settings of the next candidate.
+        Settings of a scene to try.
     """
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
         candidate = settings
         if index > 0:
-            # A field of view of None stands for an orthographic camera.
-            becomes_perspective = settings.fov is None and index % 2 == 1
+            is_orthographic = settings.fov is None
+            becomes_perspective = is_orthographic and index % 2 == 1
             fov = FOV if becomes_perspective else settings.fov
             candidate = _with_random_camera(replace(settings, fov=fov), draws)
         yield candidate
@@ -115,13 +118,20 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
 
 
 def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
-    """Return a copy of the settings with a camera at a random place and the same field of view."""
+    """Return a copy of a scene's settings with a camera at a random place.
+
+    The field of view stays the same, or the camera stays orthographic.
+
+    Args:
+        settings: Settings of the scene.
+        draws: CPU generator of the random numbers.
+    """
     polar, azimuth, width = torch.rand(3, generator=draws).tolist()
     lowest_polar, highest_polar = POLAR
     narrowest, widest = WIDTH
     if settings.fov is not None:
-        # The visible width and the field of view determine the distance of a perspective
-        # camera. At the distance `CLOSEST`, it sees this width at the origin.
+        # Width of what a perspective camera sees at the origin if it is `CLOSEST` away. A
+        # smaller width would bring the camera closer.
         closest_width = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
         narrowest = max(narrowest, closest_width)
         widest = max(widest, 2 * closest_width)
@@ -139,14 +149,15 @@ def _best_light(
     """Find the light and the exposure in which a classifier recognizes a scene best.
 
     Args:
-        scene: Scene of the settings.
+        scene: Scene that was built from the settings.
         settings: Settings of the scene.
         attack: Settings of the attack.
         classifier: Classifier to attack.
 
     Returns:
-        The highest confidence, as `_confidences` defines it, and the settings with the light
-        and the exposure that give it.
+        The highest confidence, and the settings with the light and the exposure that give it.
+        A confidence is the lowest probability of the true class in all images, or 0 if an image
+        is misclassified.
     """
     names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
     degree = harmonics_of(scene.basis).degree
@@ -158,7 +169,7 @@ def _best_light(
             exposure = settings.exposure * factor
             candidates.append(replace(settings, light=name, exposure=exposure))
             coefficients.append(light * exposure)
-    # One scene shows all candidates, so that they are rendered and classified in large batches.
+    # Put all candidates into one scene, so that they are rendered and classified in large batches.
     scene_of_candidates = _under_lights(scene, torch.stack(coefficients))
     confidences = _confidences(scene_of_candidates, attack, classifier, groups=len(candidates))
     highest, index = confidences.max(0)
@@ -166,20 +177,21 @@ def _best_light(
 
 
 def _under_lights(scene: Scene, skies: Tensor) -> Scene:
-    """Return a scene with N copies of the examples, one copy for each environment light.
+    """Return a scene that repeats all examples in each of several environment lights.
 
     Args:
         scene: Scene of E examples.
-        skies: N environment lights, each with K coefficients, shape (N, K, 3).
+        skies: RGB harmonic coefficients of N environment lights, shape (N, K, 3).
 
     Returns:
         Scene of N · E examples. Example n · E + e is example e in light n. Projector and lamps
         are those of the given scene.
     """
     count = len(skies)
-    # Shape (N · E, K, 3).
+    # Environment light of each new example, shape (N · E, K, 3).
     environment = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
-    # The environment has the first K coefficients of a light. Local lights have the others.
+    # The first K coefficients of an example are its environment light, and the others its
+    # projector and lamps.
     local_lights = scene.lights.repeat(count, 1, 1)[:, environment.shape[1] :]
     lights = torch.cat([environment, local_lights], dim=1)
     return scene.changed(examples=[*scene.examples] * count, lights=lights)
@@ -192,24 +204,24 @@ def _confidences(
     classifier: Classifier,
     groups: int = 1,
 ) -> Tensor:
-    """Compute the lowest confidence in the true class among the images of each group.
+    """Compute how surely a classifier recognizes each group of examples before an attack.
 
-    The confidence of an image is the probability of its true class. A misclassified image has
-    a confidence of 0.
+    The confidence of an image is the probability of its true class, or 0 if the image is
+    misclassified. The confidence of a group is the lowest one of its images.
 
     Args:
-        scene: Scene of E examples with V views, rendered as before an attack.
+        scene: Scene of E examples.
         attack: Settings of the attack.
         classifier: Classifier to attack.
-        groups: Number of groups of E / groups successive examples.
+        groups: Number of groups. Each has E / groups successive examples.
 
     Returns:
-        Lowest confidence, shape (groups,).
+        Confidence of each group, shape (groups,).
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)
     logits = logits_of(preprocessed_model(attack, classifier), images, attack.batch_size)
-    # Shape (E, V, C) for C classes.
+    # Probability of each of the C classes in each view of each example, shape (E, V, C).
     probabilities = logits.softmax(2)
     labels = source_labels(scene, logits, classifier)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]

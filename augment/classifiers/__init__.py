@@ -33,7 +33,7 @@ from augment.settings import NormalizeLight
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
 
-# Start of the name of a Python function.
+# A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
 PYTHON = "python:"
 
 __all__ = [
@@ -47,19 +47,21 @@ __all__ = [
 
 
 class Source(NamedTuple):
-    """Functions that make the classifiers of one source.
+    """Functions that make the classifiers of one source, such as torchvision.
 
-    If the name of the source ends in a colon, the name of the model follows
-    there, and it is the first argument of both functions.
+    A source with several models has a name with a colon at the end, such as
+    "torchvision:". Its functions take the name of the model as their first
+    argument.
 
     Attributes:
-        load: Makes a classifier with weights. It takes a file of weights, or
-            None for the weights of the source and, if `takes_facts`, the
+        load: Function that makes a classifier with weights. It takes a file of
+            weights (None for the published weights) and, if `takes_facts` is
+            True, `NetworkFacts`.
+        build: Function that makes a classifier with random weights. It takes the
+            pixels per side of the images and, if `takes_facts` is True,
             `NetworkFacts`.
-        build: Makes a classifier with random weights. It takes the number of
-            pixels per side and, if `takes_facts`, the `NetworkFacts`.
-        takes_facts: Whether the networks have any classes, sizes and
-            normalizations.
+        takes_facts: Whether the user may choose classes, image size and
+            normalization (the `NetworkFacts`).
     """
 
     load: Callable[..., Classifier]
@@ -68,14 +70,22 @@ class Source(NamedTuple):
 
 
 def _efficientnet_lite(version: int) -> Source:
-    """Return the source of EfficientNet-Lite 0, 1 or 2."""
+    """Return the functions that make the classifier EfficientNet-Lite 0, 1 or 2."""
     load = partial(load_efficientnet_lite, version)
     build = partial(build_efficientnet_lite, version)
     return Source(load, build)
 
 
 def _load_python(name: str, weights: Path | None) -> Classifier:
-    """Call a function of a user, which loads its own weights."""
+    """Load a classifier by a Python function that the user wrote.
+
+    Args:
+        name: Function, such as "package.module:function". It loads its own weights.
+        weights: File of weights, which must be None.
+
+    Raises:
+        InputError: If a file of weights is given.
+    """
     if weights is not None:
         raise InputError(
             f"weights={weights} is not for python:{name}, which loads its own: leave it out",
@@ -84,7 +94,8 @@ def _load_python(name: str, weights: Path | None) -> Classifier:
     return load_python(name)
 
 
-# `train.networks` adds "run:", the networks that this project trains.
+# Sources by their names. The module `train.networks` adds "run:", for networks that this project
+# trains.
 SOURCES = {
     "efficientnet_lite0": _efficientnet_lite(0),
     "efficientnet_lite1": _efficientnet_lite(1),
@@ -92,7 +103,7 @@ SOURCES = {
     SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
     "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
     "timm:": Source(load_timm, build_timm, takes_facts=True),
-    # The function of a user loads its own weights.
+    # A function of the user chooses the size itself, so the size is not used.
     PYTHON: Source(_load_python, lambda model, size: load_python(model)),
 }
 
@@ -122,9 +133,9 @@ def load_classifier(
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1]. None for the
             normalization of the source.
-        normalize_light: Whether the light of each image is normalized first:
-            True, or a mapping with fields of `NormalizedLightSettings`. This
-            has nothing to do with `normalization`.
+        normalize_light: How the light of each image is normalized first: True
+            for the defaults, or a mapping with fields of
+            `NormalizedLightSettings`. This is independent of `normalization`.
 
     Returns:
         The classifier.
@@ -148,7 +159,16 @@ def load_classifier(
 
 
 def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
-    """Load a classifier without normalized light."""
+    """Load a classifier by name, without the normalization of light.
+
+    Args:
+        name: Name of a source with its model, or path of a file with a network.
+        path: File of weights. None for the weights of the source.
+        facts: Classes, image size and normalization that the user gave.
+
+    Raises:
+        InputError: If the name is unknown, or an argument does not fit the source.
+    """
     source, colon, model = name.partition(":")
     if source + colon in SOURCES:
         arguments: list[Any] = [model, path] if colon else [path]
@@ -174,18 +194,15 @@ def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
 
 
 def build_classifier(name: str, size: int, classes: Sequence[str] | None = None) -> Classifier:
-    """Build the network of `load_classifier` with random weights.
+    """Build a classifier with random weights.
 
-    The function of `python:package.module:function` keeps the weights and the
-    size that it chooses, and a file keeps its weights.
+    A Python function of the user chooses weights and size itself, and a file
+    contains its weights. These classifiers are loaded as they are.
 
     Args:
         name: Name of a classifier, as for `load_classifier`.
-        size: Pixels per side.
+        size: Pixels per side of the images.
         classes: Names of the classes. None for those of the source.
-
-    Returns:
-        The classifier.
     """
     facts = as_facts(classes)
     source, colon, model = name.partition(":")
@@ -193,4 +210,6 @@ def build_classifier(name: str, size: int, classes: Sequence[str] | None = None)
         return build_file(name, size, facts)
     known = SOURCES[source + colon]
     arguments: list[Any] = [model, size] if colon else [size]
-    return known.build(*arguments, *([facts] if known.takes_facts else []))
+    if known.takes_facts:
+        arguments.append(facts)
+    return known.build(*arguments)

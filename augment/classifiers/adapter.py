@@ -32,28 +32,29 @@ if TYPE_CHECKING:
 
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
-# `require_unit_range` accepts image values that exceed [0, 1] by at most this much.
-# Interpolation and noise can produce such values.
+# Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
 OVERSHOOT = 0.1
-# `NetworkCall` refuses a network that returned probabilities for this many images.
-# Logits of a single image may be in [0, 1] and sum to 1 by chance.
+# A network is refused if its outputs for this many images look like probabilities. The logits of a
+# single image may do so by chance.
 MIN_PROBABILITY_ROWS = 2
-# Value of all pixels of the image with which `Classifier.has_gradients` calls a function.
+# Pixel value of the gray image with which a function is called to find out whether it has
+# gradients.
 GRAY = 0.5
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Threshold on the log-odds of a class. Images above it are classified as the class.
+    """Threshold for the decision whether an image shows a class.
 
-    The threshold is the lowest at which the false-positive rate on a folder of
-    photographs is at most `false_positive_rate`.
+    An image shows the class if its log-odds of the class exceed the threshold.
+    The threshold was chosen on a folder of photographs: it is the lowest one at
+    which the false-positive rate is at most `false_positive_rate`.
 
     Attributes:
         label: Name of the class.
-        threshold: Log-odds above which an image is classified as the class.
-        false_positive_rate: Largest allowed fraction of negatives above the
-            threshold, in [0, 1].
+        threshold: Threshold of the log-odds.
+        false_positive_rate: Largest permitted fraction of the photographs
+            without the class that exceed the threshold, in [0, 1].
         folder: Name of the folder of photographs.
         images: Hash of the photographs.
         negatives: Number of photographs that do not show the class.
@@ -68,13 +69,13 @@ class OperatingPoint:
 
 
 class NetworkCall:
-    """Calls a network and checks that it returns logits.
+    """Call a network, and check that it returns logits and no probabilities.
 
     Attributes:
-        name: Start of error messages, such as "classifier NAME".
-        probability_rows: Number of images so far for which the network returned
-            probabilities. None after the first batch that has other values.
-            Later batches are then no longer checked, which saves time.
+        name: Name of the network at the start of error messages.
+        probability_rows: Number of images so far whose outputs look like
+            probabilities. None as soon as a batch has other outputs. Then no
+            further batch is checked, which saves time.
     """
 
     def __init__(self, name: str):
@@ -84,12 +85,12 @@ class NetworkCall:
     def __call__(
         self, network: Callable[[Tensor], Tensor], images: Tensor, classes: int | None = None
     ) -> Tensor:
-        """Compute the logits of images.
+        """Compute the logits of images, and check them.
 
         Args:
-            network: Any callable from images to logits.
-            images: RGB in [0, 1], shape (N, 3, H, W).
-            classes: Number of classes C, None if unknown.
+            network: Any function from images to logits.
+            images: RGB images in [0, 1], shape (N, 3, H, W).
+            classes: Number of classes C. None if unknown.
 
         Returns:
             Logits, shape (N, C).
@@ -102,7 +103,7 @@ class NetworkCall:
         try:
             logits = network(images)
         except Exception as error:
-            # `BatchSize` needs errors of memory as they are, and an `InputError` is clear already.
+            # The caller handles errors of memory. An `InputError` already tells what is wrong.
             if isinstance(error, InputError) or is_out_of_memory(error):
                 raise
             raise InputError(self._failure(network, images, error)) from error
@@ -122,7 +123,7 @@ class NetworkCall:
     def _failure(
         self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception
     ) -> str:
-        """Write the error message for a network that raised an error.
+        """Return the message of the error for a network that failed on images.
 
         Args:
             network: The network.
@@ -130,8 +131,8 @@ class NetworkCall:
             error: Error that the network raised.
 
         Returns:
-            A sentence with the error and a remedy. If no weight of the network has the dtype of
-            the images, the remedy is another dtype.
+            A sentence with the error and a remedy. If the weights of the network have another
+            dtype than the images, the remedy is to convert one of them.
         """
         weights = network.parameters() if isinstance(network, nn.Module) else iter(())
         dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
@@ -144,10 +145,13 @@ class NetworkCall:
         return f"{reason}: use a network that takes such images"
 
     def _require_no_probabilities(self, logits: Tensor) -> None:
-        """Raise InputError if the network has returned probabilities so far.
+        """Check that the network does not return probabilities instead of logits.
 
         Args:
             logits: Outputs of the network for a batch, shape (N, C).
+
+        Raises:
+            InputError: If all outputs so far look like probabilities.
         """
         if self.probability_rows is None or not len(logits):
             return
@@ -184,25 +188,27 @@ def are_probabilities(outputs: Tensor) -> bool:
 class Classifier(nn.Module):
     """Frozen classifier from RGB images in [0, 1] to logits of C classes.
 
-    The logits of a network are differentiable with respect to the pixels. The parameters of
-    the network need no gradient. The network stays in evaluation mode, even
-    after `train()`. Images are not resized.
+    If the function is a network of torch, the logits are differentiable with
+    respect to the pixels. The parameters of the network get no gradient. The
+    network stays in evaluation mode, even after `train()`. Images are not
+    resized.
 
     Args:
-        function: Network, or another function from images (N, 3, size, size),
-            tensors or NumPy arrays, to logits (N, C). If it is a module, it is
-            frozen, put in evaluation mode and moved with the classifier.
+        function: Function from images, shape (N, 3, size, size), to logits,
+            shape (N, C). It takes tensors or NumPy arrays. If it is a
+            `torch.nn.Module`, it is frozen, put in evaluation mode and moved
+            with the classifier.
         size: Pixels per side of the images, from 1 to 4,096.
         classes: Names of the C classes in the order of the logits. Each name
             occurs once, because labels are found by name.
         name: Name of the classifier in messages.
-        normalize_light: Whether the light of each image is normalized before
-            the network sees it: True, or a mapping with fields of
-            `NormalizedLightSettings`.
+        normalize_light: How the light of each image is normalized before the
+            network sees it: True for the defaults, or a mapping with fields of
+            `NormalizedLightSettings`. None for no normalization.
 
     Attributes:
         operating_points: Thresholds for `detect`, at most one for each class.
-            Empty if the network stores none.
+            Empty if the network has none.
 
     Raises:
         InputError: If a class name occurs twice, if there is no class, or if
@@ -219,6 +225,7 @@ class Classifier(nn.Module):
         name: str = "callable",
         normalize_light: NormalizeLight = None,
     ):
+        """Check the arguments, and freeze the function. See the class for the arguments."""
         super().__init__()
         require_kind("name", name, str, "a string for messages")
         require_kind(
@@ -266,11 +273,10 @@ class Classifier(nn.Module):
             raise InputError(
                 f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}"
             )
-        # Lowest and highest value of all images.
+        # Lowest and highest value of all images. There are none if the batch is empty.
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
-        # The range is checked after the network was called: on a GPU, this check waits
-        # for results, and the network computes meanwhile.
+        # Check the range after the call, because the check waits until the GPU is idle.
         require_unit_range("images", *extremes)
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")
@@ -283,24 +289,22 @@ class Classifier(nn.Module):
 
     @property
     def normalized_light(self) -> NormalizedLightSettings | None:
-        """How the light of images is normalized first. None if it is not."""
+        """Settings with which the light of images is normalized. None if it is not normalized."""
         return light_settings(self.function)
 
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Classifier:
-        """Return a classifier of the same network that normalizes the light of images first.
+        """Return a classifier that first normalizes the light of images.
 
-        It has no operating points, because its log-odds differ.
+        It shares the network. It has no operating points, because its logits
+        differ.
 
         Args:
-            normalize_light: True, or a mapping with fields of
-                `NormalizedLightSettings`. None or False returns the classifier
-                as it is.
-
-        Returns:
-            The classifier. It shares the network.
+            normalize_light: True for the defaults, or a mapping with fields of
+                `NormalizedLightSettings`. With None or False, the classifier
+                itself is returned.
 
         Raises:
-            InputError: If the light is normalized already.
+            InputError: If this classifier normalizes the light already.
 
         Example:
             >>> import torch
@@ -338,7 +342,7 @@ class Classifier(nn.Module):
     def detect(
         self, images: Float[Tensor, "N 3 size size"], label: str | None = None
     ) -> Bool[Tensor, " N"]:
-        """Decide which images show a class, by the threshold of its operating point.
+        """Decide which images show a class, by the threshold that is stored for the class.
 
         Args:
             images: RGB images in [0, 1], shape (N, 3, size, size).
@@ -364,7 +368,7 @@ class Classifier(nn.Module):
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
     def train(self, mode: bool = True) -> Self:
-        """Keep evaluation mode: running batch statistics and no dropout."""
+        """Do nothing but keep evaluation mode, whatever `mode` is."""
         return super().train(False)
 
     def label(self, class_name: str | int) -> int:
@@ -373,12 +377,9 @@ class Classifier(nn.Module):
         Args:
             class_name: Name of the class, or its index.
 
-        Returns:
-            The index.
-
         Raises:
-            InputError: If there is no such class. The sentence suggests the
-                nearest names.
+            InputError: If there is no such class. The message suggests similar
+                names.
         """
         return class_index(self.classes, class_name, f"classifier {self.name}")
 
@@ -404,12 +405,12 @@ def as_images(name: str, images: object) -> Tensor:
 
 
 def require_unit_range(name: str, *extremes: Tensor) -> None:
-    """Check that values of images are in [0, 1], up to `OVERSHOOT`.
+    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`.
 
     Args:
-        name: Name of the argument, for the error.
-        extremes: The lowest and the highest value. Empty if there are no
-            images.
+        name: Name of the argument with the images, for the error.
+        extremes: The lowest and the highest value of the images. Empty if there
+            are no images.
 
     Raises:
         InputError: If a value is NaN or far from [0, 1]. This happens with
@@ -426,14 +427,11 @@ def require_unit_range(name: str, *extremes: Tensor) -> None:
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
-    """Convert the names of classes to a tuple of strings.
+    """Convert a list of names of classes to a tuple of strings.
 
     Args:
-        name: Name of the argument, for errors.
+        name: Name of the argument with the list, for errors.
         classes: List of names in the order of the logits.
-
-    Returns:
-        The names.
 
     Raises:
         InputError: If `classes` is not a list of strings. A single string is
@@ -447,9 +445,7 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
 
 
 class Wrapper(nn.Module):
-    """Module that holds another network and passes images to it.
-
-    Subclasses change the images before, or the logits after.
+    """Base class of modules that change the images or the logits of another network.
 
     Args:
         network: Module or function from images to logits.
@@ -465,20 +461,21 @@ class Wrapper(nn.Module):
 
 
 def unwrapped(network: Any) -> Any:
-    """Return the network that is inside of nested `Wrapper` modules, or the network itself."""
+    """Remove all `Wrapper` modules from around a network, and return the network inside."""
     while isinstance(network, Wrapper):
         network = network.network
     return network
 
 
 class ArrayFunction(Wrapper):
-    """A function that computes scores without torch, for tensors. It has no gradients.
+    """Make a module of a function that computes scores without torch. It has no gradients.
 
-    If its first scores are probabilities, it returns the logarithms of all.
+    If the scores of the first call are probabilities, the module returns the
+    logarithms of the scores in all calls.
 
     Args:
-        function: Function from images (N, 3, H, W), in [0, 1], to scores
-            (N, C), an array of NumPy or lists of numbers.
+        function: Function from images in [0, 1], shape (N, 3, H, W), to scores,
+            shape (N, C), as an array of NumPy or as lists of numbers.
         takes_tensors: Whether the function takes tensors. Otherwise, it takes
             arrays of float32.
 
@@ -493,14 +490,13 @@ class ArrayFunction(Wrapper):
         self.has_probabilities: bool | None = None
 
     def forward(self, images: Tensor) -> Tensor:
-        """Compute the scores of images.
+        """Compute the scores of images, or their logarithms if they are probabilities.
 
         Args:
             images: Images in [0, 1], shape (N, 3, H, W).
 
         Returns:
-            Scores, or logarithms of probabilities, in the dtype and on the device of the
-            images, shape (N, C).
+            Scores with the dtype and the device of the images, shape (N, C).
         """
         detached = images.detach()
         given = detached if self.takes_tensors else detached.cpu().float().numpy()
@@ -508,19 +504,20 @@ class ArrayFunction(Wrapper):
         if self.has_probabilities is None and scores.ndim == 2:
             self.has_probabilities = are_probabilities(scores)
         if self.has_probabilities:
-            # The logarithm of 0 is infinite, so 0 is replaced by the smallest positive number.
+            # Replace 0 by the smallest positive number, because the logarithm of 0 is infinite.
             return scores.clamp(min=torch.finfo(scores.dtype).tiny).log()
         return scores
 
 
 class AnyFunction(Wrapper):
-    """A function from images to scores, which takes tensors or NumPy arrays.
+    """Make a module of a function from images to scores that takes tensors or NumPy arrays.
 
-    The first call finds out which: it gives the function a tensor, and a NumPy
-    array if the function then fails or returns no tensor.
+    The first call finds out which of them the function takes: it is called with
+    a tensor and, if it fails or does not return a tensor, with a NumPy array.
 
     Attributes:
-        call: Function from tensors to scores. None before the first call.
+        call: Function that takes tensors and returns scores as a tensor. None
+            before the first call.
     """
 
     def __init__(self, function: Callable[[Any], Any]):
@@ -529,7 +526,7 @@ class AnyFunction(Wrapper):
 
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W)."""
-        # A former call has found out what the function takes.
+        # The first call has found out what the function takes.
         if self.call is not None:
             return self.call(images)
         failure = None
@@ -540,8 +537,8 @@ class AnyFunction(Wrapper):
                 return scores
         except Exception as error:  # Users' functions raise errors of many kinds.
             failure = error
-        # The function failed on a tensor, or returned no tensor. It may take arrays of NumPy.
-        # Or it may take tensors that are cut from the gradient, and return arrays.
+        # The function failed on a tensor, or did not return one. Try an array of NumPy, then a
+        # tensor without a gradient.
         for takes_tensors in (False, True):
             converted = ArrayFunction(self.network, takes_tensors)
             with suppress(Exception):
@@ -550,21 +547,21 @@ class AnyFunction(Wrapper):
                 return scores
         if failure is not None:
             raise failure
-        return scores  # `NetworkCall` says what is wrong with it.
+        return scores  # The caller raises an error, because this is not a tensor.
 
 
 class Normalized(Wrapper):
-    """Network that takes RGB images in [0, 1] and normalizes them as (x − mean) / std.
+    """Normalize RGB images in [0, 1] as (x − mean) / std before a network.
 
-    The images are stored channels last, with which convolutions on a CPU are
-    about a quarter faster.
+    The normalized images have the memory layout "channels last", with which
+    convolutions on a CPU are about a quarter faster.
 
     Args:
         network: Network that takes normalized images (N, 3, H, W).
-        mean: Mean of the three channels in the network's order, in units of
-            [0, 1].
-        std: Standard deviation of the channels, in the same order and unit.
-        bgr: Whether the network takes blue as the first channel.
+        mean: Mean of the three channels, in units of [0, 1] and in the order of
+            the network.
+        std: Standard deviation of the channels, in the same unit and order.
+        bgr: Whether the channels of the network are blue, green and red.
     """
 
     mean: Tensor
@@ -586,7 +583,7 @@ class Normalized(Wrapper):
 
 
 class NormalizedLight(Wrapper):
-    """Network that takes RGB images in [0, 1] and first normalizes their light.
+    """Normalize the light of RGB images in [0, 1] before a network.
 
     Args:
         network: Network that takes RGB images (N, 3, H, W) in [0, 1].
@@ -602,44 +599,47 @@ class NormalizedLight(Wrapper):
         return self.network(normalize_light(images, self.settings))
 
     def extra_repr(self) -> str:
-        """Return the settings, by which stored logits of networks are told apart."""
+        """Return the settings as a part of the text of the module.
+
+        The text distinguishes the stored logits of different networks.
+        """
         return str(self.settings)
 
 
 def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
-    """Put the normalization of light in front of a network.
+    """Return a network that normalizes the light of images and then calls a given network.
 
     Args:
         network: Network that takes RGB images in [0, 1].
-        value: Value of `normalize_light`, see `read_normalized_light`.
-
-    Returns:
-        The network itself if `value` is None or False.
+        value: How the light is normalized: True for the defaults, a mapping with fields of
+            `NormalizedLightSettings`, or such settings. With None or False, the given network
+            is returned.
 
     Raises:
-        InputError: If the light is normalized already, or if the value is wrong.
+        InputError: If the network normalizes light already, or if the value is something else.
     """
     settings = read_normalized_light(value)
     if settings is None:
         return network
     if light_settings(network) is not None:
         raise InputError(
-            "normalize_light is given, and the network normalizes light already: leave it out",
+            "normalize_light is set, but the network normalizes light already: "
+            "remove normalize_light",
             "normalize_light",
         )
     normalized = NormalizedLight(network, settings)
-    # Networks of torch.export refuse a change of the mode.
+    # Copy the mode without a call of `train`, which networks of torch.export refuse.
     normalized.training = network.training
     return normalized
 
 
 def light_settings(network: object) -> NormalizedLightSettings | None:
-    """Return how a network normalizes light. None if it does not."""
+    """Return the settings with which a network normalizes light. None if it does not."""
     return network.settings if isinstance(network, NormalizedLight) else None
 
 
 def without_normalized_light(network: Any) -> Any:
-    """Return the network behind the normalization of light, or the network itself."""
+    """Remove the normalization of light, if there is one, from in front of a network."""
     return network.network if isinstance(network, NormalizedLight) else network
 
 
@@ -648,15 +648,12 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
 
     Args:
         classes: Names of all classes.
-        name: Name of the class, or its index, which may be written as text.
-        subject: Start of the error, such as "label" or "classifier NAME": the
-            argument that names the class, or the thing that lacks it.
-
-    Returns:
-        The index.
+        name: Name of the class, or its index as a number or as text.
+        subject: Start of the error: the argument that has the name, such as
+            "label", or what lacks the class, such as "classifier NAME".
 
     Raises:
-        InputError: If there is no such class. The sentence suggests the nearest
+        InputError: If there is no such class. The message suggests similar
             names.
     """
     require_kind("label", name, str | int, "the name of a class, or its index")
@@ -687,27 +684,25 @@ def _are_indices(classes: Sequence[str]) -> bool:
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:
-    """Return the three most similar choices as one text.
+    """Return the three names that are most similar to a misspelled name, as one text.
 
     Args:
         name: Name that was given.
-        choices: Names to choose from.
+        choices: Valid names.
 
     Returns:
-        The nearest names, such as "a, b, c".
+        The most similar names, such as "a, b, c".
     """
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
 def load_python(name: str) -> Classifier:
-    """Call a function of a user that makes a network.
+    """Load a classifier by a Python function that the user wrote.
 
     Args:
-        name: "package.module:function" or "package.module.function", see
-            `call_python`.
-
-    Returns:
-        The classifier.
+        name: Function as "package.module:function" or "package.module.function".
+            It returns a network, the size of its images and the names of its
+            classes, see `call_python`.
 
     Raises:
         InputError: If there is no such function, or if the function or its
@@ -717,16 +712,18 @@ def load_python(name: str) -> Classifier:
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
-    """Call a function of a user that makes a network, and check what it returns.
+    """Call a Python function that the user wrote to load a network, and check its result.
 
     Args:
         name: "package.module:function" or "package.module.function". The module
             is in the current folder or installed.
 
     Returns:
-        Three values: the network, which maps RGB images (N, 3, size, size) in
-        [0, 1] to logits; the pixels per side of its images; and the names of
-        its classes in the order of the logits.
+        Three values:
+        - the network, which maps RGB images (N, 3, size, size) in [0, 1] to
+          logits,
+        - the pixels per side of its images,
+        - the names of its classes in the order of the logits.
 
     Raises:
         InputError: If there is no such function, or if the function or its
@@ -753,7 +750,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
             raise InputError(
                 f"name=python:{name}: there is no module {module_name} in {current_folder}: "
-                "start the command beside it",
+                f"start the command in the folder of {module_name}.py",
                 "name",
             ) from error
         last_call = traceback.extract_tb(error.__traceback__)[-1]
@@ -765,7 +762,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
             "use python:package.module:function, which returns (module, size, classes)",
             "name",
         ) from error
-    # A string is a sequence of strings, too, but no list of names.
+    # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
     if not (callable(network) and type(size) is int and has_names):

@@ -23,19 +23,19 @@ ONNX = ".onnx"
 TORCHSCRIPT = (".pt", ".pth", ".ts", ".jit", ".torchscript")
 # Endings of the names of all files that contain a network.
 SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
-# Pixels per side of the images of a network, if neither its file nor the setting
-# `size` tells another number.
+# Pixels per side of the images of a network whose size is unknown.
 DEFAULT_SIZE = 224
 
 
 @dataclass(frozen=True)
 class Content:
-    """Network of a file, and the shape of images that the file records.
+    """Network in a file, and the shape of the images that it takes.
 
     Attributes:
         network: Module or function from images (N, 3, size, size) to logits.
-        shape: Sizes of the four dimensions of its images. None for a dimension
-            of any size, or of a size that the file does not record.
+        shape: Sizes of the four dimensions of the images, as the file tells
+            them. None for a dimension that may have any size, or whose size is
+            unknown.
     """
 
     network: Callable[[Tensor], Tensor]
@@ -43,10 +43,13 @@ class Content:
 
 
 def is_network_file(name: str) -> bool:
-    """Return whether a name is the path of a file that contains a network.
+    """Return whether a name is the path of a file with a network, not with weights alone.
 
-    The weights that this project writes have the same ending as TorchScript. A
-    file with such an ending counts if it exists and is TorchScript.
+    The suffix decides. Only for .pt and similar suffixes, which files of weights
+    have, too, the file must also exist and be TorchScript.
+
+    Args:
+        name: Name of a classifier, which may be a path.
     """
     path = Path(name)
     if path.suffix.lower() in TORCHSCRIPT:
@@ -60,9 +63,9 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
     Args:
         name: Path of a file of TorchScript, `torch.export` (.pt2) or ONNX
             (.onnx). The network maps images (N, 3, size, size) to logits.
-        facts: Classes, size and normalization. Without a size, it is that of
-            the file or, if the file records none, 224. Without a
-            normalization, the network gets images in [0, 1].
+        facts: Classes, size and normalization. If no size is given, the size is
+            read from the file. If the file does not tell it, it is 224. If no
+            normalization is given, the network gets images in [0, 1].
 
     Returns:
         The classifier.
@@ -79,9 +82,9 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
     if batch_size is not None:
         network = InBatches(network, batch_size)
     if isinstance(network, nn.Module):
-        # A network of torch.export refuses `eval`, and has the mode of its export.
-        for part in network.modules():
-            part.training = False
+        # Set the mode without a call of `eval`, which networks of torch.export refuse.
+        for module in network.modules():
+            module.training = False
     size = facts.size or height or DEFAULT_SIZE
     return as_classifier(network, size, facts.classes, facts.normalization, name=name)
 
@@ -101,7 +104,10 @@ def build_file(name: str, size: int, facts: NetworkFacts = NO_FACTS) -> Classifi
 
 
 def _read(path: Path) -> Content:
-    """Read the network of a file. The ending of its name tells the format.
+    """Read a file with a network, in the format that the suffix of its name tells.
+
+    Args:
+        path: File of TorchScript, `torch.export` or ONNX.
 
     Raises:
         InputError: If the file is damaged or has another format.
@@ -112,7 +118,7 @@ def _read(path: Path) -> Content:
         return read(path)
     except InputError:
         raise
-    except Exception as error:  # Each library raises many kinds for a damaged file.
+    except Exception as error:  # A damaged file may raise many types of errors.
         raise InputError(
             f"name={path} cannot be read ({single_line(error)}): "
             "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)",
@@ -121,7 +127,14 @@ def _read(path: Path) -> Content:
 
 
 def _read_torchscript(path: Path) -> Content:
-    """Read a file that `torch.jit.save` wrote."""
+    """Read a file of TorchScript, which `torch.jit.save` wrote.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: If the file contains weights only, or a pickled module.
+    """
     if not is_torchscript(path):
         advice = advice_for_pickles(path)
         if advice is None:
@@ -131,22 +144,23 @@ def _read_torchscript(path: Path) -> Content:
             )
         raise InputError(f"name={path} {advice}", "name")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch warns that torch.jit is deprecated.
+        warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
         return Content(Scripted(torch.jit.load(path, map_location="cpu").eval()))
 
 
 class Scripted(Wrapper):
-    """Network of TorchScript.
+    """Network of TorchScript that can be copied and then trained.
 
-    torch copies such a network with weights that are no leaves of autograd, so
-    that they could not be trained. This class saves and loads it instead.
+    `copy.deepcopy` of torch gives such a network weights that are not leaves of
+    the graph of autograd, so that they cannot be trained. This class copies the
+    network by saving and loading it.
     """
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return a copy with weights of its own."""
         content = io.BytesIO()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that torch.jit is deprecated
+            warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
             torch.jit.save(self.network, content)
             content.seek(0)
             copied = type(self)(torch.jit.load(content))
@@ -158,12 +172,16 @@ class Scripted(Wrapper):
 
 
 def _read_exported(path: Path) -> Content:
-    """Read a file that `torch.export.save` wrote."""
+    """Read a network that `torch.export.save` wrote to a file.
+
+    Args:
+        path: The file. Its network has one input, the images.
+    """
     program = torch.export.load(path)
-    # The network must have a single input, the images. Its node in the graph has an example
-    # value, `node.meta["val"]`, whose shape has symbols for dimensions of any size.
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
+    # The example value of the images has a shape: whole numbers for dimensions of fixed size, and
+    # symbols for the others.
     sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
     return Content(Exported(program.module()), sizes)
 
@@ -178,9 +196,9 @@ class Exported(Wrapper):
 
 
 class InBatches(Wrapper):
-    """Network that takes batches of one size, for batches of any size.
+    """Give a network batches of the one size that it takes, whatever the number of images is.
 
-    The last batch is filled up with copies of its first image.
+    The last batch is filled up with copies of the first image.
 
     Args:
         network: Module or function from images (batch_size, 3, H, W) to logits.
@@ -193,7 +211,7 @@ class InBatches(Wrapper):
 
     def forward(self, images: Tensor) -> Tensor:
         """Compute the logits (N, C) of images (N, 3, H, W)."""
-        # Number of images that fill up the last batch.
+        # Number of copies that fill up the last batch.
         missing_count = -len(images) % self.batch_size
         filled = torch.cat([images, images[:1].expand(missing_count, -1, -1, -1)])
         logits = [self.network(part) for part in filled.split(self.batch_size)]

@@ -1,4 +1,4 @@
-"""Normalizes the light of images: white balance, exposure and encoding."""
+"""Normalize the light of images: white balance, exposure and encoding."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from renderer.image import clamp, decode, encode
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Encoded values are linear below this one, and are not raised to a power. It is the smallest
-# value of 8 bits above black.
+# Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
 DARKEST_ENCODED = 1 / 255
-# The same value in linear light. A mean or a percentile below it counts as this value, so that
-# black images stay black.
+# Linear value of this sRGB value. Images are brightened as if their brightness were at least this,
+# so that black images stay black.
 DARKEST = DARKEST_ENCODED / 12.92
 
 
@@ -26,7 +25,7 @@ def normalize_light(
 ) -> Float[Tensor, "N 3 H W"]:
     """Normalize color and brightness of the light of each image.
 
-    The steps are computed in linear light, and each image is treated alone:
+    Each image is treated by itself, in linear light:
 
     1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
        mean of the channel, and m is the mean of all channels.
@@ -57,12 +56,12 @@ def normalize_light(
 
 
 def _balance(linear: Tensor, degree: float) -> Tensor:
-    """Compute the factors of the white balance.
+    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree.
 
     Args:
         linear: Linear images, shape (N, 3, H, W).
-        degree: Exponent of the factors. 1 gives all channels the same mean, and 0 leaves the
-            channels as they are.
+        degree: Exponent. 1 gives all channels the same mean, and 0 leaves the channels as they
+            are.
 
     Returns:
         Factor of each channel of each image, shape (N, 3, 1, 1).
@@ -74,17 +73,17 @@ def _balance(linear: Tensor, degree: float) -> Tensor:
 
 
 def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
-    """Compute the factors of the exposure.
+    """Compute the factors of the exposure, which map a percentile of an image to a given value.
 
     Args:
         linear: Linear images, shape (N, 3, H, W).
-        settings: `percentile` of all values of an image is mapped to `level`.
+        settings: The percentile of all values of an image, and the `level` to which it is mapped.
 
     Returns:
         Factor of each image, shape (N, 1, 1, 1).
     """
     values = linear.flatten(1)
-    # The percentile is the value at this position in ascending order, counted from 1.
+    # The percentile is the value with this rank among the sorted values. Ranks start at 1.
     rank = math.ceil(settings.percentile / 100 * values.shape[1])
     bright = values.kthvalue(rank, dim=1).values
     factors = settings.level / bright.clamp(min=DARKEST)
@@ -92,7 +91,7 @@ def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
 
 
 def _apply_gamma(encoded: Tensor, gamma: float) -> Tensor:
-    """Raise values to a power. Below `DARKEST_ENCODED`, the curve is a line through 0.
+    """Raise the values of images to a power, except that the curve is a line near black.
 
     Args:
         encoded: sRGB-encoded images in [0, 1], shape (N, 3, H, W).
@@ -103,7 +102,7 @@ def _apply_gamma(encoded: Tensor, gamma: float) -> Tensor:
     """
     if gamma == 1:
         return encoded
-    # The derivative of a power is infinite at 0 if gamma is less than 1. The factor by which
-    # values are multiplied is therefore constant below `DARKEST_ENCODED`.
+    # x^gamma is x · x^(gamma - 1). The second factor is constant below `DARKEST_ENCODED`, because
+    # it would be infinite at 0 if gamma is less than 1.
     factor = encoded.clamp(min=DARKEST_ENCODED) ** (gamma - 1)
     return encoded * factor

@@ -1,7 +1,7 @@
-"""Makes a classifier of a user's plain network.
+"""Make a classifier of a plain network of the user.
 
-A plain network contains neither the size of its images nor the names of its
-classes. The number of its classes is found by calling it once.
+A plain network does not tell the size of its images or the names of its classes. It is called once
+to find out the number of its classes.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from renderer.errors import InputError, as_device, describe, require_file, requi
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, require_kind, require_whole
 
-# Value of the argument `normalization` that stands for the mean and the standard deviation of
-# red, green and blue below. Most networks that were trained on ImageNet use these numbers.
+# normalization="imagenet" stands for the following mean and standard deviation of red, green and
+# blue, which most networks use that were trained on ImageNet.
 IMAGENET = "imagenet"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Number of color channels.
 COLORS = 3
-# Default of the argument `value_range`: the values of black and white.
+# Default values of black and white that a network takes.
 UNIT_RANGE = (0.0, 1.0)
 # Pixels per side of the images of most networks that were trained on ImageNet.
 USUAL_SIZE = 224
-# Number of images with which `_count_outputs` calls a network. A single row of logits may
-# look like probabilities by chance, so there are two.
+# Number of images with which a network is called to count its outputs. With a single image, logits
+# could look like probabilities by chance.
 CHECKED_COUNT = 2
-# Class names of the modules of torchvision, kornia and this library that normalize images.
+# Names of module classes of torchvision, kornia and this library that normalize images.
 NORMALIZING = frozenset({"Normalize", "Normalized"})
-# Names of buffers in which networks that normalize images themselves keep the mean.
+# Names of buffers that contain the mean in networks that normalize images themselves.
 MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
@@ -50,16 +50,16 @@ Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """Classes, image size and normalization that a user gives for a network.
+    """Classes, image size and normalization that the user gives for a network.
+
+    None leaves the choice to the source of the network, such as torchvision.
 
     Attributes:
-        classes: Names of the classes in the order of the outputs. None for the
-            names of the source or, if it has none, for "0", "1" and
-            so on.
-        size: Pixels per side of the images. None for the size of the source.
+        classes: Names of the classes in the order of the outputs. If neither
+            the user nor the source gives names, they are "0", "1" and so on.
+        size: Pixels per side of the images.
         normalization: "imagenet", or mean and standard deviation of the
-            channels red, green and blue, in units of [0, 1]. None for the
-            normalization of the source.
+            channels red, green and blue, in units of [0, 1].
     """
 
     classes: tuple[str, ...] | None = None
@@ -75,18 +75,20 @@ def as_facts(
     size: int | None = None,
     normalization: Normalization = None,
 ) -> NetworkFacts:
-    """Check the classes, size and normalization that a user gives for a network.
+    """Check the classes, size and normalization that the user gives for a network.
 
     Args:
         classes: Names of the classes, or a text file with a name in each line.
-        size: Pixels per side of the images.
-        normalization: "imagenet", or mean and standard deviation.
+            None if the user gives none.
+        size: Pixels per side of the images, or None.
+        normalization: "imagenet", mean and standard deviation of the channels,
+            or None.
 
     Returns:
-        The facts.
+        The values, with the classes as a tuple of names.
 
     Raises:
-        InputError: If the file is missing, or an argument is of another kind.
+        InputError: If the file is missing, or an argument has a wrong type.
     """
     if isinstance(classes, str | Path):
         require_file(classes, "give a text file with the name of a class in each line")
@@ -102,14 +104,14 @@ def as_facts(
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
-    """Check that no facts are given for a network whose source has its own.
+    """Check that the user gives no classes, size or normalization for a network that has its own.
 
     Args:
         name: Name of the network, for the error.
-        facts: Facts that the user gave.
+        facts: Classes, size and normalization that the user gave.
 
     Raises:
-        InputError: If a fact is given.
+        InputError: If one of them is not None.
     """
     for key, value in vars(facts).items():
         if value is not None:
@@ -135,9 +137,9 @@ def as_classifier(
     """Make a classifier of a plain network, and check it on gray images.
 
     Args:
-        network: A classifier, of which only the light is normalized, or a network from
-            images to logits: a `torch.nn.Module` in evaluation mode, or a
-            function of tensors or of NumPy arrays.
+        network: A plain network from images to logits: a `torch.nn.Module` in
+            evaluation mode, or a function of tensors or of NumPy arrays. If it
+            is a `Classifier`, only `normalize_light` is applied.
         size: Pixels per side of the images. None for 224.
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
@@ -147,18 +149,19 @@ def as_classifier(
         value_range: Values of black and white that the network takes before
             normalization, such as (0, 255) or (-1, 1).
         device: Device of the images. None for that of the network.
-        argument: Name of the argument `network` of the caller, for errors.
-        name: Name for messages. None for the name of the network's class.
-        normalize_light: Whether the light of each image is normalized first:
-            True, or a mapping with fields of `NormalizedLightSettings`.
+        argument: What error messages call the network.
+        name: Name of the classifier. None for the name of the network's class.
+        normalize_light: How the light of each image is normalized first: True
+            for the defaults, or a mapping with fields of
+            `NormalizedLightSettings`. None for no normalization.
 
     Returns:
-        The classifier. It contains the network itself.
+        The classifier. It contains the network itself, not a copy.
 
     Raises:
-        InputError: If the network is in training mode, would normalize twice,
-            fails on the images or returns something else than one row of
-            logits for each image, or if the number of names does not fit.
+        InputError: If the network is in training mode, would normalize images
+            twice, fails on the images or does not return one row of logits for
+            each image, or if the number of names does not fit.
 
     Example:
         >>> network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
@@ -200,18 +203,18 @@ def as_classifier(
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:
-    """Check that no part of a network is in training mode.
+    """Check that no module of a network is in training mode.
 
     Args:
-        network: A module. Other values have no mode.
-        argument: Name of the argument of the caller, for errors.
+        network: A `torch.nn.Module`. Other values have no mode and pass.
+        argument: What the error message calls the network.
 
     Raises:
-        InputError: If a part is in training mode.
+        InputError: If a module is in training mode.
     """
     if not isinstance(network, nn.Module) or not any(part.training for part in network.modules()):
         return
-    # torch.export replaces the method by one that raises an error.
+    # A module of torch.export has its own attribute `eval`, which raises an error.
     if "eval" in vars(network):
         raise InputError(
             f"{argument} is a module of torch.export, which has no eval(): save it by "
@@ -229,10 +232,10 @@ def device_of(network: object) -> torch.device:
 
 @contextmanager
 def gradient_flags_kept(network: object) -> Iterator[None]:
-    """Restore `requires_grad` of a network's parameters at the end of a `with` block.
+    """Restore `requires_grad` of all parameters of a network at the end of a `with` block.
 
     Args:
-        network: A module. Other values are ignored.
+        network: A `torch.nn.Module`. Other values are ignored.
     """
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
     flags = [parameter.requires_grad for parameter in parameters]
@@ -248,19 +251,19 @@ def _preprocessed(
     normalization: Normalization,
     value_range: tuple[float, float],
 ) -> nn.Module:
-    """Put the scaling and the normalization of images in front of a network.
+    """Return a network that takes images in [0, 1], scales and normalizes them.
 
     Args:
-        network: The network.
+        network: The network that gets the normalized images.
         normalization: "imagenet", or mean and standard deviation. None for no normalization.
         value_range: Values of black and white that the network takes before normalization.
 
     Returns:
-        A module in evaluation mode that takes images in [0, 1].
+        A module in evaluation mode.
 
     Raises:
-        InputError: If the range or the normalization is wrong, or if the network normalizes
-            images itself and a normalization is given.
+        InputError: If the range or the normalization is wrong, or if a normalization is given
+            although the network normalizes images itself.
     """
     module = network if isinstance(network, nn.Module) else AnyFunction(network)
     mean, std = mean_and_std(normalization)
@@ -276,7 +279,7 @@ def _preprocessed(
             f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
             f"white, {white:g}: give it in these units, or the value_range of the network"
         )
-    # For a value x in [0, 1], the network takes (black + span · x - mean) / std. This is
+    # A value x in [0, 1] becomes (black + span · x - mean) / std for the network. This is equal to
     # (x - scaled_mean) / scaled_std, which `Normalized` computes.
     span = white - black
     scaled_mean = [(value - black) / span for value in mean]
@@ -285,7 +288,15 @@ def _preprocessed(
 
 
 def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and the standard deviation of each channel."""
+    """Return the mean and the standard deviation of the channels red, green and blue.
+
+    Args:
+        normalization: "imagenet", or the mean and the standard deviation themselves. None stands
+            for mean 0 and standard deviation 1.
+
+    Raises:
+        InputError: If the value is something else.
+    """
     if normalization is None:
         return (0.0,) * COLORS, (1.0,) * COLORS
     if normalization == IMAGENET:
@@ -298,7 +309,10 @@ def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequenc
 
 
 def _require_no_normalization(network: nn.Module) -> None:
-    """Raise InputError if a network contains a module that normalizes images."""
+    """Raise InputError if a network seems to normalize images itself.
+
+    Networks of several libraries are known by the names of their modules and buffers.
+    """
     kinds = {type(module).__name__ for module in network.modules()}
     buffers = {name for name, _ in network.named_buffers() if name.rpartition(".")[2] in MEANS}
     found = sorted(kinds & NORMALIZING) + sorted(buffers)
@@ -311,16 +325,13 @@ def _require_no_normalization(network: nn.Module) -> None:
 
 @torch.no_grad()
 def _count_outputs(network: nn.Module, size: int, device: torch.device | str, argument: str) -> int:
-    """Call a network on gray images, and return the number of its outputs.
+    """Call a network on gray images to find out the number of its classes.
 
     Args:
         network: Network that takes images in [0, 1].
         size: Pixels per side of the images.
         device: Device of the images.
         argument: Name of the network in error messages.
-
-    Returns:
-        Number of classes C of its logits (N, C).
     """
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)

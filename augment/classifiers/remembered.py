@@ -1,4 +1,4 @@
-"""Remembers the outputs of a function, so that it never gets the same image twice."""
+"""Keep the outputs of a classifier, so that it never classifies the same image twice."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from augment.classifiers.adapter import Classifier, Wrapper
 
 
 class Remembered(Wrapper):
-    """Function from images to scores that is called once for each different image.
+    """Call a function from images to scores only once for each different image.
 
-    An attack shows the same image to a classifier several times: before the
-    search, in it and after it. That costs much if the function is slow or paid
-    for. The outputs are kept without gradients.
+    An attack shows the same image to a classifier several times: before, during
+    and after the search. This is expensive if the function is slow or paid for.
+    The scores have no gradients.
 
     Attributes:
-        scores: Scores (C,) of each image that was shown, by the hash of the image.
+        scores: Scores of the C classes for each image so far, shape (C,), by the
+            hash of the image.
     """
 
     def __init__(self, network: Callable[[Tensor], Tensor]):
@@ -29,13 +30,15 @@ class Remembered(Wrapper):
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W)."""
         keys = [_digest(image) for image in images.detach().cpu()]
-        # Index in `images` of each image without remembered scores, by the hash of the
-        # image. Equal images have one entry, so the network classifies them once.
-        row_of_key = {key: row for row, key in enumerate(keys) if key not in self.scores}
-        if row_of_key:
-            rows = torch.tensor(list(row_of_key.values()), device=images.device)
-            scores = self.network(images.detach()[rows])
-            self.scores.update(zip(row_of_key, scores.detach(), strict=True))
+        # Index of each new image in the batch, by its hash. Equal images have one entry.
+        new_images = {}
+        for index, key in enumerate(keys):
+            if key not in self.scores:
+                new_images[key] = index
+        if new_images:
+            indices = torch.tensor(list(new_images.values()), device=images.device)
+            scores = self.network(images.detach()[indices])
+            self.scores.update(zip(new_images, scores.detach(), strict=True))
         return torch.stack([self.scores[key] for key in keys]).to(images)
 
 
@@ -46,13 +49,10 @@ def _digest(image: Tensor) -> bytes:
 
 
 def remembering(classifier: Classifier) -> Classifier:
-    """Return a copy of a classifier that remembers the logits of each image.
+    """Return a copy of a classifier that classifies each different image only once.
 
     Args:
         classifier: A classifier without gradients.
-
-    Returns:
-        A classifier that calls the same function once for each different image.
     """
     if isinstance(classifier.function, Remembered):
         return classifier

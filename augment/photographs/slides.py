@@ -1,8 +1,7 @@
-"""Random slides of a projector: two-color patterns, cells, smooth fields and photographs.
+"""Random slides: pictures that a projector shows.
 
-A slide is linear light in [0, 1]. The two-color patterns are those of
-`augment.scene.patterns`: stripes, chessboards, discs, half planes and single
-colors.
+A slide is linear light in [0, 1]. It shows a pattern in two colors (`augment.scene.patterns`),
+Voronoi cells, smooth random fields, or a photograph.
 """
 
 import math
@@ -22,19 +21,19 @@ from augment.scene.patterns import (
 )
 from renderer.image import decode, to_unit
 
-# Smallest and largest number of cells of a slide that `draw_cells` draws.
+# Smallest and largest number of Voronoi cells of a slide.
 MIN_CELLS = 3
 MAX_CELLS = 24
-# Smallest and largest number of nodes per side of a grid at which `draw_fields` draws values.
+# A smooth field interpolates random values at a grid. These are the smallest and the largest number
+# of points of the grid per side.
 MIN_NODES = 2
 MAX_NODES = 6
-# Standard deviation of these values. A sigmoid then maps them to light in [0, 1].
+# Standard deviation of the random values of a smooth field, before a sigmoid maps them to [0, 1].
 FIELD_CONTRAST = 2.0
-# Relative frequencies with which `draw_slides` draws two-color patterns, cells, smooth fields
-# and photographs.
-SHARES = (0.4, 0.15, 0.15, 0.3)
-# Coordinate of unused centers of cells in `draw_cells`. They are so far away that no pixel is
-# in their cells.
+# Probabilities of a slide with a two-color pattern, Voronoi cells, a smooth field or a photograph.
+PROBABILITIES = (0.4, 0.15, 0.15, 0.3)
+# Coordinate of the centers of Voronoi cells that a slide does not use. They are so far away that no
+# pixel belongs to their cells.
 FAR = 100.0
 
 
@@ -44,7 +43,10 @@ def draw_slides(
     draws: torch.Generator,
     photographs: Tensor | None = None,
 ) -> Tensor:
-    """Draw slides of random families.
+    """Draw random slides, which are pictures that a projector shows.
+
+    A slide has a two-color pattern, Voronoi cells, a smooth field or a
+    photograph.
 
     Args:
         count: Number of slides.
@@ -64,9 +66,10 @@ def draw_slides(
     families = [draw_patterns, draw_cells, draw_fields]
     if photographs is not None:
         families.append(partial(draw_projected, photographs))
-    shares = torch.tensor(SHARES[: len(families)])
-    # Index of the family of each slide, shape (count,).
-    slide_to_family = torch.multinomial(shares, count, replacement=True, generator=draws)
+    # `multinomial` divides by the sum, so the probabilities fit without photographs, too.
+    weights = torch.tensor(PROBABILITIES[: len(families)])
+    # Kind of each slide as an index of `families`, shape (count,).
+    slide_to_family = torch.multinomial(weights, count, replacement=True, generator=draws)
     slides = torch.empty(count, 3, size, size)
     for index, draw in enumerate(families):
         rows = torch.nonzero(slide_to_family == index).squeeze(1)
@@ -76,10 +79,13 @@ def draw_slides(
 
 
 def draw_cells(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Draw the Voronoi cells of random points, each in a color of its own.
+    """Draw pictures of Voronoi cells, each cell in a random color.
+
+    The centers of the cells are random points. A pixel belongs to the cell
+    whose center is nearest.
 
     Args:
-        count: Number of slides.
+        count: Number of pictures.
         size: Pixels per side.
         draws: CPU generator of the random numbers.
 
@@ -87,13 +93,13 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Tensor:
         Linear light in [0, 1], shape (count, 3, size, size).
     """
     cell_counts = torch.randint(MIN_CELLS, MAX_CELLS + 1, (count,), generator=draws)
-    # Every slide gets `MAX_CELLS` centers, of which some are not used, in [-1, 1].
+    # Draw `MAX_CELLS` centers for each picture, and move those that are not needed far away.
     centers = 2 * torch.rand(count, MAX_CELLS, 2, generator=draws) - 1
     is_unused = torch.arange(MAX_CELLS) >= cell_counts[:, None]
     centers[is_unused] = FAR
-    # Centers of the pixels, shape (size², 2).
+    # Coordinates x and y of the pixel centers, shape (size², 2).
     pixels = pixel_centers(size).flatten(1).T
-    # Index of the nearest center of a cell, shape (count, size²).
+    # Index of the cell of each pixel, which has the nearest center, shape (count, size²).
     pixel_to_cell = torch.cdist(pixels.expand(count, -1, -1), centers).argmin(2)
 
     hue, saturation, brightness = torch.rand(3, count * MAX_CELLS, generator=draws)
@@ -106,10 +112,10 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Tensor:
 
 
 def draw_fields(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Draw smooth fields of light, independent in the three channels.
+    """Draw pictures of smooth random light, which differs between the three channels.
 
     Args:
-        count: Number of slides.
+        count: Number of pictures.
         size: Pixels per side.
         draws: CPU generator of the random numbers.
 
@@ -125,13 +131,13 @@ def draw_fields(count: int, size: int, draws: torch.Generator) -> Tensor:
 
 
 def interpolate_smoothly(values: Tensor, size: int) -> Tensor:
-    """Interpolate values between nodes by bicubic splines.
+    """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
 
-    Values between nodes may be larger or smaller than those at all nodes.
+    Interpolated values may be outside of the range of the given values.
 
     Args:
-        values: Values at the nodes, shape (N, C, n, n).
-        size: Pixels per side.
+        values: Values at n × n grid points, in C channels, shape (N, C, n, n).
+        size: Pixels per side of the images.
 
     Returns:
         Values at the pixels, shape (N, C, size, size).
@@ -140,30 +146,32 @@ def interpolate_smoothly(values: Tensor, size: int) -> Tensor:
 
 
 def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Draw photographs as slides: turned, scaled and saturated at random.
+    """Choose photographs, and rotate, scale and saturate them at random.
 
-    Beyond the border, a photograph is mirrored.
+    Beyond its border, a photograph is mirrored.
 
     Args:
         photographs: Photographs to choose from, uint8, shape (N, 3, H, W).
-        count: Number of slides.
-        size: Pixels per side.
+        count: Number of pictures.
+        size: Pixels per side of the pictures.
         draws: CPU generator of the random numbers.
 
     Returns:
         Linear light in [0, 1], on the CPU, shape (count, 3, size, size).
     """
-    # Index of the photograph of each slide, shape (count,).
+    # Index of the photograph in each picture, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)
-    # Numbers in [0, 1], shape (count,) each.
+    # Three numbers in [0, 1] of each picture, shape (count,) each.
     turn, zoom, saturation = torch.rand(3, count, generator=draws)
     angle = 2 * math.pi * turn
     scale = MAX_ZOOM ** (2 * zoom - 1)
     cosine = scale * angle.cos()
     sine = scale * angle.sin()
     zero = torch.zeros(count)
-    # The affine map from each slide to its photograph, shape (count, 2, 3).
-    maps = torch.stack([cosine, -sine, zero, sine, cosine, zero], dim=1).view(-1, 2, 3)
+    # Affine maps from positions in the pictures to positions in the photographs, (count, 2, 3).
+    first_row = torch.stack([cosine, -sine, zero], dim=1)
+    second_row = torch.stack([sine, cosine, zero], dim=1)
+    maps = torch.stack([first_row, second_row], dim=1)
     grid = F.affine_grid(maps, [count, 3, size, size], align_corners=False)
 
     chosen = photographs[rows.to(photographs.device)].cpu()

@@ -33,11 +33,12 @@ if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings
     from augment.settings import VariationSettings
 
-# Description of a label for error messages.
+# Description of a valid label in error messages.
 LABEL = "the name of a class, or its index"
-# File of a mesh, "solid:NAME", or the mesh itself.
+# A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
 MeshSource = str | Path | Mesh
-# The settings of a scene that are options of `build_scene`.
+# Names of the fields of `SceneSettings` and `RendererSettings` that `build_scene` takes as keyword
+# arguments.
 SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
 RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
@@ -57,30 +58,32 @@ def build_scene(
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> Scene:
-    """Build a scene of every mesh, from a circle of cameras, in front of every background.
+    """Build a scene that shows every mesh from every camera in front of every background.
 
     Args:
         meshes: Pairs of a mesh and the name or the index of its class, or
             `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`.
         size: Pixels per side of the images.
-        views: Number of cameras on the circle.
-        cameras: Cameras of every mesh instead of a circle, such as those of
-            `nb.load_cameras`. They replace `views`.
+        views: Number of cameras, which are placed on a circle around the mesh.
+        cameras: Cameras to use instead of a circle, such as those of
+            `nb.load_cameras`. `views` must then be left out.
         normalize: Whether the cameras see each mesh moved to the origin and
-            scaled to span [-1, 1]. If False, they see it where it is, in the
-            units of its file. The scene then moves and scales the cameras with
-            the mesh, so that lengths in settings (such as positions of lamps and
-            shifts of poses) always have the object's center as their origin and
-            its `SceneObject.extent` as their unit.
-        shared: Whether the views of an object in front of a background are one
-            example, whose lighting, shape and colors an attack changes for all
-            views. By default, each view is an example.
+            scaled to span [-1, 1]. If False, they see it at its place, in the
+            units of its file. The scene then moves and scales mesh and cameras
+            together. In both cases, lengths in settings, such as positions of
+            lamps, are measured from the center of the object in units of its
+            `SceneObject.extent`.
+        shared: Whether all views of an object in front of a background are one
+            example, for which an attack finds one lighting, shape and color. By
+            default, each view is an example of its own.
         scene: Further settings of the scene. Its `meshes` and `views` are
             ignored.
         renderer: Settings of the renderer.
-        attack: Settings of the attack that will follow. The degree of the
-            lighting suits the smoothest surface that this attack can reach.
-        vary: Settings of the variation that will follow, for the same reason.
+        attack: Settings of an attack that will follow. The attack may make
+            surfaces smoother. The degree of the lighting is then high enough
+            for their highlights.
+        vary: Settings of a random variation (`augment.scene.variation.vary`)
+            that will follow. They matter for the same reason.
         device: Device of the images.
         options: Fields of `SceneSettings` or `RendererSettings`, which replace
             those of `scene` and `renderer`.
@@ -141,12 +144,12 @@ def build_scene(
         warn_of_cut_light(str(scene_settings.light), environment)
     else:
         environment = as_tensor("light", environment)
-        # This call checks the shape.
+        # `degree_of` raises InputError if the shape is not that of coefficients.
         degree_of(environment)
         require_bounded(light=environment)
     basis, lights = _build_lights(scene_settings, environment, degree)
-    # `lights_of_degree` loads the lighting again with another degree, which gloss may
-    # need. It is None if the user gave coefficients or chose the degree.
+    # `lights_of_degree` loads the lighting again with a higher degree, which a smoother surface
+    # may need later. It stays None if the user gave coefficients or chose the degree.
     lights_of_degree = None
     if is_named and scene_settings.degree is None:
         lights_of_degree = partial(_build_lights, scene_settings, scene_settings.light)
@@ -166,7 +169,15 @@ def build_scene(
 
 
 def _require_known(options: Mapping[str, Any]) -> None:
-    """Check that all options are fields of the settings of a scene or of the renderer."""
+    """Check that `build_scene` got known options only: fields of two classes of settings.
+
+    Args:
+        options: Options by their names. They must be fields of `SceneSettings` or of
+            `RendererSettings`.
+
+    Raises:
+        InputError: If an option is unknown.
+    """
     known = SCENE_OPTIONS | RENDERER_OPTIONS
     unknown = sorted(options.keys() - known)
     if unknown:
@@ -175,7 +186,14 @@ def _require_known(options: Mapping[str, Any]) -> None:
 
 
 def _as_meshes(meshes: object) -> list[Any]:
-    """Check that the argument is a list of `ObjectSettings`, or of pairs of a mesh and a label."""
+    """Check the argument `meshes` of `build_scene`, and return it as a list.
+
+    Args:
+        meshes: Value that must be a list of `ObjectSettings`, or of pairs of a mesh and a label.
+
+    Raises:
+        InputError: If the value is something else.
+    """
     expected = "a list of pairs such as ('solid:orange', 'orange'), or of nb.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
@@ -214,7 +232,7 @@ def _load_member(
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
-    """Check the arguments of `build_scene` about cameras.
+    """Check the arguments `cameras`, `views` and `normalize` of `build_scene`.
 
     Args:
         cameras: Cameras that the user gave, or None.
@@ -222,15 +240,15 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
         normalize: Whether each mesh is moved and scaled to span [-1, 1].
 
     Returns:
-        The cameras with numbers as fields. The list is empty for None.
+        The given cameras, without gradients. The list is empty if `cameras` is None.
 
     Raises:
-        InputError: If the arguments do not fit each other.
+        InputError: If the arguments contradict each other.
     """
     if cameras is None:
         if not normalize:
             raise InputError(
-                "normalize=False needs cameras: give cameras=[...] of the mesh's world"
+                "normalize=False needs cameras: give cameras=[...] in the coordinates of the mesh"
             )
         return []
     expected = "a list of cameras, such as list(nb.load_cameras(path).values())"
@@ -242,12 +260,17 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     fixed = [camera.fixed() for camera in given]
     if not normalize:
         return fixed
-    # The scene turns all cameras about the origin, which is the center of these cameras, too.
+    # The scene turns cameras about the origin. Make the origin the center of these cameras.
     return [camera.normalized(np.zeros(3), 1.0) for camera in fixed]
 
 
 def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:
-    """Place a number of cameras on a circle around the object of a scene."""
+    """Place cameras on a circle around the object, as the settings of a scene say.
+
+    Args:
+        settings: Width of the view, polar angle, azimuth of the first camera and field of view.
+        count: Number of cameras.
+    """
     return orbit_cameras(count, settings.width, settings.polar, settings.azimuth, settings.fov)
 
 
@@ -257,18 +280,19 @@ def _build_lights(
     degree: int | None,
     roughness: float | None = None,
 ) -> tuple[Basis, Tensor]:
-    """Join the environment lighting with the local lights of the settings.
+    """Join the environment lighting with the projector and the lamps of the settings.
 
     Args:
         settings: Settings of the scene.
-        environment: Name of the environment lighting, or its coefficients,
+        environment: Name of the environment lighting, or its RGB coefficients,
             shape (K, 3).
-        degree: Degree of a named lighting.
-        roughness: Roughness of the smoothest surface that is in a named
-            lighting. None for surfaces without gloss.
+        degree: Degree with which a named lighting is loaded.
+        roughness: Roughness of the smoothest surface of the scene, for which a
+            named lighting is loaded. None if no surface has gloss.
 
     Returns:
-        The basis of all lights and their coefficients, shape (size, 3).
+        The basis of all lights and their RGB coefficients, shape
+        (size of the basis, 3).
     """
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
@@ -278,34 +302,35 @@ def _build_lights(
 
 
 def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
-    """Build a local light.
+    """Build a local light, which is a projector or a group of lamps.
 
     Args:
-        settings: Settings of its kind, such as `ProjectorSettings`.
+        settings: Settings of the light, such as `ProjectorSettings`.
 
     Returns:
-        The light, and the coefficients (size, 3) with which attacks start.
+        The basis of the light, and its RGB coefficients, shape (size, 3): the
+        pixels of a projector or the powers of lamps.
 
     Raises:
-        InputError: If a file cannot be read, or if a value does not fit the
-            others.
+        InputError: If a file cannot be read, or if values contradict each
+            other.
     """
-    [kind] = [
-        kind for name, kind in LOCAL_LIGHTS.items() if type(settings) is LOCAL_LIGHT_SETTINGS[name]
-    ]
-    return kind.from_settings(settings)
+    for name, kind in LOCAL_LIGHTS.items():
+        if type(settings) is LOCAL_LIGHT_SETTINGS[name]:
+            return kind.from_settings(settings)
+    raise TypeError(f"{type(settings).__name__} is not the settings of a local light")
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
-    """Load backgrounds.
+    """Load the backgrounds of a scene.
 
     Args:
-        choices: Gray values in [0, 1], or image files.
-        size: Pixels per side.
+        choices: B gray values in [0, 1] or image files.
+        size: Pixels per side of the backgrounds.
 
     Returns:
-        Image values in [0, 1], shape (B, 3, size, size), or
-        (B, 1, size, size) if all backgrounds are gray.
+        RGB images in [0, 1], shape (B, 3, size, size), or gray images, shape
+        (B, 1, size, size), if all backgrounds are gray.
 
     Raises:
         InputError: If there is no background, if a gray value is out of

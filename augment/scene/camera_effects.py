@@ -12,12 +12,12 @@ from augment.settings import CameraEffectSettings
 from renderer.image import clamp, decode, encode
 from renderer.settings import ImageSettings
 
-# `_blur` averages each pixel with this number of neighbors on each side.
+# A Gaussian blur averages each pixel with this number of neighbors on each side.
 BLUR_RADIUS = 3
-# Smallest standard deviation of the Gaussian in `_blur`, in pixels. A blur of this width leaves
-# images as they are. It replaces 0, by which `_blur` cannot divide.
+# This standard deviation of a Gaussian blur, in pixels, replaces 0, by which one cannot divide. It
+# is so small that the blur changes nothing.
 MIN_BLUR = 1e-3
-# Probability that a pattern shows a photograph if the settings name a folder of photographs.
+# Probability that a random projected pattern shows a photograph, if there are photographs.
 PHOTOGRAPH_PROBABILITY = 0.5
 
 
@@ -29,10 +29,11 @@ def draw_camera_effects(
     device: torch.device | str = "cpu",
     points: Tensor | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """Draw the effects of a camera and a projected pattern for each example.
+    """Draw the effects of a camera and of a projector for the images of each example.
 
-    Patterns and white balance scale the linear light of object and background.
-    The blur and then the noise follow.
+    The linear light of an image is multiplied by a random pattern, as of a
+    projector, and by a random white balance. Then the image is blurred, and
+    noise is added.
 
     Args:
         settings: Ranges of the effects.
@@ -40,14 +41,14 @@ def draw_camera_effects(
         image: Size and encoding of the images.
         draws: Generator of the random numbers.
         device: Device of the images.
-        points: Point of the pattern that each pixel shows, in [-1, 1], shape
-            (2, count, size, size). By default, the pattern fills the image, as
-            if the camera projected it.
+        points: Coordinates x and y of the point of the pattern that each pixel
+            of each example shows, in [-1, 1], shape (2, count, size, size). By
+            default, the pattern fills the image, as if the camera projected it.
 
     Returns:
-        A differentiable function. It takes images (A, V, 3, size, size), with
-        V views of each of A examples, and the indices of these examples (A,).
-        It returns the changed images.
+        A differentiable function that applies the effects. Its arguments are
+        the images of V views of A examples, shape (A, V, 3, size, size), and the
+        indices of these examples, shape (A,). It returns the changed images.
 
     Example:
         >>> draws = torch.Generator().manual_seed(0)
@@ -55,17 +56,17 @@ def draw_camera_effects(
         >>> effects(torch.rand(2, 1, 3, 8, 8), torch.tensor([0, 4])).shape
         torch.Size([2, 1, 3, 8, 8])
     """
-    # The pattern multiplies the linear light, shape (count, 3, size, size). `fill` is the
-    # fraction of the light that does not come from the projector.
+    # Relative light of the projector at each pixel, shape (count, 3, size, size).
     patterns = draw_patterns(count, image.size, draws, points)
     if settings.slides is not None:
         patterns = _with_photographs(patterns, settings.slides, draws, points)
     low, high = settings.pattern_fill
+    # Fraction of the light of each example that does not come from the projector.
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
-    # Mask of the examples without a pattern, shape (count, 1, 1, 1).
-    is_plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
-    pattern_gains = torch.where(is_plain, 1.0, fill + (1 - fill) * patterns)
-    # White balance in stops of each color channel. One stop is a factor of 2.
+    # Some examples have no pattern.
+    has_pattern = torch.rand(count, 1, 1, 1, generator=draws) < settings.pattern_fraction
+    pattern_gains = torch.where(has_pattern, fill + (1 - fill) * patterns, 1.0)
+    # Change of the white balance of each channel, in stops. One stop is a factor of 2.
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     blurs = settings.blur * torch.rand(count, generator=draws)
     noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
@@ -81,16 +82,17 @@ def draw_camera_effects(
 def _with_photographs(
     patterns: Tensor, folder: str, draws: torch.Generator, points: Tensor | None
 ) -> Tensor:
-    """Replace some patterns by photographs.
+    """Replace some of the patterns that a projector shows by photographs.
 
     Args:
-        patterns: Linear light in [0, 1], shape (count, 3, size, size).
+        patterns: Linear light of the patterns in [0, 1], shape (count, 3, size, size).
         folder: Folder of the photographs.
         draws: Generator of the random numbers.
-        points: See `draw_camera_effects`.
+        points: Coordinates x and y of the point of the pattern that each pixel shows, in
+            [-1, 1], shape (2, count, size, size). None if the pattern fills the image.
 
     Returns:
-        The patterns, of the same shape.
+        The patterns and photographs, of the same shape.
     """
     count, _, size, _ = patterns.shape
     is_replaced = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY
@@ -107,14 +109,16 @@ def _with_photographs(
 
 @dataclass(frozen=True, eq=False)
 class _CameraEffects:
-    """Effects of a camera on the images of E examples.
+    """Function that applies the effects of a camera to the images of E examples.
 
     Attributes:
-        gains: Factors of the linear light, shape (E, 3, size, size).
-        blurs: Standard deviations of the blur in pixels, shape (E,).
-        noises: Values that are added to the images, shape
+        gains: Factor of the linear light of each pixel, shape
             (E, 3, size, size).
-        encoding: Encoding of the images.
+        blurs: Standard deviation of the blur of each example in pixels,
+            shape (E,).
+        noises: Noise that is added to each pixel value, shape
+            (E, 3, size, size).
+        encoding: Encoding of the images, such as "srgb".
     """
 
     gains: Tensor
@@ -127,7 +131,7 @@ class _CameraEffects:
 
         Args:
             images: Image values of V views of A examples, shape (A, V, 3, size, size).
-            examples: Indices of the A examples, shape (A,).
+            examples: Index of each of the A examples among all E, shape (A,).
 
         Returns:
             Changed images in [0, 1], shape (A, V, 3, size, size).
@@ -139,7 +143,7 @@ class _CameraEffects:
 
 
 def _blur(images: Tensor, deviations: Tensor) -> Tensor:
-    """Convolve images with Gaussians.
+    """Blur the images of each example by a Gaussian of its own width.
 
     The pixels at the border of an image are repeated beyond the border.
 
@@ -150,23 +154,23 @@ def _blur(images: Tensor, deviations: Tensor) -> Tensor:
     Returns:
         Blurred images, shape (A, V, 3, size, size).
     """
+    count = len(images)
     size = images.shape[-1]
-    # Below, N = 2 · BLUR_RADIUS + 1 is the number of pixels over which a pixel is averaged.
+    # A pixel is averaged over the N pixels with these offsets from it.
     offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
-    # Shape (A, N).
+    # Weight of each offset in each example, shape (A, N).
     weights = torch.exp(-0.5 * (offsets / deviations.clamp(min=MIN_BLUR)[:, None]) ** 2)
     weights = (weights / weights.sum(1, keepdim=True)).to(images)
+    # Position along a row or a column of the N pixels around each pixel, shape (size, N).
     pixels = torch.arange(size, device=images.device)
-    # Index along one axis of the N pixels around each pixel, shape (size, N).
     neighbors = (pixels[:, None] + offsets).clamp(0, size - 1)
-    # The matrix (size, size) of an example blurs its images along one axis. Row i has the
-    # weights with which the pixels contribute to pixel i.
-    matrices = images.new_zeros(len(images), size, size)
+    # One matrix for each example. Its row i has the weights of all pixels in the average for
+    # pixel i, along one axis of the image. Shape (A, size, size).
+    matrices = images.new_zeros(count, size, size)
     matrices.scatter_add_(
         2,
-        neighbors.expand(len(images), -1, -1),
+        neighbors.expand(count, -1, -1),
         weights[:, None].expand(-1, size, -1),
     )
-    # A Gaussian blur is separable. The first matrix blurs each image vertically (j to i), and
-    # the second horizontally (k to l).
+    # A Gaussian blur is separable: the first matrix blurs along columns, the second along rows.
     return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)

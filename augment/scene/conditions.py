@@ -14,22 +14,22 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Names of the fields of `Conditions` that have a row for each vertex of a mesh. `Conditions.row`
-# cuts them to the vertices of one mesh.
+# Fields of `Conditions` whose second axis is the vertices of a mesh. `Conditions.row` cuts it to
+# the number of vertices of a mesh.
 OF_VERTICES = ("vertices",)
-# Names of the fields that have a row for each face.
+# Fields of `Conditions` whose second axis is the faces of a mesh.
 OF_FACES = ("albedo", "gloss", "hue")
 
 
 @dataclass(frozen=True)
 class Example:
-    """Example of a scene: an object from V cameras in front of a background.
+    """Example of a scene: an object in front of a background, seen from V cameras.
 
     Attributes:
-        object: The index of the object in the scene's list.
+        object: Index of the object among the objects of the scene.
         cameras: The V cameras.
-        background: The index of the background in the scene's list.
-        exposure: The factor of the light.
+        background: Index of the background among the backgrounds of the scene.
+        exposure: Factor that multiplies the light of the scene.
     """
 
     object: int
@@ -43,20 +43,22 @@ class Conditions:
     """Light, shape and colors with which A examples are rendered.
 
     N and F are the numbers of vertices and faces of the largest mesh of the scene. A smaller mesh
-    uses only the first rows. A field that is None leaves the scene as it is.
+    uses only the first of the N or F entries. A field that is None changes nothing in the scene.
 
     Attributes:
-        light: The coefficients of the scene's basis, shape (A, coefficients, 3).
-        vertices: The vertices, shape (A, N, 3). None for those of the meshes.
+        light: RGB coefficients of all lights in the scene's basis, shape (A, coefficients, 3).
+        vertices: Positions of the vertices, shape (A, N, 3).
         albedo: Linear RGB that is added to the albedo of each face, shape (A, F, 3).
         pixels: Offsets that are added to the pixel values of the V images, shape
             (A, V, 3, size, size).
-        positions: The positions of the L lamps, shape (A, L, 3). None for those of the basis.
-        cameras: Changes of the polar angle and the azimuth (in degrees) and of the logarithm of
-            the distance. All V cameras of an example are changed alike, shape (A, 3).
+        positions: Positions of the L lamps, shape (A, L, 3).
+        cameras: Change of the polar angle in degrees, change of the azimuth in degrees, and
+            change of the logarithm of the distance, shape (A, 3). They apply to all V cameras of
+            an example.
         gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
-            faces, shape (A, 1, 3). Textures of gloss multiply them.
-        hue: The angle in degrees by which the hue of a changed albedo is turned, shape (A, F).
+            faces, shape (A, 1, 3). Textures of gloss are multiplied by them.
+        hue: Angle in degrees by which the hue of the albedo of each face is turned, after the
+            addition of `albedo`, shape (A, F).
     """
 
     light: Float[Tensor, "A coefficients 3"]
@@ -74,14 +76,12 @@ class Conditions:
                 object.__setattr__(self, name, as_tensor(name, values))
 
     def row(self, index: int, mesh: Mesh) -> Conditions:
-        """Return the conditions of one example, without the first dimension.
+        """Return the conditions of one example, without the dimension of the examples.
 
         Args:
-            index: The row of the example in the conditions.
-            mesh: The mesh of the example. Rows beyond its vertices and faces are left out.
-
-        Returns:
-            The conditions.
+            index: Index of the example in the first dimension of all fields.
+            mesh: Mesh of the example. Entries of vertices and faces are cut to the numbers of
+                its vertices and faces.
         """
         rows = {}
         for name, values in vars(self).items():

@@ -30,27 +30,27 @@ from renderer.shading.gloss import Gloss, smallest_roughness
 if TYPE_CHECKING:
     from augment.settings import SpecularLayerSettings
 
-# `warn_of_cut_light` warns of an rms error of the irradiance above this fraction of the rms
-# irradiance.
-NOTICED = 0.05
-# `degree_of_scene` warns if the user gives a lower degree than this. It is the lowest that
-# shades the sides of an object about right. The irradiance of a point source is off by 0.09
-# at this degree, and by 0.42 or more at lower degrees.
-SHADED = 2
-# Degree of the light whose irradiance `warn_of_cut_light` takes as exact. The irradiance of
-# every lighting of a higher degree differs from it by less than `NOTICED`.
-COMPARED = 8
-# Roughness in `Smoothest` of surfaces without gloss.
+# Warnings are given if the irradiance of a lighting is off by more than this: the rms error divided
+# by the rms irradiance.
+MAX_IRRADIANCE_ERROR = 0.05
+# Lowest degree of spherical harmonics that shades the sides of an object about right. The
+# irradiance of a point source has an error of 0.09 at this degree, and of 0.42 or more below it.
+MIN_SHADING_DEGREE = 2
+# The irradiance of lighting of this degree counts as exact. More harmonics change it by less than
+# `MAX_IRRADIANCE_ERROR`.
+REFERENCE_DEGREE = 8
+# Roughness that stands for a surface without gloss.
 MATTE = 1.0
 
 
 class Smoothest(NamedTuple):
-    """The smoothest surface that a run can reach.
+    """The smoothest surface that the objects have, or get by an attack or a random variation.
 
     Attributes:
-        roughness: Its roughness. It is 1 if no surface has gloss.
+        roughness: Roughness of the surface. It is 1 if no surface has gloss.
         name: Name of the object that has this surface.
-        verb: "has", or "can reach" if an attack or a variation makes it.
+        verb: "has" if the object has it now, "can reach" if an attack or a
+            variation makes it.
     """
 
     roughness: float
@@ -64,15 +64,18 @@ class Smoothest(NamedTuple):
 
     @property
     def degree(self) -> int:
-        """Return the degree of light that the gloss needs, or 0 if no surface has gloss."""
+        """Return the degree of lighting that shows the highlights of the surface.
+
+        It is 0 if no surface has gloss.
+        """
         return required_degree(self.roughness) if self.roughness < MATTE else 0
 
     def warn(self, choice: str, degree: int) -> None:
-        """Warn of the error of highlights in lighting of a degree that is too low.
+        """Warn that the degree of the lighting is too low for the highlights of the surface.
 
         Args:
-            choice: Beginning of a clause about the degree, such as "degree=6".
-            degree: The degree.
+            choice: Words of the warning that name the degree, such as "degree=6".
+            degree: Degree of the lighting.
         """
         surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
         needed = f"which takes light of degree {self.degree}"
@@ -86,46 +89,46 @@ class Smoothest(NamedTuple):
 def reached_gloss(
     objects: Iterable[SceneObject],
     material: MaterialSettings | None = None,
-    varnish: SpecularLayerSettings | None = None,
+    layer: SpecularLayerSettings | None = None,
 ) -> Smoothest:
-    """Find the smoothest surface of all objects, also after an attack and a variation.
+    """Find the smoothest surface that objects have, or get by an attack or a random variation.
 
     Args:
-        objects: The objects of a scene, which include hard negatives. Their
-            props count, too.
-        material: Settings of an attack on the material. It lowers the roughness
-            as far as its norm ball allows.
-        varnish: Settings from which the gloss of the objects is drawn.
+        objects: The objects of a scene. The surfaces of their props count, too.
+        material: Settings of an attack on the material, which may lower the
+            roughness as far as its norm-ball permits. None for no such attack.
+        layer: Settings of a variation that draws the gloss of the objects at
+            random. None for no such variation.
 
     Returns:
-        The lowest roughness and the object that has or reaches it.
+        The lowest roughness, and the object that has or can reach it.
     """
-    # `min` compares the roughness first, which is the first field of `Smoothest`.
-    least = Smoothest(MATTE, "")
+    lowest = Smoothest(MATTE, "")
     for item in objects:
         initial_roughness = smallest_roughness(item.mesh)
-        least = min(least, Smoothest(initial_roughness, item.name))
-        reached_roughness = _reached_roughness(item, material, varnish)
+        candidates = [lowest, Smoothest(initial_roughness, item.name)]
+        reached_roughness = _reached_roughness(item, material, layer)
         if reached_roughness < initial_roughness:
-            least = min(least, Smoothest(reached_roughness, item.name, "can reach"))
-    return least
+            candidates.append(Smoothest(reached_roughness, item.name, "can reach"))
+        lowest = min(candidates)
+    return lowest
 
 
 def _reached_roughness(
-    item: SceneObject, material: MaterialSettings | None, varnish: SpecularLayerSettings | None
+    item: SceneObject, material: MaterialSettings | None, layer: SpecularLayerSettings | None
 ) -> float:
-    """Compute the lowest roughness that an attack and a variation can give to an object.
+    """Compute the lowest roughness that an attack or a random variation can give to an object.
 
     Args:
         item: Object. Its props and its table keep their gloss and do not count.
         material: Settings of an attack on the material, or None.
-        varnish: Settings from which the gloss of the object is drawn, or None.
+        layer: Settings of a variation that draws the gloss of the object, or None.
 
     Returns:
         The lowest roughness. It is `MATTE` if neither an attack nor a variation changes the
         gloss.
     """
-    has_specular_layer = varnish is not None and any(varnish.specular_factor)
+    has_specular_layer = layer is not None and any(layer.specular_factor)
     is_attacked = material is not None and any(
         (material.roughness, material.metallic, material.specular_factor)
     )
@@ -134,35 +137,36 @@ def _reached_roughness(
     materials = initial_materials(item)
     # Roughness of each face of the object itself.
     roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
-    if varnish is not None and has_specular_layer:
-        lowest_drawn = varnish.roughness[0]
+    if layer is not None and has_specular_layer:
+        lowest_drawn = layer.roughness[0]
         roughness = torch.full_like(roughness, lowest_drawn)
     if material is not None and is_attacked and material.roughness:
-        # An attack changes the mean and adds the change of the mean to each face. Its radius
-        # is in multiples of the unit `material.roughness`. No radius means no limit.
+        # An attack lowers the mean roughness of the faces, and each face by the same amount.
         mean = float(roughness.mean())
+        # The radius counts units of size `material.roughness`. No radius means no limit.
         largest_change = math.inf
         if material.radius is not None:
             largest_change = material.radius * material.roughness
-        change = max(mean - largest_change, MIN_ROUGHNESS) - mean
-        roughness = (roughness + min(change, 0.0)).clamp(min=0)
-    # The strength of this gloss is 1, because attacks and variations can raise it to 1.
+        lowest_mean = max(mean - largest_change, MIN_ROUGHNESS)
+        change = min(lowest_mean - mean, 0.0)
+        roughness = (roughness + change).clamp(min=0)
+    # `Gloss` gets its default specular factor of 1, because attacks and variations can reach 1.
     gloss = Gloss(roughness, textured=not has_specular_layer)
     own_mesh = select_faces(item.mesh, slice(item.own))
     return smallest_roughness(gloss.on(own_mesh))
 
 
 def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
-    """Choose the degree of a scene's lighting.
+    """Choose the degree of the spherical harmonics of a scene's lighting.
 
-    Without a given degree, it is the lowest that shows all gloss, and at least
-    6. Warnings report a degree above 6, a given degree that is too low, and a
-    degree that memory limits.
+    If the user gives none, it is the lowest degree that shows the highlights of
+    all surfaces, but at least 6. Warnings are given if it is above 6, if memory
+    limits it, or if the user gives a degree that is too low.
 
     Args:
-        reached: The smoothest surface of the run.
+        reached: The smoothest surface, also after attacks and variations.
         given: The degree that the user asked for, or None.
-        pixels: Number of pixels of the views of all objects.
+        pixels: Number of pixels of all views of all objects.
 
     Returns:
         The degree, from 0 to 40.
@@ -176,28 +180,29 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
         return degree
     if reached.degree > given:
         reached.warn(f"degree={given}", given)
-    if given < SHADED:
+    if given < MIN_SHADING_DEGREE:
         fault = "shades no side of an object right"
         if given == 0:
             fault = "shades all sides of an object alike"
         message = (
             f"degree={given} {fault} in light that is not even, and so do attacks and variations "
-            f"of the light, which keep to this degree: give {SHADED} or more, or leave degree out"
+            "of the light, which keep to this degree: "
+            f"give {MIN_SHADING_DEGREE} or more, or leave degree out"
         )
         warnings.warn(message, stacklevel=3)
     return given
 
 
 def _affordable_degree(reached: Smoothest, pixels: int) -> int:
-    """Find the degree of light for the smoothest gloss of a run, as far as memory allows.
+    """Find the degree of lighting that the smoothest surface needs, as far as memory permits.
 
     Args:
-        reached: The smoothest surface of the run.
-        pixels: Number of pixels of the views of all objects.
+        reached: The smoothest surface, also after attacks and variations.
+        pixels: Number of pixels of all views of all objects.
 
     Returns:
-        The degree that the gloss needs. If its operators do not fit in memory, the highest
-        degree whose operators fit. It is at least `DEGREE`.
+        The needed degree, or the highest degree whose transfer operators (matrices from light
+        to image) fit in memory. It is at least `DEGREE`.
     """
     degree = max(DEGREE, reached.degree)
     cpu = torch.device("cpu")
@@ -207,22 +212,21 @@ def _affordable_degree(reached: Smoothest, pixels: int) -> int:
 
 
 def warn_of_cut_light(name: str, light: Tensor) -> None:
-    """Warn if a low degree changes the irradiance of a named lighting by more than 5 %.
+    """Warn if a named lighting was loaded with too low a degree for its irradiance.
 
-    The error is the rms difference to the irradiance of the same lighting of
-    degree 8, over normals and channels, relative to the rms irradiance of the
-    latter (`irradiance_error`).
+    The irradiance is compared with that of the same lighting of degree 8. The
+    warning is given if the rms difference, over normals and channels, is more
+    than 5 % of the rms irradiance.
 
     Args:
-        name: Name of the lighting, as for `load_light`. A lighting that is not
-            the file of a map has no harmonics above its own degree.
-        light: The coefficients that were loaded, shape ((degree + 1)², 3).
+        name: Name of the lighting, as `load_light` takes it.
+        light: RGB coefficients that were loaded, shape ((degree + 1)², 3).
     """
     degree = math.isqrt(len(light)) - 1
-    if degree >= COMPARED // 2:
+    if degree >= REFERENCE_DEGREE // 2:
         return
-    error = float(irradiance_error(light, load_light(name, COMPARED)))
-    if error > NOTICED:
+    error = float(irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
+    if error > MAX_IRRADIANCE_ERROR:
         fault = f"has an irradiance that is off by {error:.0%} (rms over normals)"
         message = f"light {name} of degree={degree} {fault}: give a higher degree"
         warnings.warn(message, stacklevel=3)
@@ -231,38 +235,40 @@ def warn_of_cut_light(name: str, light: Tensor) -> None:
 def with_needed_degree(
     scene: Scene,
     material: MaterialSettings | None = None,
-    varnish: SpecularLayerSettings | None = None,
+    layer: SpecularLayerSettings | None = None,
 ) -> Scene:
-    """Raise the degree of a scene's lighting to what an attack and a variation need.
+    """Raise the degree of a scene's lighting if an attack or a variation needs it.
 
-    Only a degree that `build_scene` chose is raised. If the user gave the
-    degree or the coefficients, a warning reports that the degree is too low.
+    Attacks and variations may make surfaces smoother, so that their highlights
+    need a higher degree. Only a degree that `build_scene` chose is raised. If
+    the user gave the degree or the coefficients, a warning is given instead.
 
     Args:
         scene: The scene.
-        material: Settings of an attack on the material.
-        varnish: Settings from which the gloss of the objects is drawn.
+        material: Settings of an attack on the material, or None.
+        layer: Settings of a variation that draws the gloss of the objects at
+            random, or None.
 
     Returns:
         A scene with more coefficients of the same lighting, or the given scene.
     """
-    reached = reached_gloss(scene.objects, material, varnish)
+    reached = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree
     view_count = sum(len(cameras) for cameras in scene.cameras)
     needed = _affordable_degree(reached, view_count * scene.settings.size**2)
     if needed <= degree:
         return scene
     if scene.lights_of_degree is not None:
-        # The lights that `build_scene` made. If the lights of the scene differ from them, they
-        # were changed later and are known to their present degree only.
+        # Lighting that was changed after `build_scene` cannot be loaded again with another
+        # degree. Compare the lighting of the scene with what `build_scene` loaded.
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
         has_same_shape = scene.lights.shape[1:] == built.shape
         if has_same_shape and (scene.lights == built.to(scene.lights)).all():
             reached.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, reached.gloss)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    # Coefficients of the harmonics of exactly this degree. If they are zero, the lighting has
-    # no detail that a higher degree could add, and needs no warning.
+    # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
+    # degree would add nothing, and no warning is needed.
     highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
     if highest_band.any():
         reached.warn(f"degree={degree}", degree)

@@ -1,9 +1,9 @@
 """Render objects whose vertices, colors, gloss or lamps change, one view at a time.
 
-Each view of moved vertices is rasterized again. The shadows and bounces of environment light are
-not computed again for each motion: `FrozenTransport` keeps those of a shape nearby, with the gloss
-of the mesh. The shadows of local lights are those of the moved shape itself
-(`renderer.transport.lamp_paths`).
+Each view of moved vertices is rasterized again. The shadows and bounces of environment light take
+long to compute. `FrozenTransport` keeps them for one shape, and they are used again while the
+vertices are within `NEAR` of this shape. The shadows of projector and lamps are always those of
+the moved shape itself (`renderer.transport.lamp_paths`).
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from augment.scene.conditions import Conditions
 
-# `FrozenTransport.is_near` allows this change of each coordinate of each vertex, in world
-# units. Shadows and bounces are computed again if a vertex has moved further.
+# Shadows and bounces are computed again if a coordinate of a vertex has changed by more than this
+# distance in world units.
 NEAR = 0.001
 
 
 class FrozenView(NamedTuple):
-    """Radiance that shadows and bounces add to a view of a mesh with a known albedo.
+    """What shadows and bounces of light add to one view of a mesh.
 
     Attributes:
-        change: Radiance that is added per unit of each of K coefficients of the
-            light, for each channel and pixel, shape (3, K, size²).
-        albedo_sums: Sum of the albedo of all samples of each pixel, shape
-            (3, size²).
+        change: Radiance that is added to each channel of each pixel, for each of
+            the K harmonic coefficients of the light, shape (3, K, size²).
+        albedo_sums: Sum of the albedo of the samples of each pixel with which
+            `change` was computed, shape (3, size²).
     """
 
     change: Tensor
@@ -54,23 +54,25 @@ class FrozenView(NamedTuple):
 
 
 class FrozenTransport:
-    """The radiance that shadows and bounces of environment light add to views of a mesh.
+    """Radiance that shadows and bounces of environment light add to views of a mesh.
 
-    The added radiance of each pixel is scaled with the albedo of this pixel. It
-    does not move with the object in the image.
+    It is computed once, and approximates that of shapes that differ little from
+    the mesh: the added radiance of a pixel stays the same, except that it is
+    scaled with the albedo of the pixel.
 
     Attributes:
         mesh: The mesh that casts the shadows.
-        views: What was added for each camera. None if nothing was added.
+        views: Added radiance for each camera. None if shadows and bounces add
+            nothing.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
-        """Precompute the transport of a mesh.
+        """Trace the paths of light between the faces of a mesh.
 
         Args:
             mesh: The mesh.
             settings: Settings of the images.
-            albedo_scale: Factor of the albedo of the mesh.
+            albedo_scale: Factor that multiplies the albedo of the mesh.
             basis: Basis of the light.
         """
         self.mesh = mesh
@@ -79,15 +81,19 @@ class FrozenTransport:
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
 
     def is_near(self, vertices: np.ndarray) -> bool:
-        """Return whether all coordinates of vertices (V, 3) are within `NEAR` of the mesh."""
+        """Return whether a shape is so close to the mesh that it has the same shadows and bounces.
+
+        Args:
+            vertices: Vertices of the shape, which has the faces of the mesh, shape (V, 3).
+        """
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
-        """Compute and keep what is added to a view of the mesh.
+        """Compute and keep the radiance that shadows and bounces add to a view of the mesh.
 
         Args:
             camera: The camera of the view.
-            fragments: The S samples of the mesh in the view.
+            fragments: The S samples of the mesh that the camera sees.
             albedo: Albedo of the mesh at the samples, shape (S, 3).
         """
         self.views[camera] = None
@@ -97,8 +103,8 @@ class FrozenTransport:
         change = self._transport.change(surface, albedo.cpu().double())
         if change is None:
             return
-        # `change` has the covered pixels only. All pixels of the image are kept, because
-        # a shape nearby may cover other pixels. Shape (3, K, size²).
+        # `change` contains only the pixels that the mesh covers. A slightly different shape may
+        # cover others, so expand it to all pixels of the image, shape (3, K, size²).
         all_pixels = change.new_zeros(*change.shape[:2], fragments.size**2)
         all_pixels[..., surface.fragments.pixels] = change
         self.views[camera] = FrozenView(all_pixels.to(albedo), _sum_by_pixel(fragments, albedo))
@@ -106,17 +112,19 @@ class FrozenTransport:
     def radiance(
         self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
     ) -> Tensor:
-        """Compute the added radiance of a view, differentiable in albedo and light.
+        """Compute the radiance that shadows and bounces add to a view of a shape.
+
+        It is differentiable in albedo and light.
 
         Args:
-            camera: A camera whose view was added.
-            fragments: The S samples of the shape, in P pixels. The shape may
-                differ a little from the mesh.
+            camera: A camera for which `add` was called.
+            fragments: The S samples of the shape that the camera sees, in P
+                pixels. The shape may differ a little from the mesh.
             albedo: Albedo at the samples, shape (S, 3).
-            light: Coefficients of the environment light, shape (K, 3).
+            light: RGB coefficients of the environment light, shape (K, 3).
 
         Returns:
-            The added radiance, shape (3, P).
+            Added radiance of the P pixels, shape (3, P).
         """
         view = self.views[camera]
         if view is None:
@@ -124,10 +132,10 @@ class FrozenTransport:
         change = view.change[..., fragments.pixels]
         old_sums = view.albedo_sums[..., fragments.pixels]
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
-        # Shape (3, P).
+        # Radiance with the albedo of the mesh, shape (3, P).
         added = torch.einsum("ckp,kc->cp", change.to(light), light)
-        # The added radiance is proportional to the albedo of the pixel. If the albedo of
-        # the mesh is 0 there, no ratio exists, and the radiance is not scaled.
+        # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
+        # is no ratio, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)
         return added * torch.where(old_sums > 0, ratios, 1).to(light)
 
@@ -136,13 +144,13 @@ def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
     """Sum the albedo of the samples in each pixel of an image.
 
     Args:
-        fragments: The S samples, in P of the size² pixels of the image.
+        fragments: The S samples of an object, and the pixels in which they lie.
         albedo: Albedo at the samples, shape (S, 3).
 
     Returns:
         Sum of each channel in each pixel, shape (3, size²). It is 0 in pixels without samples.
     """
-    # Row-major index in the image of the pixel of each sample, shape (S,).
+    # Row-major index of the pixel in which each sample lies, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
     sums = albedo.new_zeros(3, fragments.size**2)
     return sums.index_add(1, pixel_of_sample, albedo.T)
@@ -150,15 +158,15 @@ def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 
 @dataclass(eq=False, repr=False)
 class DirectRenderer:
-    """Renders objects directly, without precomputed transfer operators.
+    """Render objects directly, without precomputed matrices from light to image.
 
     Attributes:
-        objects: The objects. The argument `number` of methods is an index into them.
+        objects: The objects, which methods select by the argument `object_index`.
         settings: Settings of the images.
         rasterizer: The rasterizer.
         basis: Basis of the lights.
         like: A tensor with the dtype and the device of the images.
-        cached: Whether the samples of unmoved objects are kept.
+        cached: Whether the rasterized views of unmoved objects are kept.
     """
 
     objects: Sequence[SceneObject]
@@ -170,119 +178,127 @@ class DirectRenderer:
 
     def __post_init__(self) -> None:
         """Create empty caches."""
-        # The keys of these two caches are the index of an object, and a camera.
+        # Rasterized views of unmoved objects. A key is the index of an object with a camera.
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
+        # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
-        # The keys are indices of objects.
+        # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
         self._rays: dict[int, Rays] = {}
         self._transport_of_object: dict[int, FrozenTransport] = {}
-        # The keys are indices of examples whose shape has moved away from the object's mesh.
+        # Shadows and bounces of moved shapes, by the indices of their examples.
         self._transport_of_example: dict[int, FrozenTransport] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
-        """Return the vertices of each unmoved object, shape (V, 3)."""
+        """Return the vertices of each object before any change, each of shape (V, 3)."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
-    def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
-        """Rasterize an unmoved object.
+    def view(self, object_index: int, camera: Camera) -> tuple[Fragments, Tensor]:
+        """Rasterize an object whose vertices have not moved.
 
         Args:
-            number: Index of the object.
+            object_index: Index of the object.
             camera: The camera.
 
         Returns:
-            The S samples of the object, and the albedo at the samples, shape
-            (S, 3).
+            The S samples of the object that the camera sees, and the albedo at
+            the samples, shape (S, 3).
         """
-        key = (number, camera)
+        key = (object_index, camera)
         view = self._views.get(key)
         if view is None:
-            view = self._rasterize(number, camera, self.objects[number].mesh.vertices)
+            view = self._rasterize(object_index, camera, self.objects[object_index].mesh.vertices)
         if self.cached:
             self._views[key] = view
         return view
 
-    def local_view(self, number: int, camera: Camera) -> LocalLightView:
-        """Prepare a view of an unmoved object for local lights.
+    def local_view(self, object_index: int, camera: Camera) -> LocalLightView:
+        """Prepare a view of an unmoved object for the light of projector and lamps.
+
+        The result is computed once for each object and camera.
 
         Args:
-            number: Index of the object.
+            object_index: Index of the object.
             camera: The camera.
-
-        Returns:
-            The view. It is computed once for each object and camera.
         """
-        key = (number, camera)
+        key = (object_index, camera)
         if key not in self._local_views:
-            fragments, _ = self.view(number, camera)
-            mesh = self.objects[number].mesh
-            rays = self._rays_among(number)
+            fragments, _ = self.view(object_index, camera)
+            mesh = self.objects[object_index].mesh
+            rays = self._rays_among(object_index)
             self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
         return self._local_views[key]
 
     def radiance(
         self,
         example: int,
-        number: int,
+        object_index: int,
         camera: Camera,
         light: Tensor,
         changed: Conditions,
         background: Tensor,
     ) -> PixelRadiance:
-        """Compute the radiance of an object, differentiable in all tensors.
+        """Render a view of an object with changed shape, colors, gloss or lamps.
 
-        With `settings.silhouettes`, it is also differentiable in tensors among
-        the fields of the camera.
+        The result is differentiable in the light and in all changes. With
+        `settings.silhouettes`, it is also differentiable in fields of the
+        camera that are tensors.
 
         Args:
-            example: Index of the example. The shapes of one example change
-                little from call to call.
-            number: Index of the object.
+            example: Index of the example. If its shape changes little from call
+                to call, shadows and bounces are computed only once.
+            object_index: Index of the object.
             camera: The camera.
-            light: Coefficients of the basis, shape (K, 3).
-            changed: A row of conditions, without their light and cameras.
+            light: RGB coefficients of all lights in the basis, shape (K, 3).
+            changed: Changed vertices, albedo, hue, gloss and lamp positions of
+                the example. The other fields are not used.
             background: Image values behind the object, shape (3 or 1, size²).
 
         Returns:
-            The radiance of the view's pixels.
+            The pixels that the object covers, its coverage of each pixel, and
+            the radiance of each pixel.
         """
-        item = self.objects[number]
+        item = self.objects[object_index]
         fixed_camera = camera.fixed()
         is_moved = changed.vertices is not None
-        # Below, `vertices` is a tensor with a gradient, and `positions` the same as an array.
+        # `vertices` is a tensor, which may have a gradient. `positions` is the same as an array.
         if changed.vertices is None:
-            vertices = self.vertices[number]
+            vertices = self.vertices[object_index]
             positions = item.mesh.vertices
-            fragments, albedo = self.view(number, fixed_camera)
+            fragments, albedo = self.view(object_index, fixed_camera)
         else:
             vertices = changed.vertices
             positions = vertices.detach().cpu().double().numpy()
-            fragments, albedo = self._rasterize(number, fixed_camera, positions)
+            fragments, albedo = self._rasterize(object_index, fixed_camera, positions)
         if changed.albedo is not None:
-            painted = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
-            albedo = paint_faces(*painted, changed.albedo, changed.hue)
+            albedo = paint_faces(
+                item.mesh,
+                fragments,
+                self.settings.encoding,
+                item.albedo_scale,
+                changed.albedo,
+                changed.hue,
+            )
         gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
         split = split_light(self.basis, light)
-        # Local lights need rays for their shadows. The view of an unmoved object in local
-        # light is prepared once. An unmoved object with another gloss cannot use this view.
+        # Projector and lamps need rays for their shadows. For an unmoved object with its own
+        # gloss, the view is prepared once.
         rays = None
         lamp_view = None
         if split.local_lights:
             moved_mesh = replace(item.mesh, vertices=positions)
-            rays = Rays(moved_mesh) if is_moved else self._rays_among(number)
+            rays = Rays(moved_mesh) if is_moved else self._rays_among(object_index)
             if not is_moved and gloss is None:
-                lamp_view = self.local_view(number, fixed_camera)
+                lamp_view = self.local_view(object_index, fixed_camera)
         indirect = None
         if self.settings.global_illumination:
-            # `camera.fixed()` returns the camera itself if none of its fields is a tensor. A
-            # field is a tensor if the camera is attacked. Such a camera changes in every call,
-            # so its views are not kept.
+            # A camera whose fields are tensors is attacked, so it differs in each call. Its views
+            # are not kept. `fixed` returns the same camera if no field is a tensor.
             is_kept = camera is fixed_camera
             indirect = _IndirectLight(
-                self, example, number, fixed_camera, fragments, positions, is_kept
+                self, example, object_index, fixed_camera, fragments, positions, is_kept
             ).radiance
         shares_normals = not is_moved and self.settings.normals == "smooth"
         shown = ShadedView(
@@ -295,72 +311,81 @@ class DirectRenderer:
             rays=rays,
             is_moved=is_moved,
             gloss=gloss,
-            vertex_normals=self._vertex_normals(number) if shares_normals else None,
+            vertex_normals=self._vertex_normals(object_index) if shares_normals else None,
             lamp_view=lamp_view,
             indirect=indirect,
             lamp_positions=changed.positions,
         )
         return shown.pixel_radiance(camera, background)
 
-    def _rays_among(self, number: int) -> Rays:
-        """Return the ray tracer of an unmoved object, which is built once."""
-        if number not in self._rays:
-            self._rays[number] = Rays(self.objects[number].mesh)
-        return self._rays[number]
+    def _rays_among(self, object_index: int) -> Rays:
+        """Return the ray tracer of an unmoved object with the given index. It is built once."""
+        if object_index not in self._rays:
+            self._rays[object_index] = Rays(self.objects[object_index].mesh)
+        return self._rays[object_index]
 
-    def _vertex_normals(self, number: int) -> Tensor:
-        """Return the normals (V, 3) of an unmoved object, which all its views share."""
-        return torch.from_numpy(self.objects[number].mesh.vertex_normals).to(self.like.device)
+    def _vertex_normals(self, object_index: int) -> Tensor:
+        """Return the vertex normals of an unmoved object with the given index, shape (V, 3)."""
+        return torch.from_numpy(self.objects[object_index].mesh.vertex_normals).to(self.like.device)
 
     def transport_near(
-        self, example: int, number: int, camera: Camera, vertices: np.ndarray
+        self, example: int, object_index: int, camera: Camera, vertices: np.ndarray
     ) -> FrozenTransport:
-        """Return shadows and bounces of a shape that is close to the shape of an example.
+        """Return the shadows and bounces of a shape, or of a kept shape that is close to it.
 
         Args:
-            example: Index of the example. One moved shape is kept for each.
-            number: Index of the object.
+            example: Index of the example that has the shape. One shape is kept
+                for each example, in addition to the unmoved objects.
+            object_index: Index of the object.
             camera: The camera.
             vertices: Vertices of the shape, shape (V, 3).
 
         Returns:
-            The transport of a shape within `NEAR`, to which the view from the
-            camera has been added.
+            Shadows and bounces that have been computed for the view of the
+            camera.
         """
-        frozen = self._transport_of_object.get(number)
+        frozen = self._transport_of_object.get(object_index)
         if frozen is None:
-            frozen = self._freeze(number, self.objects[number].mesh)
-            self._transport_of_object[number] = frozen
-        # The unmoved mesh is tried first, then the shape that was kept for the example, and
-        # otherwise the transport of the new shape is computed.
+            frozen = self._freeze(object_index, self.objects[object_index].mesh)
+            self._transport_of_object[object_index] = frozen
+        # If the unmoved mesh is not close to the shape, try the shape that was kept for the
+        # example. If that is not close either, compute shadows and bounces of the new shape.
         if not frozen.is_near(vertices):
             frozen = self._transport_of_example.get(example, frozen)
             if not frozen.is_near(vertices):
-                moved = replace(self.objects[number].mesh, vertices=vertices)
-                frozen = self._freeze(number, moved)
+                moved = replace(self.objects[object_index].mesh, vertices=vertices)
+                frozen = self._freeze(object_index, moved)
             self._transport_of_example[example] = frozen
         if camera not in frozen.views:
-            frozen.add(camera, *self._rasterize(number, camera, frozen.mesh.vertices))
+            frozen.add(camera, *self._rasterize(object_index, camera, frozen.mesh.vertices))
         return frozen
 
-    def _freeze(self, number: int, mesh: Mesh) -> FrozenTransport:
-        """Compute the shadows and bounces of an object's mesh, whose vertices may be moved."""
-        return FrozenTransport(mesh, self.settings, self.objects[number].albedo_scale, self.basis)
+    def _freeze(self, object_index: int, mesh: Mesh) -> FrozenTransport:
+        """Trace the shadows and bounces of light on an object.
+
+        Args:
+            object_index: Index of the object.
+            mesh: Mesh of the object, whose vertices may have moved.
+        """
+        return FrozenTransport(
+            mesh, self.settings, self.objects[object_index].albedo_scale, self.basis
+        )
 
     def _rasterize(
-        self, number: int, camera: Camera, vertices: np.ndarray
+        self, object_index: int, camera: Camera, vertices: np.ndarray
     ) -> tuple[Fragments, Tensor]:
         """Rasterize an object with given vertices.
 
         Args:
-            number: Index of the object.
+            object_index: Index of the object.
             camera: The camera.
             vertices: Vertices of the object's mesh, which may be moved, shape (V, 3).
 
         Returns:
-            The S samples of the object, and the albedo at the samples, shape (S, 3).
+            The S samples of the object that the camera sees, and the albedo at the samples, shape
+            (S, 3).
         """
-        item = self.objects[number]
+        item = self.objects[object_index]
         [fragments] = build_fragments(
             vertices,
             item.mesh.faces,
@@ -376,21 +401,21 @@ class DirectRenderer:
 
 @dataclass(frozen=True, eq=False)
 class _IndirectLight:
-    """Shadows and bounces in one view of a shape, taken from a shape nearby.
+    """Shadows and bounces of environment light in one view of a shape.
 
     Attributes:
-        direct_rendering: Keeps the transport of shapes.
-        example: Index of the example.
-        number: Index of the object.
+        renderer: Renderer that keeps the shadows and bounces of shapes.
+        example: Index of the example that has the shape.
+        object_index: Index of the object.
         camera: The camera.
-        fragments: The S samples of the shape, in P pixels.
+        fragments: The S samples of the shape that the camera sees, in P pixels.
         positions: Vertices of the shape, shape (V, 3).
-        is_kept: Whether the view is kept for further calls.
+        is_kept: Whether the view of this camera is kept for further calls.
     """
 
-    direct_rendering: DirectRenderer
+    renderer: DirectRenderer
     example: int
-    number: int
+    object_index: int
     camera: Camera
     fragments: Fragments
     positions: np.ndarray
@@ -401,13 +426,13 @@ class _IndirectLight:
 
         Args:
             albedo: Albedo of the S samples, shape (S, 3).
-            light: Coefficients of the environment light, shape (K, 3).
+            light: RGB coefficients of the environment light, shape (K, 3).
 
         Returns:
             Added radiance, shape (3, P).
         """
-        frozen = self.direct_rendering.transport_near(
-            self.example, self.number, self.camera, self.positions
+        frozen = self.renderer.transport_near(
+            self.example, self.object_index, self.camera, self.positions
         )
         added = frozen.radiance(self.camera, self.fragments, albedo, light)
         if not self.is_kept:

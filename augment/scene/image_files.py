@@ -1,4 +1,4 @@
-"""Random image files of a folder."""
+"""Read randomly chosen images of a folder."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from renderer.io.images import SUFFIXES, read_image
 def draw_image_files(
     folder: str | Path, key: str, count: int, size: int, draws: torch.Generator
 ) -> Tensor:
-    """Read randomly chosen images of a folder. A file may be chosen several times.
+    """Read randomly chosen images of a folder, with replacement.
 
     Args:
         folder: Folder of the image files. Its sub-folders are searched, too.
-        key: Setting that names the folder, for the error message.
+        key: Name of the setting that has the folder, for the error message.
         count: Number of images, at least 1.
         size: Pixels per side to which each image is scaled.
         draws: Generator of the random numbers.
@@ -30,7 +30,7 @@ def draw_image_files(
     """
     files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
-        raise InputError(f"{key}={folder} holds no image: give a folder of .jpg or .png files")
+        raise InputError(f"{key}={folder} has no images: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
     images = [read_image(files[index], size) for index in progress(chosen, f"reading {key}")]
     return torch.stack(images)

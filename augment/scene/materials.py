@@ -1,4 +1,4 @@
-"""Specular materials of an object before an attack changes them."""
+"""Specular materials of the faces of an object before an attack changes them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from torch import Tensor
 
 from augment.scene.objects import SceneObject
 
-# Positions among roughness, metallic and specular factor of a face.
+# Each face has three numbers: roughness, metallic and specular factor. These are the positions of
+# the first two.
 ROUGHNESS = 0
 METALLIC = 1
 
-# Roughness, metallic and specular factor of an object that neither reflects specularly
-# nor is metallic. `initial_materials` gives it to meshes without a gloss.
+# Roughness, metallic and specular factor of a matte surface, which is neither specular nor
+# metallic.
 MATTE = (1.0, 0.0, 0.0)
 # Roughness, metallic and specular factor with which an attack on a matte object starts.
 SPECULAR_LAYER = (0.5, 0.0, 1.0)
@@ -43,21 +44,24 @@ class FaceMaterials:
         return bool(self.object_mask.all() and has_same_gloss)
 
     def first_face(self) -> FaceMaterials:
-        """Select the first face, which stands for all faces of a uniform mesh."""
+        """Return the material of the first face only. In a uniform mesh, it is that of all."""
         return FaceMaterials(face_gloss=self.face_gloss[:1], object_mask=self.object_mask[:1])
 
 
 def initial_materials(item: SceneObject) -> FaceMaterials:
     """Return the materials with which an attack on the material of an object starts.
 
-    It is the material of the mesh. If the object itself is matte, which means
-    that metallic and specular factor are zero on all its faces, it gets `SPECULAR_LAYER`.
+    They are those of the mesh. If the object is matte (metallic and specular
+    factor are zero on all its faces), its faces get the material
+    `SPECULAR_LAYER`. Props and table keep their materials.
 
     Args:
-        item: The object, whose mesh has F faces.
+        item: The object. Its mesh has F faces, those of props and table
+            included.
 
     Returns:
-        The material of all faces, and which faces are the object's own.
+        Material of each of the F faces, and the mask of the faces that belong
+        to the object itself.
     """
     object_mask = torch.from_numpy(item.own_faces)
     if item.mesh.gloss is None:
@@ -67,6 +71,6 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     metallic_and_specular = face_gloss[object_mask, METALLIC:]
     is_matte = not metallic_and_specular.any()
     if is_matte:
-        varnish = face_gloss.new_tensor(SPECULAR_LAYER)
-        face_gloss = torch.where(object_mask[:, None], varnish, face_gloss)
+        specular_layer = face_gloss.new_tensor(SPECULAR_LAYER)
+        face_gloss = torch.where(object_mask[:, None], specular_layer, face_gloss)
     return FaceMaterials(face_gloss=face_gloss, object_mask=object_mask)

@@ -23,31 +23,29 @@ from renderer.geometry.mesh import (
 from renderer.geometry.shapes import solid
 from renderer.shading.gloss import Gloss
 
-# `add_table` makes each side of a table at least this far from the vertical axis through the
-# origin, in world units.
+# Smallest distance of the sides of a table from its center below the object, in world units.
 MIN_TABLE_REACH = 1.2
-# `add_table` makes a table reach at least this far beyond the object and its props, in world
-# units.
+# Smallest distance by which a table extends beyond the object and its props, in world units.
 TABLE_MARGIN = 0.2
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """An object of a scene, with its props and its table.
+    """An object of a scene, with its props (meshes beside it) and its table.
 
     Attributes:
         label: Name of its class.
-        mesh: A mesh whose first faces are those of the object, which spans
-            [-1, 1]. The faces of props and table follow.
-        albedo_scale: Factor of the albedo of all faces.
+        mesh: One mesh of all faces: first those of the object, which spans
+            [-1, 1], then those of the props and of the table.
+        albedo_scale: Factor that multiplies the albedo of all faces.
         name: Name of the object in messages.
-        own: Number of the object's own faces. None if all faces are its own.
-        props: Meshes of the props, which stand on z = 0.
-        ground: Color of the table, or None without a table.
-        center: Point of the mesh as it was given that is the origin of `mesh`,
-            shape (3,).
-        extent: Length in the mesh as it was given that is 1 in `mesh`. A vertex v
-            of `mesh` lies at center + extent · v.
+        own: Number of faces of the object itself. None if the mesh has no props
+            and no table.
+        props: Meshes of the props, each of which stands on the plane z = 0.
+        ground: Color of the table. None for no table.
+        center: Center of the mesh before normalization, shape (3,).
+        extent: Scale of the mesh before normalization. A vertex v of `mesh` was
+            at center + extent · v before.
     """
 
     label: str
@@ -67,10 +65,10 @@ class SceneObject:
         """Create an object from a mesh of any size at any place.
 
         Args:
-            label: Name of its class.
-            given: The mesh. The object has a copy that is moved and scaled to
+            label: Name of the class of the object.
+            given: The mesh. The object gets a copy that is moved and scaled to
                 span [-1, 1].
-            albedo_scale: Factor of the albedo of all faces.
+            albedo_scale: Factor that multiplies the albedo of all faces.
             name: Name of the object in messages.
 
         Returns:
@@ -83,9 +81,9 @@ class SceneObject:
 
     @property
     def own_faces(self) -> np.ndarray:
-        """Return a mask of the faces of the object itself, shape (F,).
+        """Return a mask of the faces that belong to the object itself, shape (F,).
 
-        It is False for the faces of props and table.
+        The other faces belong to props (meshes beside the object) or to a table.
         """
         face_count = len(self.mesh.faces)
         own_count = face_count if self.own is None else self.own
@@ -93,9 +91,9 @@ class SceneObject:
 
     @property
     def own_vertices(self) -> np.ndarray:
-        """Return a mask of the vertices of the object itself, shape (V,).
+        """Return a mask of the vertices that belong to the object itself, shape (V,).
 
-        It is False for the vertices that a face of a prop or of the table uses.
+        The other vertices belong to faces of props (meshes beside the object) or of a table.
         """
         corners_of_others = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
@@ -104,37 +102,38 @@ class SceneObject:
     def radius(self) -> float:
         """Return the largest distance of a vertex from the origin, including props and table."""
         distances = np.linalg.norm(self.mesh.vertices, axis=1)
-        # A mesh may have vertices that no face uses. These do not count.
+        # Index by faces, to ignore vertices that no face uses.
         return float(distances[self.mesh.faces].max())
 
     @property
     def lowest(self) -> float:
         """Return the height z of the lowest vertex, at which a table is placed."""
         heights = self.mesh.vertices[:, 2]
-        # A mesh may have vertices that no face uses. These do not count.
+        # Index by faces, to ignore vertices that no face uses.
         return float(heights[self.mesh.faces].min())
 
     def move_cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-        """Move and scale cameras as the given mesh was moved and scaled to the object's mesh.
+        """Move and scale cameras in the same way as the mesh was normalized.
 
         Args:
-            cameras: Cameras of the given mesh.
+            cameras: Cameras around the mesh before normalization.
 
         Returns:
-            Cameras that show the object's mesh as the others show the given
-            mesh.
+            Cameras whose images of the normalized mesh are the same as those of
+            the given cameras before normalization.
         """
         center = np.array(self.center)
         return tuple(camera.normalized(center, 1 / self.extent) for camera in cameras)
 
     def joined(self, others: Sequence[Mesh]) -> SceneObject:
-        """Append other meshes to the mesh of the object.
+        """Append the faces of other meshes to the mesh of the object.
 
         Args:
-            others: The other meshes. They are not the object's own.
+            others: Meshes of props or of a table. Their faces do not count as
+                faces of the object itself.
 
         Returns:
-            The object with one mesh of all faces.
+            A copy of the object with one mesh of all faces.
         """
         if not others:
             return self
@@ -143,15 +142,15 @@ class SceneObject:
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """Load an object and its props.
+    """Load an object and its props (meshes beside it).
 
     Args:
         item: Settings of the object.
-        vertices: The object's mesh is subdivided until it has more vertices
+        vertices: The mesh of the object is subdivided until it has more vertices
             than this number.
 
     Returns:
-        The object, scaled and moved to span [-1, 1].
+        The object, moved and scaled to span [-1, 1].
 
     Raises:
         InputError: If a mesh cannot be loaded, has colors besides those of the
@@ -167,21 +166,20 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """Put props beside an object.
+    """Put props, which are meshes that are never attacked, beside an object.
 
     Args:
         item: The object.
-        props: Meshes that stand on z = 0. They are moved to the height of the
-            object's lowest vertex.
+        props: Meshes that stand on the plane z = 0. They are moved to the
+            height of the lowest vertex of the object.
 
     Returns:
-        The object with its props.
+        A copy of the object with the props.
     """
     offset = np.array([0, 0, item.lowest])
     raised = []
     for prop in props:
-        # `normalize` rounds the vertices of the object to float32. Props are rounded
-        # in the same way.
+        # Round the vertices to float32, as `normalize` does with those of the object.
         vertices = (prop.vertices + offset).astype(np.float32)
         raised.append(replace(prop, vertices=vertices.astype(np.float64)))
     return replace(item.joined(raised), props=props)
@@ -196,16 +194,16 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
             for no table.
 
     Returns:
-        The object with its table.
+        A copy of the object with the table.
 
     Raises:
-        InputError: If the color is none.
+        InputError: If `color` is not a color.
     """
     if color is None:
         return item
     require_color("ground", color)
     used_vertices = np.unique(item.mesh.faces)
-    # x and y of each vertex that a face uses.
+    # Horizontal coordinates x and y of the vertices that a face uses.
     horizontal = item.mesh.vertices[used_vertices, :2]
     left, near = np.minimum(horizontal.min(0) - TABLE_MARGIN, -MIN_TABLE_REACH)
     right, far = np.maximum(horizontal.max(0) + TABLE_MARGIN, MIN_TABLE_REACH)
@@ -220,15 +218,15 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
 
 
 def resample_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Replace a solid by another random shape of the same kind, such as another orange.
+    """Replace a generated solid by another random shape of the same kind, such as another orange.
 
     Args:
-        item: The object. Only a solid whose name has no seed, such as "solid:orange" and not
-            "solid:orange:3", is replaced.
-        seed: Seed of the instance.
+        item: The object. It is replaced only if its name is that of a solid without a seed, such
+            as "solid:orange". The name "solid:orange:3" asks for one particular shape.
+        seed: Seed of the new shape.
 
     Returns:
-        The new object with the same gloss, props and table, or the given
+        A copy of the object with the new shape and the same gloss, props and table, or the given
         object.
     """
     kind, *name_and_seed = item.name.split(":")
@@ -237,25 +235,25 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
     mesh = normalize(solid(name_and_seed[0], seed))
     gloss = item.mesh.gloss
     if gloss is not None:
-        # All faces of a solid have the same gloss.
+        # All faces of a solid have the same gloss. Repeat it for the faces of the new shape.
         gloss = gloss[:1].repeat(len(mesh.faces), axis=0)
     return _with_mesh(item, replace(mesh, gloss=gloss))
 
 
 def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
-    """Rotate an object about the origin.
+    """Rotate an object about the origin. Its props and its table do not rotate.
 
     Args:
         item: The object.
         rotation: Rotation matrix, shape (3, 3).
 
     Returns:
-        The rotated object. The same props and table are at the height of its
-        new lowest vertex.
+        The rotated copy. Its props and its table are at the height of its new
+        lowest vertex.
     """
-    # The faces of the object itself come first. `item.own` is their number, or None for all.
+    # Select the faces of the object itself, which come first, without those of props and table.
     mesh = select_faces(item.mesh, slice(item.own))
-    # `normalize` rounds vertices to float32. Rotated vertices are rounded again.
+    # Round the vertices to float32, as `normalize` does.
     vertices = (mesh.vertices @ rotation.T).astype(np.float32)
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 
@@ -270,7 +268,7 @@ def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
     Returns:
         The copy.
     """
-    # The faces of the object itself come first. `item.own` is their number, or None for all.
+    # Select the faces of the object itself, which come first, without those of props and table.
     own_mesh = select_faces(item.mesh, slice(item.own))
     return _with_mesh(item, gloss.on(own_mesh))
 
@@ -290,14 +288,17 @@ def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
 
 
 def _load_prop(item: PropSettings) -> Mesh:
-    """Load the mesh of a prop, turn, scale and move it, and put it on z = 0."""
+    """Load the mesh of a prop (a mesh beside an object), and put it on the plane z = 0.
+
+    Args:
+        item: Settings of the prop, with its scale, its azimuth and its position.
+    """
     mesh = normalize(_load(item))
     angle = math.radians(item.azimuth)
     cosine = math.cos(angle)
     sine = math.sin(angle)
-    # This matrix is transposed, because it multiplies rows from the right.
-    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-    turned = item.scale * mesh.vertices @ turn
+    rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    turned = item.scale * mesh.vertices @ rotation.T
     used_vertices = np.unique(mesh.faces)
     lowest = turned[used_vertices, 2].min()
     return replace(mesh, vertices=turned + np.array([*item.at, -lowest]), skin=None)
@@ -306,13 +307,16 @@ def _load_prop(item: PropSettings) -> Mesh:
 def _load(item: MeshSettings) -> Mesh:
     """Load a mesh with the color and the gloss of its settings.
 
+    Args:
+        item: Settings of the mesh.
+
     Raises:
         InputError: If the mesh is metallic and has no colors.
     """
     mesh = _load_with_color(item)
     if item.gloss is None:
         return mesh
-    # With "file", the gloss of the file has been loaded with the mesh.
+    # If the setting is "file", `_load_with_color` has loaded the gloss of the file.
     if item.gloss != "file":
         mesh = _as_gloss(item.gloss).on(mesh)
     # Column 1 of the gloss is the metallic factor of each face.
@@ -326,7 +330,14 @@ def _load(item: MeshSettings) -> Mesh:
 
 
 def _load_with_color(item: MeshSettings) -> Mesh:
-    """Load a mesh file or build a solid, and color it as its settings say."""
+    """Load a mesh file or generate a solid, and give it the color of its settings, if any.
+
+    Args:
+        item: Settings of the mesh.
+
+    Raises:
+        InputError: If the mesh has colors of its own, and the settings have another.
+    """
     kind, _, name = item.mesh.partition(":")
     if kind == "solid":
         mesh = _build_solid(item.mesh, name)
@@ -347,22 +358,21 @@ def _load_with_color(item: MeshSettings) -> Mesh:
 
 
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
-    """Build a solid.
+    """Generate the mesh of a solid, such as an orange.
 
     Args:
         mesh_name: Full name for error messages, such as "solid:orange:3".
-        name_and_seed: Name and seed of the solid, such as "orange:3". The seed is 0 if it is
-            left out.
+        name_and_seed: Name of the solid and its seed, such as "orange:3". Without a seed, it is
+            0.
 
-    Returns:
-        The mesh.
+    Raises:
+        InputError: If there is no such solid, or if the seed is not a whole number.
     """
     name, _, seed = name_and_seed.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"{mesh_name}: its seed is {seed!r}, give a whole number")
     try:
         return solid(name, int(seed or 0))
-    # The name is unknown, or the seed is no number.
     except ValueError as error:
         raise InputError(f"{mesh_name}: {error}") from error
 
@@ -376,8 +386,7 @@ def _as_gloss(values: Sequence[float]) -> Gloss:
     """Convert the values of the setting `gloss` to a gloss.
 
     Args:
-        values: Roughness, metallic and specular factor. The last value, or the last two, may be
-            left out.
+        values: Roughness, then metallic, then specular factor. Values at the end may be left out.
 
     Returns:
         The gloss. Values that are left out have the defaults of `Gloss`.

@@ -16,14 +16,15 @@ from torch import Tensor
 
 from renderer.image import LUMINANCE, decode
 
-# The radius of a disc in a cell of width 1. The discs cover half of the area.
+# Radius of a disc in the pattern `spots`, which has one disc in each square cell of width 1. The
+# discs cover half of the area.
 DISC_RADIUS = 0.4
-# The smallest and the largest period of a pattern.
+# Smallest and largest period of a random pattern. The image is 2 units wide.
 MIN_PERIOD = 0.25
 MAX_PERIOD = 1.0
-# A pattern shows a photograph at a scale from 1 / MAX_ZOOM to MAX_ZOOM.
+# Largest random factor by which a projected photograph is enlarged or reduced.
 MAX_ZOOM = 2.0
-# The largest factor by which the saturation of such a photograph is multiplied.
+# Largest random factor by which the saturation of a projected photograph is multiplied.
 MAX_SATURATION = 3.0
 
 
@@ -31,23 +32,24 @@ def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tenso
     """Find the points on the bright parts of vertical stripes with period 1.
 
     Args:
-        points: Points, shape (2, ...).
-        shift: Shift of the stripes. Of a tensor (2, ...), only the first row,
-            along x, is used.
+        points: Points, with x in row 0 and y in row 1, shape (2, ...).
+        shift: Shift of the stripes along x: a number, or row 0 of a tensor
+            (2, ...).
         bright: Fraction of a period that is bright.
 
     Returns:
         Mask of the points on bright stripes, shape (...).
     """
-    # Row 0 of the comparison is about x. The stripes do not depend on y.
-    return ((points + shift) % 1 < bright)[0]
+    is_bright = (points + shift) % 1 < bright
+    # Vertical stripes depend on x only, which is row 0.
+    return is_bright[0]
 
 
 def checkers(points: Tensor, shift: Tensor) -> Tensor:
     """Find the points on the bright squares of a chessboard with period 1.
 
     Args:
-        points: Points, shape (2, ...).
+        points: Points, with x in row 0 and y in row 1, shape (2, ...).
         shift: Shift of the chessboard along x and y, shape (2, ...).
 
     Returns:
@@ -59,41 +61,42 @@ def checkers(points: Tensor, shift: Tensor) -> Tensor:
 
 
 def spots(points: Tensor, shift: Tensor) -> Tensor:
-    """Find the points in the discs of a grid with period 1.
+    """Find the points in the discs of a square grid with period 1.
 
     Args:
-        points: Points, shape (2, ...).
+        points: Points, with x in row 0 and y in row 1, shape (2, ...).
         shift: Shift of the grid along x and y, shape (2, ...).
 
     Returns:
         Mask of the points in discs, shape (...).
     """
-    # Offset of each point from the center of its disc, shape (2, ...).
+    # Vector from the center of the disc in the same cell to each point, shape (2, ...).
     from_center = (points + shift) % 1 - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
 def half(points: Tensor, shift: Tensor | float) -> Tensor:
-    """Find the points to the right of the line x = shift - 0.5.
+    """Find the points to the right of the vertical line x = shift - 0.5.
 
     Args:
-        points: Points, shape (2, ...).
-        shift: Shift of the line. Of a tensor (2, ...), only the first row,
-            along x, is used.
+        points: Points, with x in row 0 and y in row 1, shape (2, ...).
+        shift: Shift of the line along x: a number, or row 0 of a tensor
+            (2, ...).
 
     Returns:
-        Mask of the points to the right, shape (...).
+        Mask of the points to the right of the line, shape (...).
     """
-    # Row 0 of the comparison is about x. The line does not depend on y.
-    return (points > shift - 0.5)[0]
+    is_greater = points > shift - 0.5
+    # The line depends on x only, which is row 0.
+    return is_greater[0]
 
 
 def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
     """Return ones for all points, which makes a pattern of a single color.
 
     Args:
-        points: Points, shape (2, ...).
-        shift: Not used. All shapes are called with a shift.
+        points: Points, with x in row 0 and y in row 1, shape (2, ...).
+        shift: Not used. All patterns are called with a shift.
 
     Returns:
         Ones, shape (...).
@@ -101,18 +104,19 @@ def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
     return torch.ones_like(points[0])
 
 
-# Shapes of which `draw_patterns` chooses one for each pattern.
+# Kinds of patterns, of which `draw_patterns` chooses at random.
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 
 
 def pixel_centers(size: int) -> Tensor:
-    """Return the centers of the pixels of an image as points.
+    """Return the coordinates of the pixel centers of an image, which spans [-1, 1].
 
     Args:
         size: Pixels per side.
 
     Returns:
-        x (to the right) and y (down) of each center in [-1, 1], shape (2, 1, size, size).
+        x (to the right) in row 0 and y (down) in row 1, shape (2, 1, size, size). The second
+        axis is for several images of this size.
     """
     centers = (torch.arange(size) + 0.5) / size * 2 - 1
     return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
@@ -122,8 +126,9 @@ def turned(points: Tensor, cosine: Tensor | float, sine: Tensor | float) -> Tens
     """Rotate points about the center of the image.
 
     Args:
-        points: Points, shape (2, ...).
-        cosine: Cosine of the angle. A positive angle turns right to down.
+        points: Points, with x to the right in row 0 and y down in row 1, shape
+            (2, ...).
+        cosine: Cosine of the angle. Positive angles are clockwise.
         sine: Sine of the angle.
 
     Returns:
@@ -134,35 +139,34 @@ def turned(points: Tensor, cosine: Tensor | float, sine: Tensor | float) -> Tens
 
 
 def two_colors(weight: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Blend two colors of light.
+    """Blend two colors in each of N images, with a weight for each pixel.
 
     Args:
         weight: Weight of the first color in [0, 1], shape (N, 1, H, W).
-        first: Linear RGB, shape (N, 3, 1, 1).
-        second: Linear RGB, shape (N, 3, 1, 1).
+        first: Linear RGB of the first color, shape (N, 3, 1, 1).
+        second: Linear RGB of the second color, shape (N, 3, 1, 1).
 
     Returns:
-        Linear RGB, shape (N, 3, H, W).
+        Linear RGB images, shape (N, 3, H, W).
     """
     return second + weight * (first - second)
 
 
 def random_colors(draws: Tensor) -> Tensor:
-    """Compute colors of light whose largest channel is 1.
+    """Convert hue and saturation to colors of full brightness (HSV with value 1).
 
     Args:
-        draws: Hue and saturation in [0, 1] of each color, shape (N, 2).
+        draws: Hue and saturation in [0, 1] of each of N colors, shape (N, 2).
 
     Returns:
-        Linear RGB, shape (N, 3, 1, 1): white at saturation 0, a pure hue at 1.
-        The sRGB values are linear in the saturation.
+        Linear RGB of each color, shape (N, 3, 1, 1). The largest channel is 1.
 
     Example:
         >>> random_colors(torch.tensor([[0.0, 0.0], [0.0, 1.0]])).flatten(1).tolist()
         [[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]]
     """
     hue, saturation = draws.split(1, dim=1)
-    # Each channel of a pure hue is a piecewise linear function of the hue (HSV, Smith 1978).
+    # The sRGB channels of a pure hue are piecewise linear in the hue (HSV, Smith 1978).
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6
     pure = ((ramps - 3).abs() - 1).clamp(0, 1)
     return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]
@@ -171,14 +175,17 @@ def random_colors(draws: Tensor) -> Tensor:
 def draw_patterns(
     count: int, size: int, draws: torch.Generator, points: Tensor | None = None
 ) -> Tensor:
-    """Draw patterns of random colors, at random angles, scales and positions.
+    """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
+
+    Kind, colors, angle, period and position are random.
 
     Args:
         count: Number of patterns.
-        size: Pixels per side.
-        draws: Source of random numbers.
-        points: Point of the pattern that each pixel shows, shape
-            (2, count, size, size). By default, the pattern fills the image.
+        size: Pixels per side of the images.
+        draws: CPU generator of the random numbers.
+        points: Coordinates x and y of the point of the pattern that each pixel
+            shows, shape (2, count, size, size). By default, the pattern fills
+            the image, which spans [-1, 1].
 
     Returns:
         Linear light in [0, 1], shape (count, 3, size, size).
@@ -196,22 +203,23 @@ def draw_patterns(
         position_draws.append(torch.rand(4, generator=draws))
         family_draws.append(torch.randint(len(FAMILIES), (), generator=draws))
         color_draws.append(torch.rand(5, generator=draws))
-    # Angle as a fraction of a full turn, period as a fraction of its range, and shifts along x
-    # and y. Each of these four numbers in [0, 1] has shape (count, 1, 1).
-    turn, relative_period, *shift = torch.stack(position_draws).T[:, :, None, None]
+    # Four numbers in [0, 1] of each pattern, each of shape (count, 1, 1): angle as a fraction of
+    # a full turn, period as a fraction of its range, and shifts along x and y.
+    turn, relative_period, shift_x, shift_y = torch.stack(position_draws).T[:, :, None, None]
     period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
-    # Shape (2, count, size, size).
+    # Points of the pattern in units of its period, shape (2, count, size, size).
     rotated = turned(points / period, angle.cos(), angle.sin())
-    shifts = torch.stack(shift)
-    # Index in `FAMILIES` of each pattern, shape (count,).
+    shifts = torch.stack([shift_x, shift_y])
+    # Kind of each pattern as an index in `FAMILIES`, shape (count,).
     family_of_pattern = torch.stack(family_draws)
+    # Weight of the first color at each pixel, shape (count, 1, size, size).
     weight = torch.empty(count, 1, *points.shape[2:])
-    for index, shape in enumerate(FAMILIES):
+    for index, family in enumerate(FAMILIES):
         patterns = torch.nonzero(family_of_pattern == index).squeeze(1)
-        weight[patterns, 0] = shape(rotated[:, patterns], shifts[:, patterns]).float()
-    # The five numbers of a pattern are hue and saturation of its first color, hue and
-    # saturation of its second color, and the brightness of the second color.
+        weight[patterns, 0] = family(rotated[:, patterns], shifts[:, patterns]).float()
+    # Hue and saturation of the first color, hue and saturation of the second color, and
+    # brightness of the second color, shape (count, 5).
     colors = torch.stack(color_draws)
     first = random_colors(colors[:, :2])
     brightness = colors[:, 4:, None, None]
@@ -220,18 +228,19 @@ def draw_patterns(
 
 
 def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.Generator) -> Tensor:
-    """Draw patterns that show photographs: turned, scaled and saturated at random.
+    """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
     Args:
-        photographs: Linear light in [0, 1], shape (N, 3, H, W).
-        points: Point of the pattern that each pixel shows, shape
-            (2, N, size, size), or (2, 1, size, size) if it is the same for all.
-        draws: Source of random numbers.
+        photographs: Photographs as linear light in [0, 1], shape (N, 3, H, W).
+        points: Coordinates x and y of the point of the pattern that each pixel
+            shows, shape (2, N, size, size), or (2, 1, size, size) if they are the
+            same for all photographs.
+        draws: CPU generator of the random numbers.
 
     Returns:
         Linear light in [0, 1], shape (N, 3, size, size).
     """
-    # Numbers in [0, 1], shape (N, 1, 1) each.
+    # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
     turn, zoom, saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
     angle = 2 * math.pi * turn
     scale = MAX_ZOOM ** (2 * zoom - 1)
@@ -240,32 +249,32 @@ def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.G
 
 
 def show_photographs(photographs: Tensor, grid: Tensor, saturation: Tensor) -> Tensor:
-    """Sample photographs at points, and change their saturation.
+    """Sample photographs at given points, and change their saturation.
 
-    Beyond the border, a photograph is mirrored.
+    Beyond its border, a photograph is mirrored.
 
     Args:
-        photographs: Linear light in [0, 1], shape (N, 3, H, W).
-        grid: Point of the photograph that each pixel shows, in [-1, 1], shape
-            (N, size, size, 2).
-        saturation: Factor of the saturation as a fraction of `MAX_SATURATION`,
-            shape (N,).
+        photographs: Photographs as linear light in [0, 1], shape (N, 3, H, W).
+        grid: Coordinates x and y of the point of the photograph that each pixel
+            shows, in [-1, 1], shape (N, size, size, 2).
+        saturation: Factor of the saturation of each photograph, divided by
+            `MAX_SATURATION`, shape (N,).
 
     Returns:
         Linear light in [0, 1], shape (N, 3, size, size).
     """
     shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
-    # The saturation is changed by moving each color away from or towards its gray value.
+    # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
     factor = MAX_SATURATION * saturation[:, None, None, None]
     return (gray + factor * (shown - gray)).clamp(0, 1)
 
 
 def luminance(linear: Tensor) -> Tensor:
-    """Compute the luminance of linear RGB.
+    """Compute the luminance of each pixel.
 
     Args:
-        linear: Linear RGB, shape (N, 3, H, W).
+        linear: Linear RGB images, shape (N, 3, H, W).
 
     Returns:
         Luminance, shape (N, 1, H, W).

@@ -1,5 +1,6 @@
 """Render images of unchanged objects in changing light with stacked transfer operators.
 
+A transfer operator is a matrix that maps the coefficients of the light to the pixels of one view.
 The objects are rasterized once. After that, a change of the light costs a matrix product.
 """
 
@@ -24,15 +25,14 @@ from renderer.transport.operators import TransferOperator
 
 
 class Layer(NamedTuple):
-    """Radiance of B images of a batch at P pixels.
-
-    The objects of these images cover no other pixels.
+    """Radiance of B images of a batch at the P pixels that their objects may cover.
 
     Attributes:
-        rows: Indices of the B images in the batch: a slice, or indices (B,)
-            on the device of the radiance.
-        pixels: Indices of the pixels in an image, shape (P,).
-        composite: Linear radiance of object and background, shape (B, 3, P).
+        rows: Indices of the B images in the batch: a slice, or a tensor (B,) on
+            the device of the radiance.
+        pixels: Row-major index of each of the P pixels in an image, shape (P,).
+        composite: Linear radiance of the objects in front of the backgrounds,
+            shape (B, 3, P).
     """
 
     rows: Rows
@@ -41,16 +41,17 @@ class Layer(NamedTuple):
 
 
 class _BuiltStack(NamedTuple):
-    """A stack of operators and the M images of `Relighting` that it renders.
+    """A stack of transfer operators, and the backgrounds of the M images that it renders.
+
+    A transfer operator is a matrix from light to the pixels of one view.
 
     Attributes:
-        operators: The operators.
-        image_to_stack_image: For each of all N images, its index among the M
-            images of this stack, shape (N,). Values of images that are not in
-            this stack have no meaning.
+        operators: The stack, which covers P pixels of an image.
+        image_to_stack_image: For each of the N images of the scene, its index
+            among the M images of this stack, shape (N,). Images of other stacks
+            have arbitrary values.
         background_terms: Linear radiance that the backgrounds add to the M
-            images at the P pixels of the stack, in C = 1 or 3 channels, shape
-            (M, C, P).
+            images at the P pixels, in C = 1 or 3 channels, shape (M, C, P).
     """
 
     operators: OperatorStack
@@ -60,53 +61,53 @@ class _BuiltStack(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class Relighting:
-    """Render N images, each of one object from one camera in front of one background.
+    """Render N images with transfer operators, which are matrices from light to image.
 
-    Images of the same object from the same camera share an operator. The
-    operators are built when they are first needed, one stack at a time. The
-    radiance of the backgrounds is computed once.
+    Each image shows one object from one camera in front of one background.
+    Images of the same object from the same camera share an operator. Operators
+    are combined to stacks, which are built when they are first needed.
 
     Attributes:
         objects: The objects.
         views: Index of the object, and the camera, for each of the N images.
-        behind: Index of the background of each image, shape (N,).
-        backgrounds: Image values, shape (B, 3 or 1, size²).
+        image_to_background: Index of the background of each image, shape (N,).
+        backgrounds: Image values of B backgrounds, shape (B, 3 or 1, size²).
         settings: Settings of the images.
-        build: Builds one operator for each camera, from a mesh, cameras and
-            an albedo_scale.
-        beside: Bytes that an attack needs in addition to the operators.
+        build: Function that builds the operators of several cameras. Its
+            arguments are a mesh, cameras and `albedo_scale`.
+        attack_bytes: Bytes that an attack needs in addition to the operators.
     """
 
     objects: Sequence[SceneObject]
     views: Sequence[tuple[int, Camera]]
-    behind: Tensor
+    image_to_background: Tensor
     backgrounds: Tensor
     settings: ImageSettings
     build: Callable[..., Sequence[TransferOperator]]
-    beside: int = 0
+    attack_bytes: int = 0
 
     def __post_init__(self) -> None:
-        """Assign an operator to each image, and a stack to each operator.
+        """Assign a transfer operator to each image, and a stack to each operator.
 
-        Images of the same view share an operator. Each stack has as many
-        operators as fit into `PIXELS_PER_STACK`.
+        Images of the same object from the same camera share an operator. A
+        stack has as many operators as fit into `PIXELS_PER_STACK`.
         """
-        # The view of each operator: index of the object, and camera. Sorting by the object puts
-        # the operators of one object into few stacks.
+        # Object and camera of each operator. Sort them by the object, so that the operators of
+        # one object are in few stacks.
         self._views_of_operators = sorted(dict.fromkeys(self.views), key=itemgetter(0))
         operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
-        # Index in `_views_of_operators` of the operator of each image, shape (N,).
+        # Index of the transfer operator that renders each image, shape (N,).
         self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
         self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.size**2)
-        # Index of the stack of each image, shape (N,).
+        # Index of the stack of operators that renders each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
         self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
-        # The keys are indices of stacks.
+        # Stacks of transfer operators that were built so far, by their indices.
         self._built: dict[int, _BuiltStack] = {}
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """Return all stacks of operators, and build those that do not exist yet."""
+        """Return all stacks of transfer operators. Build those that were not needed so far."""
         self._build_missing(range(self._stack_count))
         return [self._built[index].operators for index in range(self._stack_count)]
 
@@ -114,16 +115,17 @@ class Relighting:
         """Compute the radiance of a batch of images, differentiable in the light.
 
         Args:
-            light: Coefficients of the light of each image of the batch, shape
-                (A, size, 3).
-            images: Indices of the images of the batch among all N, shape (A,).
+            light: RGB coefficients of the light of each image of the batch,
+                shape (A, size of the basis, 3).
+            images: Index of each image of the batch among all N, shape (A,).
 
         Yields:
-            The radiance of those images of the batch that share a stack.
+            One layer for each stack of operators, with the radiance of the
+            images of the batch that this stack renders.
         """
-        # The CPU waits here for a GPU. It waits once for all stacks.
+        # Copying waits until the GPU is idle. This happens once for all stacks.
         images = images.cpu()
-        # A row is the position of an image in the batch. Shape (A,).
+        # Index of the stack of each image of the batch, shape (A,).
         row_to_stack = self._stack_of_image[images]
         needed_stacks = row_to_stack.unique().tolist()
         self._build_missing(needed_stacks)
@@ -131,7 +133,7 @@ class Relighting:
             built = self._built[index]
             row_indices = torch.nonzero(row_to_stack == index).squeeze(1)
             rows = _as_rows(row_indices, light.device)
-            # Where these images of the batch are among the images of the stack.
+            # Indices of these images of the batch among the images of the stack.
             stack_images = built.image_to_stack_image[images[row_indices]]
             stack_images_on_device = stack_images.to(light.device, non_blocking=True)
             radiance = built.operators.radiance(light[rows], stack_images)
@@ -139,32 +141,47 @@ class Relighting:
             yield Layer(rows, built.operators.pixels, composite)
 
     def _build_missing(self, indices: Iterable[int]) -> None:
-        """Build those of the stacks with the given indices that do not exist yet."""
+        """Build the stacks of transfer operators with the given indices, if they do not exist yet.
+
+        Args:
+            indices: Indices of stacks.
+
+        Raises:
+            InputError: If all stacks of the scene would not fit in memory.
+        """
         missing = [index for index in indices if index not in self._built]
         if not missing:
             return
         for index in progress(missing, "rendering views"):
             self._built[index] = self._build_stack(index)
-            # After the first stack, the memory of all others is known.
+            # The first stack tells how much memory all stacks will need.
             if len(self._built) == 1:
                 self._require_memory_for_others(self._built[index])
 
     def _require_memory_for_others(self, first: _BuiltStack) -> None:
-        """Raise InputError unless there is memory for all stacks that are not built yet.
+        """Check that all other stacks fit in memory, if each is as large as the first one.
 
-        All stacks are taken to be as large as the first one.
+        Args:
+            first: The stack that was built first.
+
+        Raises:
+            InputError: If memory is too small.
         """
         operators = first.operators
         stack_bytes = (
             operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
         )
-        needed = (self._stack_count - 1) * stack_bytes + self.beside
+        needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
         view_count = len(self._views_of_operators)
         name = f"{view_count} views of {self.settings.size} pixels per side (views)"
         require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
-        """Build the stack of operators with an index, and the background terms of its images."""
+        """Build a stack of transfer operators, and the backgrounds of the images that it renders.
+
+        Args:
+            index: Index of the stack.
+        """
         first_operator = index * self._operators_per_stack
         end = first_operator + self._operators_per_stack
         views = self._views_of_operators[first_operator:end]
@@ -173,32 +190,32 @@ class Relighting:
             item = self.objects[object_index]
             cameras = [camera for _, camera in views_of_object]
             operators += self.build(item.mesh, cameras, albedo_scale=item.albedo_scale)
-        # Mask of the M images whose operators are in the stack, shape (N,).
+        # Mask of the images whose operators are in this stack, shape (N,). M of them are True.
         is_in_stack = self._stack_of_image == index
-        # Index in the stack of the operator of each of the M images, shape (M,).
+        # Index of the operator of each of these images in the stack, shape (M,).
         operator_of_image = (self._operator_of_image[is_in_stack] - first_operator).cpu()
         stack = OperatorStack(operators, operator_of_image, self.backgrounds.device)
         background_pixels = self.backgrounds.index_select(2, stack.pixels)
         background_terms = background_term(
             stack.coverage[stack.shown],
-            background_pixels[self.behind[is_in_stack]],
+            background_pixels[self.image_to_background[is_in_stack]],
             self.settings.encoding,
         )
-        # The images of the stack are numbered in the order of all N images. The cumulative sum
-        # of the mask counts them.
+        # Number the images of the stack in their order: 0 for the first True of the mask, and so
+        # on.
         image_to_stack_image = is_in_stack.cumsum(0) - 1
         return _BuiltStack(stack, image_to_stack_image, background_terms)
 
 
 def _as_rows(indices: Tensor, device: torch.device) -> Rows:
-    """Convert increasing row indices to a faster form.
+    """Convert row indices to a slice if they are consecutive, because a slice is faster.
 
     Args:
         indices: Row indices in increasing order, shape (B,), on the CPU.
         device: Device of the tensor whose rows are selected.
 
     Returns:
-        A slice if the indices are consecutive numbers, or else the indices on the device.
+        A slice, or the indices on the device.
     """
     first = int(indices[0])
     end = int(indices[-1]) + 1

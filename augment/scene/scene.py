@@ -1,4 +1,4 @@
-"""Examples of objects, cameras and backgrounds, rendered under conditions that attacks change."""
+"""The examples of a scene: objects, cameras and backgrounds, rendered in light that can change."""
 
 from __future__ import annotations
 
@@ -32,49 +32,50 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Number of pixels, over all views, of the images that are rendered at a time. It decides
-# `Scene.group_size`.
+# Largest total number of pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
-# Direct rendering shows its progress if it renders more views than this. For fewer views,
-# showing the progress would make a step of an attack 4 % slower.
+# A progress bar is shown if more views than this are rendered one by one. For fewer views, the bar
+# would make a step of an attack 4 % slower.
 UNCOUNTED_VIEWS = 8
 
 
 class Scene:
-    """E examples with V views each, in front of B backgrounds.
+    """E examples, each of which shows an object from V cameras in front of a background.
 
-    While only the light changes, each view is rasterized once. After that, its transfer operator
-    gives the image under each light (see `Relighting`). A view whose vertices move is rasterized
-    each time (see `DirectRenderer`).
+    If only the light changes, each view is rasterized once into a transfer operator, a matrix
+    from light to image (see `Relighting`). If vertices, colors or gloss change, each view is
+    rasterized each time (see `DirectRenderer`).
 
     Args:
         objects: The objects.
-        examples: The examples, which have the same number of views.
-        backgrounds: The backgrounds, with values in [0, 1], shape (B, 3, size, size) or
+        examples: The E examples, each with V cameras.
+        backgrounds: B backgrounds with values in [0, 1], shape (B, 3, size, size) or
             (B, 1, size, size).
-        lights: The lights where attacks begin, shape (E, coefficients, 3), or (coefficients, 3)
-            for all examples. Images have the dtype and the device of the lights.
-        settings: The settings of the images.
+        lights: RGB coefficients of the light before any attack, shape (E, coefficients, 3), or
+            (coefficients, 3) for all examples. Images have the dtype and the device of the
+            lights.
+        settings: Settings of the images.
         rasterizer: The rasterizer.
-        basis: The basis of the lights' coefficients, by default 49 harmonics.
-        camera_effects: A differentiable function of rendered images (A, V, 3, size, size) and
-            of the indices of these A examples, shape (A,). It returns the changed images. See
-            `draw_camera_effects`.
-        one_light: Whether each view is rendered under one light only. No transfer operators are
-            built then, because direct rendering takes less time.
-        lights_of_degree: A function of a degree and of the roughness of the smoothest gloss,
-            which is None without gloss. It returns the basis of this degree, and the scene's
-            lighting as coefficients (coefficients, 3) of this basis. None if only the
-            coefficients `lights` are known.
+        basis: Basis of the coefficients. By default, these are 49 spherical harmonics.
+        camera_effects: A differentiable function that changes rendered images, such as one of
+            `draw_camera_effects`. Its arguments are the images of A examples, shape
+            (A, V, 3, size, size), and the indices of these examples, shape (A,). None for no
+            effects.
+        one_light: Whether each view is rendered in one light only. Then no transfer operators
+            are built, because direct rendering takes less time.
+        lights_of_degree: A function that loads the lighting with another degree of harmonics.
+            Its arguments are the degree, and the roughness of the smoothest surface (None if no
+            surface has gloss). It returns the basis, and RGB coefficients of the light, shape
+            (coefficients, 3). None if the lighting cannot be loaded again.
 
     Attributes:
-        views: The number of views of an example.
-        object_of: The index of the object of each example, shape (E,).
-        group_size: The number of examples that are rendered at a time.
-        attack_bytes: The memory that an attack on the light needs beside the operators.
+        views: Number V of views of an example.
+        object_of: Index of the object of each example, shape (E,).
+        group_size: Largest number of examples that are rendered at a time.
+        attack_bytes: Bytes that an attack on the light needs in addition to the operators.
 
     Raises:
-        InputError: If an argument is of another kind, shape or range, or memory is too small.
+        InputError: If an argument has a wrong type, shape or range, or if memory is too small.
 
     Example:
         >>> import torch
@@ -121,15 +122,17 @@ class Scene:
         self.camera_effects = camera_effects
         self.one_light = one_light
         self.lights_of_degree = lights_of_degree
-        # The depth range of a camera holds the whole object.
+        # The depth range of each camera must contain the whole object.
         self.examples = [self._with_clip_ranges(example) for example in examples]
         self.backgrounds = backgrounds.to(lights)
         self.lights = lights.expand(len(examples), *lights.shape[-2:])
         self.views = len(examples[0].cameras)
         device = lights.device
-        self.object_of = torch.tensor([row.object for row in examples], device=device)
-        self._background = torch.tensor([row.background for row in examples], device=device)
-        exposures = torch.tensor([row.exposure for row in examples])
+        self.object_of = torch.tensor([example.object for example in examples], device=device)
+        backgrounds_of_examples = [example.background for example in examples]
+        self._background = torch.tensor(backgrounds_of_examples, device=device)
+        exposures = torch.tensor([example.exposure for example in examples])
+        # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
         self._exposure = exposures.to(lights)[:, None, None]
 
         pixels_per_example = self.views * settings.size**2
@@ -148,25 +151,24 @@ class Scene:
         )
 
     def _with_clip_ranges(self, example: Example) -> Example:
-        """Return an example whose cameras have a depth range that holds the whole object."""
+        """Return a copy of an example whose cameras have a depth range with the whole object."""
         radius = self.objects[example.object].radius
-        return replace(
-            example, cameras=tuple(camera.with_clip_range(radius) for camera in example.cameras)
-        )
+        cameras = tuple(camera.with_clip_range(radius) for camera in example.cameras)
+        return replace(example, cameras=cameras)
 
     def _build_relighting(self) -> Relighting:
-        """Prepare rendering with transfer operators of all views of all examples.
+        """Prepare rendering with transfer operators, which are matrices from light to image.
 
-        The operators themselves are built when an image first needs them.
+        The operators are built when an image first needs them.
 
         Returns:
-            The renderer of E · V images. Image e · V + v is view v of example e.
+            A renderer of all V views of all E examples. Its image e · V + v is view v of example
+            e.
         """
-        views = [
-            (example.object, camera) for example in self.examples for camera in example.cameras
-        ]
-        # `build` must not refer to `self`. Python would otherwise free the scenes of earlier
-        # epochs late, because of the circular reference.
+        views = []
+        for example in self.examples:
+            views += [(example.object, camera) for camera in example.cameras]
+        # `build` must not refer to `self`. Python frees objects with circular references late.
         build = partial(
             build_operators,
             settings=self.settings,
@@ -199,42 +201,36 @@ class Scene:
     ) -> Scene:
         """Build a scene of every object from every camera in front of every background.
 
-        The backgrounds change fastest from example to example, and the objects slowest.
+        The examples are sorted by object, then by camera, then by background.
 
         Args:
             objects: The objects.
             cameras: The cameras.
             backgrounds: The backgrounds, shape (B, 3, size, size) or (B, 1, size, size).
             of_scene: Further arguments of `Scene`, by position.
-            shared: Whether the cameras are the views of one example, which share one light and
-                one shape. Otherwise each camera makes an example of its own.
-            placed: Whether the cameras see each object where its mesh was given, and not as it is
-                after normalization. They are then moved and scaled with each object.
+            shared: Whether all cameras are the views of one example, so that they share one light
+                and one shape. By default, each camera makes an example of its own.
+            placed: Whether the cameras belong to the meshes before their normalization. They are
+                then moved and scaled in the same way as each mesh.
             options: Further arguments of `Scene`, by name.
-
-        Returns:
-            The scene.
         """
-        # The cameras of each example that shows the same object and background.
+        # Cameras of the examples of an object in front of a background: one tuple per example.
         camera_groups = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = []
         for object_index, given_cameras, background_index in product(
             range(len(objects)), camera_groups, range(len(backgrounds))
         ):
-            moved_cameras = given_cameras
+            cameras_of_example = given_cameras
             if placed:
-                moved_cameras = objects[object_index].move_cameras(given_cameras)
-            examples.append(Example(object_index, moved_cameras, background_index))
+                cameras_of_example = objects[object_index].move_cameras(given_cameras)
+            examples.append(Example(object_index, cameras_of_example, background_index))
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:
-        """Return a scene with some other arguments.
+        """Return a copy of the scene with some other arguments.
 
         Args:
-            arguments: Arguments of `Scene` that are replaced, by name.
-
-        Returns:
-            The scene.
+            arguments: Arguments of `Scene` that differ in the copy, by name.
         """
         arguments_of_self = {name: getattr(self, name) for name in _ARGUMENTS}
         return Scene(**arguments_of_self | arguments)
@@ -244,7 +240,7 @@ class Scene:
 
     @cached_property
     def cameras(self) -> list[tuple[Camera, ...]]:
-        """Return the V cameras of each example."""
+        """Return the V cameras of each of the E examples."""
         return [example.cameras for example in self.examples]
 
     @cached_property
@@ -254,7 +250,7 @@ class Scene:
 
     @cached_property
     def vertices(self) -> Tensor:
-        """Return the vertices of the M objects, shape (M, N, 3).
+        """Return the vertices of all objects before any attack, shape (objects, N, 3).
 
         N is the number of vertices of the largest mesh. Smaller meshes are padded with zeros.
         """
@@ -262,42 +258,36 @@ class Scene:
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """Return the stacked transfer operators of all views, and build missing ones."""
+        """Return the transfer operators (matrices from light to image) of all views, in stacks."""
         return self._relighting.stacks
 
     def mesh(self, example: int) -> Mesh:
-        """Return the mesh of an example, which is given by its index."""
+        """Return the mesh of the example with the given index."""
         return self.objects[self.examples[example].object].mesh
 
     def basis_under(self, conditions: Conditions, row: int) -> Basis:
-        """Return the basis of the light under some conditions.
+        """Return the basis of the light of an example, whose lamps may have moved.
 
         Args:
-            conditions: The conditions.
-            row: The row of the conditions.
-
-        Returns:
-            The basis, with lamps at the positions of the row.
+            conditions: Conditions of some examples, with the positions of the lamps.
+            row: Index of the example in the first dimension of the conditions.
         """
         if conditions.positions is None:
             return self.basis
         return self.basis.moved(conditions.positions[row].detach())
 
     def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
-        """Return the cameras of an example under some conditions.
+        """Return the V cameras of an example, which may have moved.
 
         Args:
-            conditions: The conditions.
-            row: The row of the conditions.
-            example: The index of the example.
-
-        Returns:
-            The V cameras.
+            conditions: Conditions of some examples, with the changes of cameras.
+            row: Index of the example in the first dimension of the conditions.
+            example: Index of the example in the scene.
         """
         cameras = self.cameras[example]
         if conditions.cameras is None:
             return cameras
-        # The depth range of the cameras must hold vertices that have moved away from the origin.
+        # The depth range of the cameras must contain vertices that have moved away from the origin.
         radius = 0.0
         if conditions.vertices is not None:
             radius = float(conditions.vertices[row].detach().norm(dim=1).max())
@@ -308,11 +298,14 @@ class Scene:
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """Return the conditions of some examples before any attack.
 
+        Conditions are the light, shape and colors with which examples are rendered.
+
         Args:
-            examples: The indices of the examples, shape (A,).
+            examples: Index of each of A examples, shape (A,).
 
         Returns:
-            The conditions.
+            Conditions with the light of the scene. Their other fields are None, because nothing
+            else is changed.
 
         Raises:
             InputError: If there is no such example.
@@ -322,31 +315,31 @@ class Scene:
     def render(
         self, conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A V 3 size size"]:
-        """Render examples from their views, differentiable in the conditions.
+        """Render the V views of examples, differentiable in the conditions.
 
         Args:
-            conditions: The light, shape and colors of each example.
-            examples: The indices of the examples, shape (A,).
+            conditions: Light, shape and colors of each of A examples.
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
-            The images, with values in [0, 1], shape (A, V, 3, size, size).
+            Images with values in [0, 1], shape (A, V, 3, size, size).
 
         Raises:
-            InputError: If there is no such example, if the conditions belong to other examples, or
-                if they contain NaN.
+            InputError: If there is no such example, if the conditions do not have one light for
+                each example, or if they contain NaN.
         """
         expected = "conditions, such as scene.conditions(examples)"
         require_kind("conditions", conditions, Conditions, expected)
         if conditions.light.shape[1:] != (self.basis.size, 3):
             raise InputError(
                 f"conditions.light has shape {tuple(conditions.light.shape)}: "
-                f"use one light for each example, such as {(len(self), self.basis.size, 3)}",
+                f"give a light for each example, shape (examples, {self.basis.size}, 3)",
             )
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
-        # The images are the backgrounds, in which the pixels of the layers are overwritten.
+        # Start with the background of each image, shape (A · V, 3 or 1, size²). Then overwrite
+        # the pixels that objects cover.
         image_to_background = self._background[examples].repeat_interleave(self.views)
-        # Shape (A · V, 3 or 1, size²).
         canvas = self.backgrounds.flatten(2).index_select(0, image_to_background)
         new_values = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
@@ -365,11 +358,11 @@ class Scene:
         The range of indices on a GPU is not checked, because the CPU would wait for the GPU.
 
         Args:
-            examples: The indices, as a list, an array or a tensor, shape (A,).
-            count: The number A of indices that the caller needs. None for any number.
+            examples: Indices as a list, an array or a tensor, shape (A,).
+            count: Number of indices that there must be. None for any number.
 
         Returns:
-            The indices, shape (A,).
+            Indices, shape (A,).
 
         Raises:
             InputError: If the indices have another shape or are out of range.
@@ -385,76 +378,77 @@ class Scene:
             return indices.to(self.lights.device)
         if int(indices.min()) < 0 or int(indices.max()) >= len(self):
             raise InputError(
-                f"examples names some that are not there: give indices from 0 to {len(self) - 1}",
+                f"examples has indices from {int(indices.min())} to {int(indices.max())}: "
+                f"give indices from 0 to {len(self) - 1}",
             )
         return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Render the covered pixels of all images, by the fastest method that is exact.
+        """Render the pixels that objects cover, by the fastest method that is exact.
 
-        - If the shape, the albedo or the gloss changed, the images are rendered without
-          transfer operators. So are the images of a scene with `one_light`.
-        - If lamps moved, transfer operators render all other light. The light of the lamps
-          is computed for each image and added.
-        - If only the light changed, transfer operators render all of it.
+        - If shape, albedo or gloss have changed, or if `one_light` is set, each view is rendered
+          directly.
+        - If lamps have moved, transfer operators (matrices from light to image) render all other
+          light. The light of the lamps is computed for each view and added.
+        - If only the light has changed, transfer operators render all of it.
 
         Args:
             conditions: Light, shape and colors of A examples.
-            examples: Indices of the A examples, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Yields:
-            Layers of the A · V images. Image a · V + v is view v of example `examples[a]`.
+            Layers with the pixels of the A · V images. Image a · V + v of them is view v of the
+            example with the index `examples[a]`.
         """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
         surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
         is_surface_changed = any(values is not None for values in surface_changes)
         if self.one_light or is_surface_changed:
-            return self._reshaded(light, conditions, examples)
+            return self._render_directly(light, conditions, examples)
         if conditions.positions is not None:
-            return self._under_moved_lamps(light, conditions.positions, examples)
-        return self._relit(light, examples)
+            return self._relight_with_moved_lamps(light, conditions.positions, examples)
+        return self._relight(light, examples)
 
-    def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """Render images with transfer operators, one matrix product for each stack of operators.
+    def _relight(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
+        """Render the V views of examples with transfer operators, which map light to images.
 
         Args:
-            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
-            examples: Indices of the A examples, shape (A,).
+            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Yields:
-            One layer for each stack. A layer has those of the A · V images whose operators are
-            in the stack.
+            One layer for each stack of operators, with the images that the stack renders.
         """
         views = torch.arange(self.views, device=examples.device)
-        # `Relighting` has an index for each view of each example of the scene, shape (A · V,).
+        # The renderer numbers the views of all examples of the scene, shape (A · V,).
         images = (examples[:, None] * self.views + views).flatten()
         if self.views > 1:
             # All views of an example have the same light, shape (A · V, K, 3).
             light = light.repeat_interleave(self.views, dim=0)
         return self._relighting.layers(light, images)
 
-    def _under_moved_lamps(
+    def _relight_with_moved_lamps(
         self, light: Tensor, positions: Tensor, examples: Tensor
     ) -> Iterator[Layer]:
-        """Render images with transfer operators, and add the light of moved lamps to each image.
+        """Render views with transfer operators, and add the light of moved lamps to each view.
 
         Args:
-            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
+            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
             positions: Positions of the L lamps, shape (A, L, 3).
-            examples: Indices of the A examples, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Yields:
-            One layer for each stack of operators.
+            One layer for each stack of transfer operators.
         """
         movable_light = self.basis.movable_light
         assert movable_light is not None
-        # Rows of the lamps among the K coefficients, and the basis of the lamps.
+        # Rows of the lamps in the K coefficients, and the basis of the lamps.
         lamp_rows, lamps = movable_light
         other_light = light.clone()
         other_light[:, lamp_rows] = 0
         batch_images = torch.arange(len(light) * self.views, device=light.device)
-        for rows, pixels, composite in self._relit(other_light, examples):
+        for rows, pixels, composite in self._relight(other_light, examples):
             lamp_radiances = []
             for image in batch_images[rows].tolist():
                 row, view = divmod(image, self.views)
@@ -465,28 +459,29 @@ class Scene:
                 radiance = view_in_lamps.radiance(
                     lamps, albedo, light[row, lamp_rows], positions[row]
                 )
-                # Where the pixels that the object covers are among the layer's pixels.
+                # Positions of the pixels that the object covers among the pixels of the layer.
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))
                 lamp_radiances.append(canvas.index_copy(1, covered, radiance))
             yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
 
-    def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Render each view without transfer operators.
+    def _render_directly(
+        self, light: Tensor, conditions: Conditions, examples: Tensor
+    ) -> Iterator[Layer]:
+        """Render each view of examples by rasterization, without transfer operators.
 
         Args:
-            light: Coefficients of all lights, times the exposure, shape (A, K, 3).
-            conditions: Conditions of the A examples. Their light is not used.
-            examples: Indices of the A examples, shape (A,).
+            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
+            conditions: Shape, colors and cameras of the A examples. Their light is not used.
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Yields:
             One layer for each of the A · V images.
         """
-        row_and_view = [*product(range(len(examples)), range(self.views))]
-        counted: Iterable[tuple[int, int]] = row_and_view
-        if len(row_and_view) > UNCOUNTED_VIEWS:
-            counted = progress(row_and_view, "rendering views")
-        for image, (row, view) in enumerate(counted):
+        row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
+        if len(examples) * self.views > UNCOUNTED_VIEWS:
+            row_and_view = progress(list(row_and_view), "rendering views")
+        for image, (row, view) in enumerate(row_and_view):
             example_index = int(examples[row])
             example = self.examples[example_index]
             camera = self.cameras_under(conditions, row, example_index)[view]
@@ -504,28 +499,61 @@ class Scene:
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
 
 
-# Names of the arguments of `Scene`. A scene keeps each argument in the attribute of this name,
-# from which `Scene.changed` reads it.
+# Names of the arguments of `Scene`. A scene has an attribute of the same name for each of them.
 _ARGUMENTS = tuple(name for name in signature(Scene).parameters)
 
 
 def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject]) -> None:
-    """Raise InputError if there are no examples, or if an example names an absent object."""
+    """Check that there are examples, and that each refers to one of the objects.
+
+    Args:
+        examples: Examples, with indices of objects.
+        objects: The objects.
+
+    Raises:
+        InputError: If there are no examples, or if an index of an object is too large.
+    """
     if not examples:
         raise InputError("examples is empty: give at least one mesh, one view and one background")
-    if max(example.object for example in examples) >= len(objects):
-        raise InputError(f"objects holds {len(objects)}: give all that the examples name")
+    highest = max(example.object for example in examples)
+    if highest >= len(objects):
+        raise InputError(
+            f"objects has {len(objects)} objects, but an example refers to index {highest}: "
+            "give an object for each index"
+        )
 
 
 def _require_lights(lights: Tensor, basis: Basis) -> None:
-    """Raise InputError unless lights (..., coefficients, 3) are finite and fit the basis."""
+    """Check that lights are finite and have one RGB coefficient for each function of the basis.
+
+    Args:
+        lights: RGB coefficients, shape (..., coefficients, 3).
+        basis: Basis of the lights.
+
+    Raises:
+        InputError: If a value is not finite, or if the shape does not fit the basis.
+    """
     require_bounded(lights=lights)
     if lights.shape[-2:] != (basis.size, 3):
-        raise InputError(f"lights has shape {tuple(lights.shape)}: give {basis.size} rows")
+        raise InputError(
+            f"lights has shape {tuple(lights.shape)}: give (examples, {basis.size}, 3), "
+            "three channels for each coefficient of the basis"
+        )
 
 
 def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
-    """Raise InputError unless backgrounds have shape (B, 3 or 1, size, size), values in [0, 1]."""
+    """Check the shape and the range of backgrounds.
+
+    Args:
+        backgrounds: Values in [0, 1], shape (B, 3, size, size) or (B, 1, size, size).
+        size: Pixels per side of the images.
+
+    Raises:
+        InputError: If the shape differs, or if a value is out of range.
+    """
     is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
     if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
-        raise InputError(f"backgrounds: give (B, 3, {size}, {size}) of values in [0, 1]")
+        raise InputError(
+            f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
+            f"give images of shape (count, 3, {size}, {size}) with values in [0, 1]"
+        )

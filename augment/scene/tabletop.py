@@ -1,12 +1,17 @@
 """A table under an object and a wall behind it, as the background of an image.
 
-Both are lit as the object is, and lie in its shadow. The sky's irradiance is exact except where
-the object blocks the sky. There, as in `renderer.transport`, the radiance of the directions that
-hit the object is taken away. A distant lamp casts a sharp shadow, and local lights cast theirs.
-What the table reflects of sky and distant lamp lights the object from below. The object reflects
-nothing onto the table, which would change the table by 0.1 to 1.4 of 255 on average at 32 pixels.
+Table and wall together are called a room. They have the same light as the object, and the object
+casts its shadow on them. The light consists of the environment light (the sky), a distant lamp,
+and local lights (projector and lamps).
 
-In this module, index 0 of a pair of surfaces is the table, and index 1 is the wall.
+- The irradiance from the sky is exact where the object blocks nothing of the sky. Elsewhere, the
+  radiance of `DIRECTIONS` directions that hit the object is subtracted.
+- The distant lamp casts a sharp shadow.
+- The table reflects sky and distant lamp to the object (`above_table`). The reflection from the
+  object to the table is ignored. It would change the table by 0.1 to 1.4 of 255 on average in
+  images of 32 pixels.
+
+In arrays with a pair of surfaces, index 0 is the table, and index 1 is the wall.
 """
 
 import math
@@ -25,31 +30,34 @@ from renderer.settings import ImageSettings
 from renderer.transport.lamp_paths import unoccluded
 from renderer.transport.rays import NO_FACE, Rays, sphere
 
-# Number D of directions in which rays are traced from a point of the table or the wall to
-# the sky.
+# Number of directions of the sky that are traced from each point of the table or the wall, to find
+# out whether the object blocks them.
 DIRECTIONS = 48
-# The part of the sky that the object blocks is computed at points that are this many pixels
-# apart. The shadow of the sky is soft, so it is interpolated between these points.
+# The soft shadow of the object in the light of the sky is computed at every second pixel along each
+# side, and interpolated between them.
 COARSE = 2
-# Number of directions on the sphere with which `_split_at_horizon` computes integrals.
+# Number of directions on the sphere over which `_split_at_horizon` sums to approximate integrals.
 NODES = 2**12
-# The distance from which the rays of an orthographic camera start, in world units.
+# Distance from which the rays of an orthographic camera start, in world units.
 FAR = 1e3
-# Largest component of a camera ray along the normal of the table or the wall. A ray that is
-# parallel to the surface or leaves it gets this component, so that it meets the surface far away.
+# A camera ray that never meets the table or the wall gets this component along the normal of the
+# surface. It then meets the surface very far away, and no division by zero occurs.
 FALLING = -1e-9
+# Indices of the two surfaces in arrays such as `normals`.
+TABLE = 0
+WALL = 1
 
 
 @dataclass(frozen=True)
 class Room:
-    """A table and a wall, and the object whose shadow lies on them.
+    """A table and a wall, and the object that casts its shadow on them.
 
     Attributes:
-        rays: Traces rays among the faces of the object.
-        radius: The object lies within this distance of the origin, in world units.
-        height: The height z of the table, in world units.
-        wall: The distance of the wall behind the origin, in world units. The wall faces the
-            azimuth of the camera.
+        rays: Ray tracer of the faces of the object.
+        radius: Largest distance of the object from the origin, in world units.
+        height: Height z of the table, in world units.
+        wall: Distance of the wall from the origin, in world units. The wall is vertical, behind
+            the object, and faces the camera.
     """
 
     rays: Rays
@@ -60,10 +68,10 @@ class Room:
 
 @dataclass(frozen=True)
 class _SeenPoints:
-    """The points of table and wall that a camera sees through S samples of each of P pixels.
+    """The points of table and wall that a camera sees, S points in each of P pixels.
 
     Attributes:
-        points: The points, shape (S, P, 3).
+        points: Positions in world units, shape (S, P, 3).
         is_on_wall: Mask of the points on the wall, shape (S, P). The others are on the table.
     """
 
@@ -73,15 +81,17 @@ class _SeenPoints:
 
 @cache_tensors
 def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
-    """Compute how harmonics represent the light above the horizon and the light below.
+    """Split light in spherical harmonics into the part above and the part below the horizon.
 
     Args:
         degree: Degree of the harmonics. There are K = (degree + 1)² of them.
 
     Returns:
-        Matrix (K, K) that multiplies the coefficients of a light and gives the coefficients of
-        the part of this light above the horizon. Coefficients (K,) of a light with radiance 1 in
-        all directions below the horizon and radiance 0 above.
+        Two tensors:
+        - A matrix (K, K). Its product with the coefficients of a light is the coefficients of
+          the part of the light that comes from above the horizon.
+        - Coefficients (K,) of a light that has radiance 1 in all directions below the horizon,
+          and radiance 0 above.
     """
     directions = sphere(NODES)
     # Value of each harmonic in each direction, shape (NODES, K).
@@ -89,34 +99,36 @@ def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
     values_above = values[directions[:, 2] > 0]
     # Solid angle of each direction.
     weight = 4 * math.pi / NODES
-    # Harmonics are orthonormal, so each coefficient is the integral of the light times a harmonic.
-    return (
-        values_above.T @ values_above * weight,
-        (values.sum(0) - values_above.sum(0)) * weight,
-    )
+    # Harmonics are orthonormal. A coefficient is therefore the integral of the light times the
+    # harmonic, which is approximated by the sum over the directions.
+    upper_part = values_above.T @ values_above * weight
+    below_horizon = (values.sum(0) - values_above.sum(0)) * weight
+    return upper_part, below_horizon
 
 
 def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
-    """Compute the light of an object on an infinite table.
+    """Compute the light that reaches an object on an infinite table.
+
+    It is the environment light from above, and from below the light that the table reflects.
+    The table reflects the environment light from above and the light of a distant lamp.
 
     Args:
-        lights: Coefficients of the environment light of E examples without a table, in K
-            harmonics, shape (E, K, 3).
-        lamps: Unit direction towards a white distant lamp, shape (E, 3). A surface that faces
-            the lamp has irradiance 1. Zero for no lamp.
-        albedo: Linear albedo of the table, shape (E, 3).
+        lights: RGB coefficients of the environment light of each of E examples in K harmonics,
+            before the table is added, shape (E, K, 3).
+        lamps: Unit direction towards a white distant lamp in each example, shape (E, 3). A
+            surface that faces the lamp has irradiance 1. Zero stands for no lamp.
+        albedo: Linear RGB albedo of the table in each example, shape (E, 3).
 
     Returns:
-        Coefficients of the light that reaches the object, without the direct light of the lamp,
-        shape (E, K, 3). They are the light from above, and the light that the table reflects.
-        The table reflects the environment light from above and the light of the lamp.
+        RGB coefficients of the light that reaches the object, without the direct light of the
+        lamp, shape (E, K, 3).
     """
     harmonics = Harmonics(degree_of(lights[0]))
     upper_part, below_horizon = _split_at_horizon(harmonics.degree)
     above = upper_part @ lights.cpu().double()
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    # Irradiance of the table, shape (E, 3). That of a distant lamp is the cosine to its
-    # direction, which is the z component.
+    # Irradiance of the table, shape (E, 3). The irradiance from the lamp is the cosine of the
+    # angle between its direction and the vertical, which is the z component of the direction.
     from_sky = harmonics.irradiance(up)[0] @ above[:, harmonics.nonzero]
     arriving = from_sky.clamp(min=0) + lamps[:, 2:].clamp(min=0)
     # Radiance of a Lambertian table, the same in all directions, shape (E, 3).
@@ -132,20 +144,22 @@ def irradiance(
     lamp: Tensor,
     lights: Sequence[tuple[LocalBasis, Tensor]] = (),
 ) -> Tensor:
-    """Compute the irradiance of the table and the wall that a camera sees.
+    """Compute an image of the irradiance of a table and a wall, with the shadow of an object.
 
     Args:
         room: The table, the wall, and the object that casts the shadow.
         camera: The camera.
-        image: The size of the image and the samples of a pixel, over which the irradiance is
+        image: Size of the image, and number of samples of a pixel, over which the irradiance is
             averaged.
-        sky: The coefficients of the sky in K harmonics, shape (K, 3).
+        sky: RGB coefficients of the environment light in K harmonics, shape (K, 3).
         lamp: Unit direction towards a white distant lamp, shape (3,). A surface that faces the
-            lamp has irradiance 1. Zero for no lamp.
-        lights: The basis of each local light, and its coefficients, shape (size of the basis, 3).
+            lamp has irradiance 1. Zero stands for no lamp.
+        lights: Basis of each local light, such as a projector, and its RGB coefficients, shape
+            (size of the basis, 3).
 
     Returns:
-        The irradiance, shape (3, size, size).
+        Irradiance of what each pixel shows of table or wall, as if the object were invisible,
+        shape (3, size, size).
 
     Raises:
         InputError: If Embree is not installed.
@@ -153,29 +167,30 @@ def irradiance(
     room_axes = _room_axes(camera)
     # Unit normals of the table and the wall in world axes.
     normals = torch.stack([room_axes[2], room_axes[0]])
-    # In the axes of the room: D directions of table and wall, shape (2, D, 3), the values of
-    # the harmonics there, shape (2, D, K), and the irradiance per harmonic, shape (2, K).
+    # Directions of the sky, the values of the harmonics in them, and the irradiance by each
+    # harmonic, in the axes of the room.
     directions, harmonic_values, irradiance_per_harmonic = _directions(degree_of(sky))
     sky = _sky_in_room_axes(sky, camera.azimuth)
 
-    # Irradiance of all P pixels by the whole sky, the lamp and the local lights, shape (P, 3).
     # Shadows of lamps have sharp edges, which need several samples per pixel.
     fine = image if lamp.any() or lights else replace(image, samples=1)
     fine_points = _find_seen_points(camera, fine, room, normals)
-    # Irradiance of table and wall, shape (2, 3).
-    arriving = (irradiance_per_harmonic @ sky).clamp(min=0)
+    # Irradiance from the whole sky of the table, in row 0, and of the wall, in row 1.
+    from_table_sky, from_wall_sky = (irradiance_per_harmonic @ sky).clamp(min=0)
+    # The following values are averages over the samples of each of the P pixels.
     fraction_on_wall = fine_points.is_on_wall.double().mean(0)[:, None]
-    open_sky = arriving[0] + fraction_on_wall * (arriving[1] - arriving[0])
+    open_sky = from_table_sky + fraction_on_wall * (from_wall_sky - from_table_sky)
     from_lamp = _from_lamp(room, fine_points, normals, lamp).mean(0)[:, None]
     from_lights = _from_local_lights(room, fine_points, normals, lights).mean(0)
     lit = open_sky + (from_lamp + from_lights)
 
-    # Irradiance of the part of the sky that the object blocks, in an image of fewer pixels.
+    # Irradiance from the part of the sky that the object blocks, in an image of fewer pixels.
     coarse_size = math.ceil(image.size / COARSE)
     coarse = replace(image, size=coarse_size, samples=1)
     coarse_points = _find_seen_points(camera, coarse, room, normals)
-    # The density of the D directions is proportional to the cosine, so each has the same weight.
-    # The integral of the cosine over the hemisphere is π.
+    # The irradiance is the integral of radiance times cosine. The density of the directions is
+    # proportional to the cosine, so each direction has the same share of π, the integral of the
+    # cosine.
     weighted_radiance = harmonic_values @ sky * (math.pi / DIRECTIONS)
     world_directions = directions @ room_axes
     blocked = _blocked_sky(room, coarse_points, normals, world_directions, weighted_radiance)
@@ -186,10 +201,16 @@ def irradiance(
 
 
 def _room_axes(camera: Camera) -> Tensor:
-    """Return the axes of the room as unit row vectors in world axes, shape (3, 3).
+    """Return the axes of a room, which is a table and a wall that faces the camera.
 
-    The first axis is the normal of the wall. It is horizontal and points to the side of the
-    camera. The third axis is the normal of the table, which is the vertical.
+    Row 0 is the normal of the wall, which is horizontal and points to the side of the camera. Row
+    2 is the normal of the table, which is vertical. Row 1 is perpendicular to both.
+
+    Args:
+        camera: The camera.
+
+    Returns:
+        Unit vectors in world axes as rows, shape (3, 3).
     """
     azimuth = math.radians(camera.azimuth)
     sine = math.sin(azimuth)
@@ -199,22 +220,22 @@ def _room_axes(camera: Camera) -> Tensor:
 
 
 def _from_lamp(room: Room, seen: _SeenPoints, normals: Tensor, lamp: Tensor) -> Tensor:
-    """Compute the irradiance of the seen points by a white distant lamp.
+    """Compute the irradiance of points on a table and a wall from a white distant lamp.
 
     Args:
         room: Table, wall and object.
-        seen: Points that S samples of P pixels see.
-        normals: Unit normals of table and wall, shape (2, 3).
+        seen: Points that a camera sees, S in each of P pixels.
+        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
         lamp: Unit direction towards the lamp, or zero for no lamp, shape (3,).
 
     Returns:
-        Irradiance, shape (S, P). It is 0 in the shadow of the object.
+        Irradiance of each point, shape (S, P). It is 0 in the shadow of the object.
     """
-    # Index 0 or 1 of the surface of each point in `normals`, shape (S, P).
+    # Surface of each point as a row of `normals`: 0 for the table, 1 for the wall, shape (S, P).
     point_to_surface = seen.is_on_wall.long()
     lit = (normals @ lamp).clamp(min=0)[point_to_surface]
     may_be_shaded = (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius)
-    # Indices of the R points from which rays are traced: sample and pixel, shape (R,) each.
+    # Positions of these points in (S, P): indices of samples, and indices of pixels.
     candidates = torch.nonzero(may_be_shaded, as_tuple=True)
     offset = room.rays.offset * normals[point_to_surface[candidates]]
     starts = seen.points[candidates] + offset
@@ -229,25 +250,30 @@ def _from_local_lights(
     normals: Tensor,
     lights: Sequence[tuple[LocalBasis, Tensor]],
 ) -> Tensor:
-    """Compute the irradiance of the seen points by local lights.
+    """Compute the irradiance of points on a table and a wall from projector and lamps.
+
+    The object casts shadows.
 
     Args:
         room: Table, wall and object.
-        seen: Points that S samples of P pixels see.
-        normals: Unit normals of table and wall, shape (2, 3).
-        lights: The basis of each local light, and its coefficients, shape (size of the basis, 3).
+        seen: Points that a camera sees, S in each of P pixels.
+        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
+        lights: Basis of each local light, such as a projector, and its RGB coefficients, shape
+            (size of the basis, 3).
 
     Returns:
-        Irradiance, shape (S, P, 3). The object casts shadows.
+        Irradiance of each point, shape (S, P, 3).
     """
-    # The samples of all pixels as one list of S · P points.
+    # One list of all points, shape (S · P, 3).
     points = seen.points.flatten(0, 1)
     point_normals = normals[seen.is_on_wall.long()].flatten(0, 1)
     arriving = torch.zeros(len(points), 3, dtype=torch.float64)
     for basis, coefficients in lights:
-        # The table and the wall are flat, so the normals for shading are those of the surface.
+        # `unoccluded` needs the normals of faces and those for shading. On flat surfaces, both
+        # are the same.
         paths = unoccluded(room.rays, basis, points, point_normals, point_normals)
-        # Each path leads from one basis function of the light to one point.
+        # A path goes from one function of the basis, such as a pixel of the projector, to one
+        # point.
         irradiance_of_path = paths.irradiance[:, None] * coefficients[paths.function]
         arriving.index_add_(0, paths.point, irradiance_of_path)
     return arriving.unflatten(0, (len(seen.points), -1))
@@ -256,31 +282,32 @@ def _from_local_lights(
 def _blocked_sky(
     room: Room, seen: _SeenPoints, normals: Tensor, directions: Tensor, radiance: Tensor
 ) -> Tensor:
-    """Compute the irradiance that the seen points would have from the blocked part of the sky.
+    """Compute how much irradiance an object takes from a table and a wall by blocking the sky.
 
-    The object blocks this part.
+    From each point, rays are traced in D directions. The radiance of the directions in which a
+    ray hits the object is summed.
 
     Args:
         room: Table, wall and object.
-        seen: Points that one sample of each of P pixels sees.
-        normals: Unit normals of table and wall, shape (2, 3).
-        directions: D unit directions to the sky, for the table and for the wall, in world axes,
+        seen: Points that a camera sees, one in each of P pixels.
+        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
+        directions: D unit directions for points of the table, and D for points of the wall, in
+            world axes, shape (2, D, 3).
+        radiance: RGB irradiance that each of these directions contributes if it is not blocked,
             shape (2, D, 3).
-        radiance: Radiance of the sky in these directions, shape (2, D, 3). Each is multiplied by
-            the cosine to the normal times the solid angle of the direction.
 
     Returns:
-        Irradiance of the blocked part of the sky, shape (P, 3).
+        Blocked irradiance of the point in each pixel, shape (P, 3).
     """
     points = seen.points[0]
     is_on_wall = seen.is_on_wall[0]
     blocked = torch.zeros(len(points), 3, dtype=torch.float64)
-    for surface in range(2):
+    for surface in (TABLE, WALL):
         # Pixels that show this surface.
         pixels = torch.nonzero(is_on_wall == surface).squeeze(1)
         starts = points[pixels] + room.rays.offset * normals[surface]
         may_hit = _passes_near_origin(starts, directions[surface].T, room.radius)
-        # Index in `starts` and index of the direction of each ray that is traced.
+        # Each traced ray has an index of its start and an index of its direction.
         ray_to_start, ray_to_direction = torch.nonzero(may_hit, as_tuple=True)
         face_of_ray = room.rays.first_hit(
             starts[ray_to_start], directions[surface, ray_to_direction]
@@ -294,47 +321,26 @@ def _blocked_sky(
 def project_along_light(
     room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Tensor
 ) -> Tensor:
-    """Compute which point of a projected pattern reaches each pixel of an image.
+    """Compute which point of a projected pattern each pixel of an image shows.
 
-    A projector far away shines in parallel rays along one direction. A pixel shows a point of
-    the mesh, the table or the wall. The projector's ray through this point determines the point
-    of the pattern.
+    A projector far away shines a pattern along parallel rays. A pixel shows a point of the
+    object, the table or the wall. The ray of the projector through this point tells which point
+    of the pattern lights it.
 
     Args:
         room: The table and the wall.
-        mesh: The mesh, whose faces `room.rays` traces.
+        mesh: The object.
         camera: The camera.
-        image: The size of the image.
+        image: Size of the image.
         towards: Unit vector from the scene towards the projector, shape (3,).
 
     Returns:
         Two coordinates of the point of the pattern for each pixel, shape (2, size, size). They
-        are distances from the projector's ray through the origin, divided by half of the width
-        that the camera sees.
+        are 0 on the ray through the origin. Their unit is half of the width that the camera sees.
     """
-    room_axes = _room_axes(camera)
-    # Unit normals of the table and the wall.
-    normals = torch.stack([room_axes[2], room_axes[0]])
-    # Points of table or wall that the P pixel centers see without the mesh, shape (P, 3).
-    points = _find_seen_points(camera, replace(image, samples=1), room, normals).points[0]
-    starts = points + FAR * torch.from_numpy(camera.axes()[2])
-    if isinstance(camera, PerspectiveCamera):
-        starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
-    forward = F.normalize(points - starts, dim=1)
-    face_of_pixel = room.rays.first_hit(starts, forward)
-    # The M pixels that show the mesh. Their points are moved to the faces that they show.
-    mesh_pixels = torch.nonzero(face_of_pixel != NO_FACE).squeeze(1)
-    corners = torch.from_numpy(mesh.vertices[mesh.faces[face_of_pixel[mesh_pixels].numpy()]])
-    first, second, third = corners.unbind(1)
-    # Normals of the faces, not of unit length, shape (M, 3).
-    face_normals = torch.linalg.cross(second - first, third - first)
-    # The ray meets the plane of the face after the distance `length`, shape (M,).
-    height = ((first - starts[mesh_pixels]) * face_normals).sum(1)
-    length = height / (forward[mesh_pixels] * face_normals).sum(1)
-    points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
-
-    # A horizontal direction across the light. The small number keeps the vector from being
-    # zero if the light comes from straight above.
+    points = _find_shown_points(room, mesh, camera, image)
+    # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
+    # small number keeps the vector from being zero.
     right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
     right = F.normalize(right, dim=0)
     axes = torch.stack([right, torch.linalg.cross(towards, right)])
@@ -342,46 +348,83 @@ def project_along_light(
     return coordinates.T.unflatten(1, (image.size, -1))
 
 
-def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Tensor:
-    """Find the rays that pass the origin within a radius.
+def _find_shown_points(room: Room, mesh: Mesh, camera: Camera, image: ImageSettings) -> Tensor:
+    """Find the points of an object, a table or a wall that the centers of the pixels show.
 
     Args:
-        points: Starts of the rays, shape (..., 3).
-        directions: Unit direction of all rays, shape (3,), or D unit directions in which a ray
-            starts at each point, shape (3, D).
-        radius: The radius.
+        room: The table and the wall.
+        mesh: The object.
+        camera: The camera.
+        image: Size of the image, which has P = size² pixels.
 
     Returns:
-        Mask of the rays, shape (...) for one direction and (..., D) for D directions.
+        Positions in world units, shape (P, 3).
     """
-    # The point of a ray that is nearest to the origin lies at the distance -along from its start.
+    room_axes = _room_axes(camera)
+    # Unit normals of the table (row 0) and the wall (row 1).
+    normals = torch.stack([room_axes[2], room_axes[0]])
+    # Points of table or wall that the pixels would show without the object, shape (P, 3).
+    points = _find_seen_points(camera, replace(image, samples=1), room, normals).points[0]
+    starts = points + FAR * torch.from_numpy(camera.axes()[2])
+    if isinstance(camera, PerspectiveCamera):
+        starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
+    forward = F.normalize(points - starts, dim=1)
+    face_of_pixel = room.rays.first_hit(starts, forward)
+    # M of the pixels show the object. Replace their points by those of the faces.
+    mesh_pixels = torch.nonzero(face_of_pixel != NO_FACE).squeeze(1)
+    corners = torch.from_numpy(mesh.vertices[mesh.faces[face_of_pixel[mesh_pixels].numpy()]])
+    first, second, third = corners.unbind(1)
+    # Normals of the faces, not of unit length, shape (M, 3).
+    face_normals = torch.linalg.cross(second - first, third - first)
+    # Intersect each ray with the plane of its face. `length` is the distance to it, shape (M,).
+    height = ((first - starts[mesh_pixels]) * face_normals).sum(1)
+    length = height / (forward[mesh_pixels] * face_normals).sum(1)
+    points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
+    return points
+
+
+def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Tensor:
+    """Find the rays that pass through a sphere around the origin.
+
+    Args:
+        points: Starts of the rays outside of the sphere, shape (..., 3).
+        directions: Unit direction of all rays, shape (3,), or D unit directions for each start,
+            one in each column, shape (3, D).
+        radius: Radius of the sphere.
+
+    Returns:
+        Mask of the rays, shape (...) for one direction, or (..., D) for D directions.
+    """
+    # A ray comes nearest to the origin after the distance -along from its start.
     along = points @ directions
     squared = points.square().sum(-1)
     if directions.ndim > 1:
         squared = squared[..., None]
     is_ahead = along < 0
-    # By Pythagoras, this is the squared distance of the nearest point from the origin.
-    return is_ahead & (squared - along**2 < radius**2)
+    # Pythagoras gives the squared distance between the ray and the origin.
+    squared_distance = squared - along**2
+    return is_ahead & (squared_distance < radius**2)
 
 
 @cache_tensors
 def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose directions above a table with normal +z and in front of a wall with normal +x.
+    """Choose directions above a table (normal +z) and in front of a wall (normal +x).
 
-    The density of the directions is proportional to the cosine to the normal (Malley's method).
+    The density of the D = `DIRECTIONS` directions is proportional to the cosine of the angle to
+    the normal (Malley's method).
 
     Args:
-        degree: Degree of the light. It has K = (degree + 1)² harmonics.
+        degree: Degree of the light, which has K = (degree + 1)² harmonics.
 
     Returns:
-        D directions for table and wall, shape (2, D, 3). Values of the harmonics in these
-        directions, shape (2, D, K). Irradiance of table and wall per unit of each harmonic,
-        shape (2, K).
+        Three tensors, each with the table at index 0 and the wall at index 1:
+        - Unit directions, shape (2, D, 3).
+        - Values of the harmonics in these directions, shape (2, D, K).
+        - Irradiance of the surface for a coefficient of 1 of each harmonic, shape (2, K).
     """
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
-    # Malley's method distributes points evenly over the unit disk and raises them to the
-    # hemisphere. The golden angle from point to point and the square root make a spiral
-    # (Fibonacci lattice) that covers the disk evenly.
+    # Distribute points evenly over the unit disk, along a spiral (Fibonacci lattice). Malley's
+    # method then projects them onto the hemisphere.
     squared_radius = (index + 0.5) / DIRECTIONS
     golden_angle = math.pi * (3 - math.sqrt(5))
     angle = golden_angle * index
@@ -389,10 +432,10 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     x = radius * angle.cos()
     y = radius * angle.sin()
     above_table = torch.stack([x, y, (1 - squared_radius).sqrt()], dim=1)
-    # `roll` permutes the coordinates (x, y, z) to (z, x, y), which rotates the normal of the
-    # table, +z, to the normal of the wall, +x.
-    before_wall = above_table.roll(1, 1)
-    directions = torch.stack([above_table, before_wall])
+    # Permute the coordinates (x, y, z) to (z, x, y), which turns the normal +z of the table to
+    # the normal +x of the wall.
+    in_front_of_wall = above_table.roll(1, 1)
+    directions = torch.stack([above_table, in_front_of_wall])
     harmonics = Harmonics(degree)
     normals = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     irradiance = torch.zeros(2, harmonics.size, dtype=torch.float64)
@@ -402,22 +445,22 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sky_in_room_axes(sky: Tensor, azimuth: float) -> Tensor:
-    """Rotate a sky about the vertical by minus an azimuth.
+    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x.
 
     Args:
-        sky: Coefficients of the sky in world axes, shape (K, 3).
-        azimuth: Azimuth of the camera in degrees, which is the azimuth of the wall's normal.
+        sky: RGB coefficients of the light in K harmonics, in world axes, shape (K, 3).
+        azimuth: Azimuth of the normal of the wall in degrees.
 
     Returns:
-        Coefficients in axes in which the normal of the wall is +x, shape (K, 3).
+        RGB coefficients of the rotated light, shape (K, 3).
     """
-    # The harmonic of band l and order m, from -l to l, has the index l (l + 1) + m. With m > 0,
-    # the harmonics of order m and -m depend on the azimuth φ as cos mφ and sin mφ. A rotation
+    # The harmonic of band l and order m (from -l to l) has the index l (l + 1) + m. For m > 0,
+    # the harmonics of orders m and -m depend on the azimuth φ as cos mφ and sin mφ. A rotation
     # about the vertical mixes only these two.
     l = bands(degree_of(sky))
     order = torch.arange(len(l)) - l * (l + 1)
     angle = (order * math.radians(azimuth)).double()[:, None]
-    # Index of the harmonic with the same band and the opposite order.
+    # Index of the harmonic with the same band l and the order -m.
     opposite_order = l * (l + 1) - order
     return angle.cos() * sky + angle.sin() * sky[opposite_order]
 
@@ -425,49 +468,65 @@ def _sky_in_room_axes(sky: Tensor, azimuth: float) -> Tensor:
 def _find_seen_points(
     camera: Camera, image: ImageSettings, room: Room, normals: Tensor
 ) -> _SeenPoints:
-    """Find where the camera's rays meet the table or the wall.
-
-    The object is ignored.
+    """Find where the rays of a camera meet a table or a wall, if no object is in the way.
 
     Args:
         camera: The camera.
-        image: Size of the image, which has P = size² pixels, and samples of a pixel. Each pixel
-            has S = samples² rays.
+        image: Size of the image, which has P = size² pixels, and number of samples along a side
+            of a pixel. Each pixel has S = samples² rays.
         room: Table and wall.
-        normals: Unit normals of table and wall, shape (2, 3).
+        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
 
     Returns:
-        The points of the first surface that each ray meets.
+        The point of the first surface that each ray meets.
     """
-    # Samples along one side of the image. Their distances from the middle are in world units.
-    count = image.size * image.samples
-    middles = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
-    # Positions in the image relative to the principal point.
-    half_width = camera.width / 2
-    up_of_rows = (-middles - camera.principal_up * half_width) / camera.pixel_aspect
-    right_of_columns = middles - camera.principal_right * half_width
-    up, right = torch.meshgrid(
-        up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
-    )
-    # The axes are: right or up, row of pixels, row of samples, column of pixels, column of samples.
-    by_pixel = torch.stack([right, up]).view(
-        2, image.size, image.samples, image.size, image.samples
-    )
-    # Shape (S, P, 1) each.
-    right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, image.samples**2, -1, 1)
-    # The rays pass through points `ends` of the plane through the origin that faces the camera,
-    # shape (S, P, 3). The rows of `axes` point right, up and towards the camera.
+    right, up = _sample_positions(camera, image)
+    # Each ray passes through a point of the plane through the origin that faces the camera. The
+    # rows of `axes` point right, up and towards the camera.
     axes = torch.from_numpy(camera.axes())
     ends = right * axes[0] + up * axes[1]
     starts = ends + FAR * axes[2]
     if isinstance(camera, PerspectiveCamera):
         starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(ends)
     forward = ends - starts
-    # A point p lies on table or wall if its product with the normal has this value. A ray meets
-    # the surface at starts + lengths · forward. The last axis is table and wall, shape (S, P, 2).
+    # Table and wall are the planes normal · p = level.
     levels = torch.tensor([room.height, -room.wall], dtype=torch.float64)
+    # A ray p = starts + length · forward meets each plane at one length, shape (S, P, 2).
     falling = (forward @ normals.T).clamp(max=FALLING)
     lengths = (levels - starts @ normals.T) / falling
     points = starts + lengths.amin(2, keepdim=True) * forward
-    is_on_wall = lengths[..., 1] < lengths[..., 0]
+    is_on_wall = lengths[..., WALL] < lengths[..., TABLE]
     return _SeenPoints(points, is_on_wall)
+
+
+def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Tensor]:
+    """Compute where the samples of an image lie in the plane through the origin.
+
+    The plane faces the camera.
+
+    Args:
+        camera: The camera.
+        image: Size of the image, which has P = size² pixels, and number of samples along a side
+            of a pixel. Each pixel has S = samples² samples.
+
+    Returns:
+        Distances of the samples from the origin to the right and up, in world units, each of
+        shape (S, P, 1).
+    """
+    count = image.size * image.samples
+    # Distances of the samples of a row or column from the center of the image, in world units.
+    centers = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
+    # Measure from the principal point, which may be off the center of the image.
+    half_width = camera.width / 2
+    up_of_rows = (-centers - camera.principal_up * half_width) / camera.pixel_aspect
+    right_of_columns = centers - camera.principal_right * half_width
+    up, right = torch.meshgrid(
+        up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
+    )
+    size = image.size
+    samples = image.samples
+    # Split rows and columns of samples: (2, pixel row, sample row, pixel column, sample column).
+    by_pixel = torch.stack([right, up]).view(2, size, samples, size, samples)
+    # Bring the two axes of samples to the front, and join each pair of axes.
+    right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, samples**2, -1, 1)
+    return right, up

@@ -30,38 +30,37 @@ from renderer.shading.gloss import Gloss
 from renderer.transport.rays import Rays
 from renderer.vectors import rotation_matrices
 
-# `_raise_above_table` limits the elevation of a camera above a table to this range, in degrees.
+# Smallest and largest elevation of a camera above a table, in degrees.
 MIN_ELEVATION = 15.0
 MAX_ELEVATION = 75.0
-# `_vary_lighting` draws the distance of a wall behind an object between these two distances, in
-# world units.
+# Smallest and largest distance of a wall behind an object, in world units.
 WALL_DISTANCES = (1.8, 8.0)
-# The polar angle and the azimuth of a drawn directional light differ from those of the camera
-# by at most this angle, in degrees.
+# Largest difference in degrees between the direction of a random directional light and that of the
+# camera, in polar angle and in azimuth.
 MAX_LIGHT_ANGLE = 70.0
 
 
 def vary(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False
 ) -> Scene:
-    """Return a scene whose examples differ at random from the examples of a scene.
+    """Change objects, cameras, lighting and backgrounds of a scene at random.
 
-    All views of one example are moved in the same way.
+    All views of one example change in the same way.
 
     Args:
         scene: Scene to vary.
         settings: Ranges of the random changes.
         draws: CPU generator of the random numbers.
-        once: Whether the new examples are rendered in one lighting only. If so,
-            no transfer operators are built for them.
+        once: Whether the new examples are rendered in one lighting only. Then
+            they are rendered directly, without matrices from light to image.
 
     Returns:
-        The new scene, or the given scene if the settings vary nothing.
+        The new scene, or the given scene if the settings change nothing.
 
     Raises:
         InputError: If the folder of backgrounds has no images, or if tables
-            are asked for and the scene already has tables or several views per
-            example.
+            are to be added to a scene that already has tables or several views
+            per example.
 
     Example:
         >>> from augment.scene.build import build_scene
@@ -96,20 +95,17 @@ def _vary_geometry(
     once: bool,
     is_on_table: Tensor,
 ) -> Scene:
-    """Return a scene with drawn cameras, backgrounds and objects.
+    """Return a copy of a scene with random cameras, backgrounds and objects.
 
     Args:
         scene: Scene of E examples.
         settings: Ranges of the random changes.
         draws: Generator of the random numbers.
         once: Whether the new examples are rendered in one lighting only.
-        is_on_table: Mask of the examples with a table, shape (E,).
-
-    Returns:
-        The new scene, whose lighting is that of the given scene.
+        is_on_table: Mask of the examples whose object stands on a table, shape (E,).
     """
     examples = _draw_cameras(scene, settings, draws, is_on_table)
-    # Arguments of `Scene` that the new scene does not take from the given scene.
+    # Arguments of `Scene` that differ in the copy.
     changed: dict[str, Any] = {}
     if settings.backgrounds is not None:
         folder = Path(settings.backgrounds)
@@ -117,18 +113,19 @@ def _vary_geometry(
         changed["backgrounds"] = draw_image_files(folder, "backgrounds", len(scene), size, draws)
         examples = _number_backgrounds(examples)
     if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
-        # One object is drawn for each pair of an object and its cameras in the given scene.
-        # Examples that differ in their backgrounds only show the same drawn object.
+        # Examples of the same object and the same cameras get the same random object. They
+        # differ in their backgrounds only.
         pairs = [(example.object, example.cameras) for example in scene.examples]
-        pair_to_drawn_object = {pair: index for index, pair in enumerate(dict.fromkeys(pairs))}
-        objects = [scene.objects[object_index] for object_index, _ in pair_to_drawn_object]
+        different_pairs = dict.fromkeys(pairs)
+        pair_to_new_object = {pair: index for index, pair in enumerate(different_pairs)}
+        objects = [scene.objects[object_index] for object_index, _ in different_pairs]
         changed["objects"] = _draw_objects(objects, settings, draws)
         examples = [
-            replace(example, object=pair_to_drawn_object[pair])
+            replace(example, object=pair_to_new_object[pair])
             for example, pair in zip(examples, pairs, strict=True)
         ]
-    # If a view is rendered in one lighting only, a transfer operator costs more than direct
-    # rendering, except if direct rendering would trace rays.
+    # Direct rendering of a view in one lighting is faster than the construction of its transfer
+    # operator, except if direct rendering would trace rays.
     needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
     one_light = once and settings.moves and not needs_rays
     return scene.changed(examples=examples, one_light=one_light, **changed)
@@ -137,19 +134,17 @@ def _vary_geometry(
 def _draw_cameras(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> list[Example]:
-    """Return the examples of a scene with randomly changed cameras.
+    """Return copies of the examples of a scene with randomly changed cameras.
 
-    The changes are a shift and a zoom of the image, and a rotation around the object. A
-    field of view is also drawn if the settings give one.
+    The image is shifted and zoomed, and the camera turns around the object. If the settings
+    have a range of fields of view, the camera also gets one of them. All cameras of one example
+    get the same changes.
 
     Args:
         scene: Scene of E examples.
         settings: Ranges of the random changes.
         draws: Generator of the random numbers.
         is_on_table: Mask of the examples whose cameras must be above a table, shape (E,).
-
-    Returns:
-        The E changed examples. All cameras of one example get the same changes.
     """
     count = len(scene)
     shifts = _draw_pairs(settings.shift, count, draws)
@@ -177,21 +172,19 @@ def _draw_cameras(
 def _move_camera(
     camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
 ) -> Camera:
-    """Return a copy of a camera that is zoomed, shifted and turned.
+    """Return a copy of a camera that is zoomed, shifted and turned around the object.
 
     Args:
         camera: Camera to change.
-        shift: Shift of the object in the image to the right and up, as fractions of the
-            width of the image.
-        scale: Factor of the size of the object in the image.
+        shift: Shift of the object in the image to the right and up, as fractions of the width
+            of the image.
+        scale: Factor by which the object becomes larger in the image.
         angles: Change of the polar angle and of the azimuth, in degrees.
-
-    Returns:
-        The changed copy.
     """
     width = camera.width / scale
     right, up = shift
-    turned = _turn_camera(camera, *angles)
+    polar, azimuth = angles
+    turned = _turn_camera(camera, polar, azimuth)
     return replace(
         turned,
         width=width,
@@ -201,31 +194,36 @@ def _move_camera(
 
 
 def _turn_camera(camera: Camera, polar: float, azimuth: float) -> Camera:
-    """Return a copy of a camera with angles in degrees added to its polar angle and azimuth."""
+    """Return a copy of a camera that is turned around the object.
+
+    Args:
+        camera: Camera to turn.
+        polar: Change of its polar angle in degrees.
+        azimuth: Change of its azimuth in degrees.
+    """
     return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
 
 def _raise_above_table(camera: Camera) -> Camera:
-    """Return a copy of a camera whose elevation is from `MIN_ELEVATION` to `MAX_ELEVATION`.
+    """Return a copy of a camera whose elevation above a table is within limits.
 
-    A camera below the horizon is first mirrored at the horizon.
+    A camera below the horizon is mirrored to the same elevation above. The elevation is then
+    limited to the range from `MIN_ELEVATION` to `MAX_ELEVATION`.
     """
-    # The polar angle, from +z, may have any value. Its cosine is the sine of the elevation.
+    # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.
     elevation = abs(math.degrees(math.asin(math.cos(math.radians(camera.polar)))))
     elevation = min(max(elevation, MIN_ELEVATION), MAX_ELEVATION)
     return replace(camera, polar=90 - elevation)
 
 
 def _to_perspective(camera: Camera, fov: float) -> Camera:
-    """Return a perspective camera with a field of view.
+    """Return a perspective copy of a camera with a given field of view.
+
+    The copy is at such a distance that it sees the same width at the origin as before.
 
     Args:
         camera: Orthographic or perspective camera.
         fov: Field of view in degrees.
-
-    Returns:
-        Perspective camera in the same direction. Its distance is such that it sees the same
-        width at the origin as the given camera.
     """
     distance = camera.width / 2 / math.tan(math.radians(fov) / 2)
     if isinstance(camera, PerspectiveCamera):
@@ -235,32 +233,36 @@ def _to_perspective(camera: Camera, fov: float) -> Camera:
 
 
 def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
-    """Return copies of the examples in which example i has background i."""
+    """Return copies of examples, in which example i refers to background i."""
     return [replace(example, background=index) for index, example in enumerate(examples)]
 
 
 def _draw_objects(
     objects: Sequence[SceneObject], settings: VariationSettings, draws: torch.Generator
 ) -> list[SceneObject]:
-    """Draw the instance, the rotation and the gloss of each object.
+    """Return copies of objects with a random shape, rotation and gloss.
 
-    An instance is one of the random shapes of a solid, such as another orange. What the
-    settings do not vary is kept.
+    A random shape is possible for generated solids only: another orange, for example.
+
+    Args:
+        objects: Objects to copy.
+        settings: Which of shape, rotation and gloss are random, and in which ranges.
+        draws: Generator of the random numbers.
     """
-    drawn = list(objects)
+    varied = list(objects)
     if settings.instances:
-        seeds = torch.randint(2**31, (len(drawn),), generator=draws).tolist()
-        pairs = progress(zip(drawn, seeds, strict=True), "new instances", len(drawn))
-        drawn = [resample_instance(item, seed) for item, seed in pairs]
+        seeds = torch.randint(2**31, (len(varied),), generator=draws).tolist()
+        pairs = progress(zip(varied, seeds, strict=True), "new instances", len(varied))
+        varied = [resample_instance(item, seed) for item, seed in pairs]
     if settings.rotation:
-        rotations = _draw_rotations(settings.rotation, len(drawn), draws)
-        drawn = [rotated(item, rotation) for item, rotation in zip(drawn, rotations, strict=True)]
+        rotations = _draw_rotations(settings.rotation, len(varied), draws)
+        varied = [rotated(item, rotation) for item, rotation in zip(varied, rotations, strict=True)]
     if any(settings.gloss.specular_factor):
-        glosses = _draw_glosses(settings.gloss, len(drawn), draws)
-        drawn = [
-            add_specular_layer(item, gloss) for item, gloss in zip(drawn, glosses, strict=True)
+        glosses = _draw_glosses(settings.gloss, len(varied), draws)
+        varied = [
+            add_specular_layer(item, gloss) for item, gloss in zip(varied, glosses, strict=True)
         ]
-    return drawn
+    return varied
 
 
 def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.ndarray:
@@ -290,14 +292,11 @@ def _draw_glosses(
         settings: Lowest and highest roughness and specular factor.
         count: Number of glosses.
         draws: Generator of the random numbers.
-
-    Returns:
-        The glosses.
     """
-    # The rows are roughness and specular factor, the columns are lowest and highest value.
+    # Row 0 is the roughness, row 1 the specular factor. Columns are the lowest and highest value.
     ranges = torch.tensor([settings.roughness, settings.specular_factor], dtype=torch.float64)
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
-    # Shape (count, 2).
+    # Roughness and specular factor of each gloss, shape (count, 2).
     values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions)
     return [
         Gloss(roughness, specular_factor=specular_factor)
@@ -307,13 +306,14 @@ def _draw_glosses(
 
 @dataclass(frozen=True, eq=False)
 class _DrawnLights:
-    """The lighting of E examples.
+    """The random lighting of E examples.
 
     Attributes:
-        environment: K coefficients of the environment lighting, shape (E, K, 3).
-        directions: Unit vectors from the objects towards directional lights,
+        environment: RGB coefficients of the environment lighting in K harmonics,
+            shape (E, K, 3).
+        directions: Unit vector from each object towards its directional light,
             shape (E, 3). Zero stands for no directional light.
-        local: L coefficients of all local lights, shape (E, L, 3).
+        local: RGB coefficients of projector and lamps, shape (E, L, 3).
     """
 
     environment: Tensor
@@ -321,31 +321,29 @@ class _DrawnLights:
     local: Tensor
 
     def coefficients(self) -> Tensor:
-        """Combine environment, directional and local light of each example.
+        """Combine environment, directional light, projector and lamps of each example.
+
+        Directional lights are white, and a surface that faces them has irradiance 1.
 
         Returns:
-            Coefficients in the basis of the scene, shape (E, K + L, 3). Directional lights are
-            white and give a surface that faces them an irradiance of 1.
+            RGB coefficients in the basis of the scene, shape (E, K + L, 3).
         """
         environment = self.environment
         is_directional = self.directions.any(1)
         if is_directional.any():
             added = directional(self.directions, torch.ones(3), degree_of(environment[0]))
-            # `added` has no meaning for examples without a directional light.
+            # Add the directional light only in the examples that have one.
             mask = is_directional[:, None, None].to(environment.device)
             environment = torch.where(mask, added.to(environment) + environment, environment)
         return torch.cat([environment, self.local], dim=1)
 
     def without_ground(self, is_on_table: Tensor, albedo: Tensor) -> "_DrawnLights":
-        """Replace light from below by the light that a table reflects.
+        """Return a copy in which the light from below is what a table reflects.
 
         Args:
             is_on_table: Mask of the examples with a table, shape (E,).
-            albedo: Albedo of the background images, shape (E, C, size, size).
-                A table has the mean albedo of its image.
-
-        Returns:
-            A copy with the changed environment light.
+            albedo: Linear albedo of the background image of each example, shape
+                (E, C, size, size). The table has the mean albedo of the image.
         """
         environment = self.environment.clone()
         environment[is_on_table] = above_table(
@@ -359,17 +357,16 @@ class _DrawnLights:
 def _vary_lighting(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> Scene:
-    """Return a scene with drawn lighting, lit backgrounds and drawn camera effects.
+    """Return a copy of a scene with random lighting and random effects of the camera.
+
+    The background of some examples becomes a table and a wall.
 
     Args:
         scene: Scene of E examples.
         settings: Ranges of the random changes.
         draws: Generator of the random numbers.
-        is_on_table: Mask of the examples whose background becomes a table with a wall,
-            shape (E,).
-
-    Returns:
-        The new scene, with the objects and the cameras of the given scene.
+        is_on_table: Mask of the examples whose background becomes a table and a wall, shape
+            (E,).
     """
     exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
     examples = [
@@ -377,7 +374,7 @@ def _vary_lighting(
         for example, factor in zip(scene.examples, exposures, strict=True)
     ]
     lights = _draw_lights(scene, settings, draws, is_on_table)
-    # Arguments of `Scene` that the new scene does not take from the given scene.
+    # Arguments of `Scene` that differ in the copy.
     changed: dict[str, Any] = {}
     # Point of a projected pattern that each pixel shows. None if the pattern fills the image.
     pattern_points = None
@@ -386,17 +383,9 @@ def _vary_lighting(
         if settings.tables:
             lights = lights.without_ground(is_on_table, albedo)
         lit_scene = scene.changed(examples=examples, lights=lights.coefficients())
-        # Without `lit_background`, an albedo is shown as under an irradiance of 1.
-        background_irradiance = albedo.new_ones(3, 1, 1)
-        if settings.lit_background:
-            background_irradiance = _facing_irradiance(lit_scene)
-        # Linear values of the backgrounds, shape (E, 3, size, size).
-        values = albedo * background_irradiance
-        if settings.tables:
-            wall_distances = _draw_log_uniform(WALL_DISTANCES, len(scene), draws)
-            arriving, pattern_points = _light_rooms(lit_scene, lights, wall_distances, is_on_table)
-            values[is_on_table] = albedo[is_on_table] * arriving.to(albedo)
-        changed["backgrounds"] = encode(clamp(values), scene.settings.encoding)
+        changed["backgrounds"], pattern_points = _light_backgrounds(
+            lit_scene, lights, albedo, settings, draws, is_on_table
+        )
         # Each example now has a background of its own.
         examples = _number_backgrounds(examples)
     if settings.camera != CameraEffectSettings():
@@ -406,23 +395,59 @@ def _vary_lighting(
     return scene.changed(examples=examples, lights=lights.coefficients(), **changed)
 
 
+def _light_backgrounds(
+    scene: Scene,
+    lights: _DrawnLights,
+    albedo: Tensor,
+    settings: VariationSettings,
+    draws: torch.Generator,
+    is_on_table: Tensor,
+) -> tuple[Tensor, Tensor | None]:
+    """Compute the background images of all examples from their albedo and the random lighting.
+
+    Args:
+        scene: Scene of E examples in the random lighting.
+        lights: The random lighting.
+        albedo: Linear albedo of the backgrounds, shape (E, 1 or 3, size, size).
+        settings: Whether backgrounds are lit, and whether there are tables.
+        draws: Generator of the random numbers.
+        is_on_table: Mask of the examples whose background becomes a table and a wall, shape
+            (E,).
+
+    Returns:
+        Two values:
+        - Background images, shape (E, 3, size, size).
+        - Coordinates x and y of the point of a projected pattern that each pixel of each
+          example shows, shape (2, E, size, size). None if there are no tables.
+    """
+    # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
+    background_irradiance = albedo.new_ones(3, 1, 1)
+    if settings.lit_background:
+        background_irradiance = _facing_irradiance(scene)
+    linear = albedo * background_irradiance
+    pattern_points = None
+    if settings.tables:
+        wall_distances = _draw_log_uniform(WALL_DISTANCES, len(scene), draws)
+        table_irradiance, pattern_points = _light_rooms(scene, lights, wall_distances, is_on_table)
+        linear[is_on_table] = albedo[is_on_table] * table_irradiance.to(albedo)
+    return encode(clamp(linear), scene.settings.encoding), pattern_points
+
+
 def _draw_lights(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
 ) -> _DrawnLights:
-    """Draw the environment and the directional lighting of all examples.
+    """Draw a random environment and a random directional light for each example.
+
+    Projector and lamps stay the same. So does the environment if the settings name none.
 
     Args:
-        scene: Scene of E examples. The drawn examples keep its local lights, and also its
-            environment lighting if the settings name no environments.
-        settings: Environments, and ranges of the random changes.
+        scene: Scene of E examples.
+        settings: Environments to choose from, and ranges of the random changes.
         draws: Generator of the random numbers.
         is_on_table: Mask of the examples with a table, shape (E,).
-
-    Returns:
-        Lighting of the E examples.
     """
     harmonics = harmonics_of(scene.basis)
-    # The first coefficients of the basis are those of the environment.
+    # Split the coefficients into those of the environment, and those of projector and lamps.
     environment, local = scene.lights.tensor_split([harmonics.size], dim=1)
     directions = torch.zeros(len(scene), 3, dtype=torch.float64)
     if settings.environments:
@@ -442,7 +467,10 @@ def _draw_directional(
     draws: torch.Generator,
     is_on_table: Tensor,
 ) -> _DrawnLights:
-    """Add a directional light to some examples and dim their environment lighting.
+    """Add a directional light to some examples, and dim their environment lighting.
+
+    The directions are random, but differ from the direction of the camera by at most
+    `MAX_LIGHT_ANGLE` in polar angle and in azimuth.
 
     Args:
         lights: Lighting of the E examples.
@@ -453,21 +481,20 @@ def _draw_directional(
         is_on_table: Mask of the examples with a table, shape (E,).
 
     Returns:
-        Lighting with directional lights from near the camera's direction.
+        A copy of the lighting with the directional lights.
     """
     low, high = settings.fill_light
     shape = (len(scene), 1, 1)
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     is_chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     angles = _draw_pairs(MAX_LIGHT_ANGLE, len(scene), draws)
-    # The direction of a light is that of a camera that is turned from the example's camera.
-    turned_cameras = [
-        _turn_camera(example.cameras[0], *turn)
-        for example, turn in zip(scene.examples, angles, strict=True)
-    ]
-    # The third axis of a camera points from the origin to the camera.
-    directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in turned_cameras]))
-    # A table blocks light from below, so directions from below are mirrored.
+    to_lights = []
+    for example, (polar, azimuth) in zip(scene.examples, angles, strict=True):
+        turned = _turn_camera(example.cameras[0], polar, azimuth)
+        # The third axis of a camera points from the origin to the camera.
+        to_lights.append(turned.axes()[2])
+    directions = torch.from_numpy(np.stack(to_lights))
+    # A table blocks light from below, so such directions are mirrored to above.
     grounds = [scene.objects[example.object].ground for example in scene.examples]
     has_table = is_on_table | torch.tensor([ground is not None for ground in grounds])
     directions[has_table, 2] = directions[has_table, 2].abs()
@@ -483,16 +510,16 @@ def _draw_directional(
 def _draw_background_albedo(
     scene: Scene, settings: VariationSettings, draws: torch.Generator
 ) -> Tensor:
-    """Compute the albedo of the background of each example.
+    """Convert the background of each example to an albedo, and multiply it by a random color.
 
     Args:
-        scene: Scene of E examples. Its backgrounds are taken as images of the albedo.
-        settings: `background_saturation` is the largest saturation of a random color by which
-            an albedo is multiplied. With 0, the albedo keeps its color.
+        scene: Scene of E examples. The values of a background are taken as its albedo.
+        settings: `background_saturation` is the largest saturation of the random colors. With
+            0, the albedo keeps its color.
         draws: Generator of the random numbers.
 
     Returns:
-        Linear albedo, shape (E, 1 or 3, size, size).
+        Linear albedo of each pixel, shape (E, 1 or 3, size, size).
     """
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]
@@ -504,13 +531,13 @@ def _draw_background_albedo(
 
 
 def _facing_irradiance(scene: Scene) -> Tensor:
-    """Compute the irradiance of a surface that faces the first camera of each example.
+    """Compute the irradiance of a surface that faces the camera, in the environment light.
 
     Args:
-        scene: Scene of E examples. Only its environment light counts.
+        scene: Scene of E examples. The first camera of each example counts.
 
     Returns:
-        Irradiance times the exposure of each example, shape (E, 3, 1, 1).
+        RGB irradiance times the exposure of each example, shape (E, 3, 1, 1).
     """
     # The normal of the surface points to the camera.
     directions = [example.cameras[0].axes()[2] for example in scene.examples]
@@ -525,29 +552,30 @@ def _facing_irradiance(scene: Scene) -> Tensor:
 def _light_rooms(
     scene: Scene, lights: _DrawnLights, wall_distances: Sequence[float], is_on_table: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Compute the irradiance of the rooms, and the points of projected patterns.
+    """Light a table and a wall in some examples, and find where a projected pattern falls.
 
-    In a room, a pattern falls on table, wall and object along the directional
-    light. Without a directional light, it falls along the view.
+    The pattern falls on table, wall and object along the directional light of
+    the example or, if it has none, along the direction of the view.
 
     Args:
-        scene: The scene of E examples, in the drawn lighting.
-        lights: The drawn lighting.
+        scene: Scene of E examples in the random lighting.
+        lights: The random lighting.
         wall_distances: Distance of the wall behind each object, in world units, E numbers.
-        is_on_table: Mask of the N examples in rooms, shape (E,).
+        is_on_table: Mask of the N examples with a table and a wall, shape (E,).
 
     Returns:
-        The irradiance of table and wall in the N rooms, shape
-        (N, 3, size, size), and the point of the pattern that reaches each
-        pixel of each example, shape (2, E, size, size).
+        Two tensors:
+        - RGB irradiance of table and wall in these N examples, shape (N, 3, size, size).
+        - Coordinates x and y of the point of the pattern that each pixel of each of the E
+          examples shows, shape (2, E, size, size).
     """
     room_examples = torch.nonzero(is_on_table).squeeze(1).tolist()
     environments = lights.environment.cpu().double()
     settings = scene.settings
     irradiance_images = []
-    # Examples without a room keep the pixel centers: their pattern fills the image.
+    # Without a table, the pattern fills the image: each pixel shows the point at its center.
     points = pixel_centers(settings.size).repeat(1, len(scene), 1, 1)
-    # Neighboring examples of the same object share its ray tracer.
+    # Build the ray tracer of an object once for all successive examples that show this object.
     groups = groupby(progress(room_examples, "tables"), lambda index: scene.examples[index].object)
     for object_index, examples_of_object in groups:
         item = scene.objects[object_index]
@@ -560,6 +588,7 @@ def _light_rooms(
             local = split_light(scene.basis, scene.lights[index].cpu().double()).local_lights
             arriving = irradiance(room, camera, settings, environments[index], direction, local)
             irradiance_images.append(example.exposure * arriving)
+            # A direction of zero stands for no directional light.
             if not direction.any():
                 direction = torch.from_numpy(camera.axes()[2])
             points[:, index] = project_along_light(
@@ -574,13 +603,25 @@ def _light_rooms(
 
 
 def _draw_log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
-    """Draw `count` numbers between two limits, with uniformly distributed logarithms."""
+    """Draw numbers whose logarithms are uniformly distributed.
+
+    Args:
+        limits: Smallest and largest number.
+        count: Number of numbers.
+        draws: Generator of the random numbers.
+    """
     low, high = (math.log(limit) for limit in limits)
     fractions = torch.rand(count, generator=draws, dtype=torch.float64)
     return (low + (high - low) * fractions).exp().tolist()
 
 
 def _draw_pairs(limit: float, count: int, draws: torch.Generator) -> list[list[float]]:
-    """Draw pairs (count, 2) of numbers uniformly from [-limit, limit]."""
+    """Draw pairs of numbers uniformly from [-limit, limit].
+
+    Args:
+        limit: Largest magnitude of a number.
+        count: Number of pairs.
+        draws: Generator of the random numbers.
+    """
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
     return (limit * (2 * fractions - 1)).tolist()

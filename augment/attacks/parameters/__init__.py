@@ -31,7 +31,7 @@ def parameter_class(name: str) -> type[Parameter]:
         name: Name of the quantity, such as "pose".
 
     Returns:
-        The class, such as `Pose`, or `LocalLight` for a kind of local light.
+        The class, such as `Pose`. For a projector or lamps, it is `LocalLight`.
 
     Raises:
         InputError: If there is no such quantity.
@@ -51,16 +51,16 @@ def make_parameter(name: str, scene: Scene, settings: StepSettings, **options: A
         name: Name of the parameter, such as "pose".
         scene: Scene to attack.
         settings: Norm-ball, steps and units of the attack. Their class is the
-            type of the field `name` of `ParameterSettings`.
-        options: Further arguments of the parameter's class, such as
+            type of the field of `ParameterSettings` with this name.
+        options: Further arguments of the constructor of the parameter, such as
             `nonnegative` of `Lighting`.
 
     Returns:
         The parameter.
 
     Raises:
-        InputError: If there is no such parameter, or if the scene does not have
-            the attacked thing, such as lamps.
+        InputError: If there is no such parameter, or if the scene lacks what
+            the parameter changes, such as lamps.
     """
     if name in LOCAL_LIGHTS:
         return LocalLight(scene, settings, name)

@@ -11,7 +11,7 @@ from augment.scene.scene import Scene
 
 
 class Albedo(MeshParameter):
-    """Linear RGB color that is added to the albedo of each face of the object.
+    """Attack on the colors: a linear RGB offset that is added to the albedo of each face.
 
     The renderer clamps the sum to [0, 1].
 
@@ -30,9 +30,10 @@ class Albedo(MeshParameter):
         """Return a copy of the conditions with a color offset for each face.
 
         Args:
-            values: Linear RGB offsets of the F faces of the largest mesh, shape (A, 3 F).
-            conditions: Conditions of the A examples.
-            examples: Indices of the examples in the scene, shape (A,).
+            values: Linear RGB offsets of the F faces of the largest mesh in each of A examples,
+                shape (A, 3 F).
+            conditions: Light, shape and colors of the A examples.
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Conditions with the offsets, differentiable with respect to the values.

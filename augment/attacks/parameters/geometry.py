@@ -11,11 +11,12 @@ from augment.scene.scene import Scene
 
 
 class Geometry(MeshParameter):
-    """Displacement of each vertex of the object in world units. The object spans [-1, 1].
+    """Attack on the shape: a displacement of each vertex of the object.
 
-    The gradient takes into account that normals turn as vertices move. If
+    Displacements are in world units, in which the object spans [-1, 1]. The
+    gradient takes into account that normals turn as vertices move. If
     `ImageSettings.silhouettes` is set, it also takes into account that the
-    outline of the object moves.
+    silhouette of the object moves.
 
     Args:
         scene: Scene to attack. Props and table stay as they are.
@@ -34,10 +35,10 @@ class Geometry(MeshParameter):
         """Return a copy of the conditions with displaced vertices.
 
         Args:
-            values: Displacements of the N vertices of the largest mesh in world units, shape
-                (A, 3 N).
-            conditions: Conditions of the A examples.
-            examples: Indices of the examples in the scene, shape (A,).
+            values: Displacements of the N vertices of the largest mesh in each of A examples, in
+                world units, shape (A, 3 N).
+            conditions: Light, shape and colors of the A examples.
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Conditions with the vertices, differentiable with respect to the values.

@@ -1,4 +1,4 @@
-"""Base class of attacks on one of the lights of a scene, and where this light is among all."""
+"""Base class of attacks on one of the lights of a scene, such as its environment."""
 
 from dataclasses import replace
 
@@ -14,23 +14,21 @@ from renderer.light.basis import Harmonics, LocalBasis, parts_of
 
 
 class LightParameter(Parameter):
-    """All RGB coefficients of one light of a scene, such as its environment or its projector.
+    """Attack on all RGB coefficients of one light, such as the environment or the projector.
 
-    The attack starts at the light of each example. If radiance must not be
-    negative, it starts at `project_nonnegative` of this light, which has the
-    same mean. Each step then ends in the nearest coefficients whose radiance is
-    not negative and that lie in the norm-ball. Their mean may differ from the
-    mean that the step asked for, because the ball need not contain a
-    non-negative light of that mean.
+    The attack starts at the light of the scene. If radiance must not be
+    negative, the start is the nearest light without negative radiance that has
+    the same mean. Each step then ends in the nearest coefficients that lie in
+    the norm-ball and have no negative radiance.
 
     Args:
         scene: Scene to attack. Its other lights stay as they are.
         settings: Norm-ball and steps of the attack.
-        rows: Rows of this light among the coefficients of all lights of the
-            scene, shape (size of the scene's basis, 3).
+        rows: Rows of this light in the coefficients of all lights of the scene,
+            shape (size of the scene's basis, 3).
         basis: Basis of this light.
-        nonnegative: Whether radiance must not be negative. Projectors and lamps
-            never have negative radiance, whatever is given here.
+        nonnegative: Whether radiance must not be negative. It is always True for
+            projectors and lamps.
     """
 
     def __init__(
@@ -41,6 +39,7 @@ class LightParameter(Parameter):
         basis: Harmonics | LocalBasis,
         nonnegative: bool,
     ):
+        """Compute the light at which the attack starts. See the class for the arguments."""
         self._rows = rows
         self._basis = basis
         self._nonnegative = nonnegative or not basis.allow_negative
@@ -53,8 +52,9 @@ class LightParameter(Parameter):
         """Return a copy of the conditions with other coefficients of this light.
 
         Args:
-            values: Red, green and blue of the K coefficients of this light, shape (A, 3 K).
-            conditions: Conditions of the A examples.
+            values: Red, green and blue of the K coefficients of this light in each of A examples,
+                shape (A, 3 K).
+            conditions: Light, shape and colors of the A examples.
             examples: Not used. All parameters have this argument.
 
         Returns:
@@ -75,7 +75,7 @@ class LightParameter(Parameter):
         """
         if not self._nonnegative:
             return super().project_feasible(values, within)
-        # Shape (A, K, 3).
+        # RGB of each of the K coefficients, shape (A, K, 3).
         coefficients = values.unflatten(1, (-1, 3))
         ball = None if within is None else within.unflatten(-1, 3)
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
@@ -85,27 +85,28 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
     """Find the environment lighting among the lights of a scene.
 
     Args:
-        scene: Scene with environment lighting.
+        scene: Scene with environment lighting, and possibly with a projector
+            or lamps.
 
     Returns:
-        Rows of the environment lighting among the coefficients of all lights,
-        and the basis of the environment lighting.
+        Rows of the environment lighting in the coefficients of all lights, and
+        the basis of the environment lighting.
     """
-    # The environment lighting is the first part of the basis of all lights.
-    parts = parts_of(scene.basis)
-    return parts[0]
+    # `parts_of` returns one pair for each light. The environment comes first.
+    lights = parts_of(scene.basis)
+    return lights[0]
 
 
 def replace_light(conditions: Conditions, rows: slice, coefficients: Tensor) -> Conditions:
     """Return a copy of the conditions with other coefficients for one light.
 
     Args:
-        conditions: Conditions of A examples.
-        rows: Rows of the replaced light among the coefficients of all lights.
-        coefficients: New coefficients of this light, shape (A, its size, 3).
+        conditions: Light, shape and colors of A examples.
+        rows: Rows of the replaced light in the coefficients of all lights.
+        coefficients: New RGB coefficients of this light, shape (A, K, 3).
 
     Returns:
-        Conditions in which the coefficients of all other lights are the same.
+        Conditions in which all other lights are the same.
     """
     all_lights = conditions.light
     # A scene with a single light needs no concatenation.

@@ -6,7 +6,7 @@ from augment.scene.scene import Scene
 
 
 class Lighting(LightParameter):
-    """Spherical-harmonic coefficients of the environment lighting.
+    """Attack on the spherical-harmonic coefficients of the environment lighting.
 
     Args:
         scene: Scene to attack. Its projector and lamps stay as they are.

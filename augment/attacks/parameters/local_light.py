@@ -7,21 +7,28 @@ from renderer.errors import InputError
 
 
 class LocalLight(LightParameter):
-    """RGB coefficients of a local light, from 0 to its power, such as the pixels of a projector.
+    """Attack on the RGB coefficients of a projector (its pixels) or of lamps (their powers).
+
+    A coefficient lies between 0 and the power of the light.
 
     Args:
         scene: Scene to attack.
         settings: Norm-ball and steps of the attack.
-        name: Name of the kind of light, which is also the name of the quantity.
+        name: Kind of light: "projector" or "lamps".
 
     Raises:
         InputError: If the scene has no such light.
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
+        """Find the light among the local lights of the scene. See the class for the arguments."""
         self.name = name
         for rows, basis in scene.basis.local_lights:
             if basis.name == name:
                 super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=True)
                 return
-        raise InputError(f"{name}: the scene has no {name}: build it with {name}=...", name)
+        raise InputError(
+            f"{name} cannot be attacked, because the scene has none: "
+            f"build the scene with {name}=...",
+            name,
+        )

@@ -13,12 +13,12 @@ from augment.scene.scene import Scene
 
 
 class MeshParameter(Parameter):
-    """Three values for each vertex or each face of an object, such as x, y and z.
+    """Attack with three values for each vertex or each face of an object, such as x, y and z.
 
-    The mesh of an object also contains its props and its table, which the
-    attack leaves as they are. All examples have as many values as the largest
-    mesh needs. Values of props, of a table, and of vertices or faces that a
-    smaller mesh does not have are not used. The attack starts at zero.
+    All examples have as many values as the largest mesh needs. Values of
+    vertices or faces that a smaller mesh lacks are not used. The mesh of an
+    object also contains its props (meshes beside the object) and its table. The
+    attack does not change these. The attack starts at zero.
 
     Args:
         scene: Scene to attack.
@@ -29,20 +29,23 @@ class MeshParameter(Parameter):
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
-        # Shape (objects, N), with N vertices or faces in the largest mesh.
+        """Find the values that each example uses. See the class for the arguments."""
+        # One row for each object, one column for each of the N vertices or faces of the largest
+        # mesh. Rows of smaller meshes end with False.
         masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)
-        # Shape (objects, 3 N), three values for each vertex or face.
+        # Three values for each vertex or face, shape (objects, 3 N).
         value_masks = masks.to(scene.lights.device).repeat_interleave(3, dim=1)
         used_mask = value_masks[scene.object_of]
         start = scene.lights.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
 
     def offsets(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Return the values as vectors, one for each vertex or face.
+        """Reshape the attack values to one vector for each vertex or face.
 
         Args:
-            values: Values of A examples, shape (A, 3 N).
-            examples: Indices of the examples in the scene, shape (A,).
+            values: Attack values of A examples, three for each vertex or face,
+                shape (A, 3 N).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Offset of each of the N vertices or faces, shape (A, N, 3). It is

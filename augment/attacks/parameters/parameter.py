@@ -11,7 +11,8 @@ from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 
-# Without a radius, the random search begins with changes of this many step sizes.
+# If a parameter has no radius, a search without gradients begins with random changes that are as
+# long as this many steps.
 STEPS_OF_SEARCH = 4
 
 
@@ -20,14 +21,16 @@ class Parameter(ABC):
 
     Each of the E examples of a scene has D values of the quantity. The
     constructor of a subclass computes the values at which an attack starts. The
-    subclass defines `apply`, which puts values into the conditions under which
-    a scene is rendered. If not all values are feasible, it also overrides
-    `project_feasible`.
+    subclass defines `apply`, which puts values into the light, shape and colors
+    with which a scene is rendered. If not all values are feasible, it also
+    overrides `project_feasible`.
 
     Attributes:
         name: Name of the quantity in settings, messages and files.
-        fits_other_meshes: Whether the values can be given to another mesh.
-        fits_other_views: Whether the values can be given to another view.
+        fits_other_meshes: Whether values can be transferred to another mesh.
+            Displacements of vertices, for example, belong to one mesh.
+        fits_other_views: Whether values can be transferred to another camera.
+            Offsets of pixels, for example, belong to one view.
         settings: Norm-ball and steps of the attack.
         start: Values at which attacks start and on which the norm-balls are
             centered, shape (E, D).
@@ -51,11 +54,14 @@ class Parameter(ABC):
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         """Return a copy of the conditions in which this quantity has the given values.
 
+        Conditions are the light, shape and colors with which examples are
+        rendered.
+
         Args:
-            values: Values of the quantity, shape (A, D).
+            values: D values of the quantity in each of A examples, shape (A, D).
             conditions: Conditions of the A examples. Other parameters may have
                 changed them already.
-            examples: Indices of the examples in the scene, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Conditions of the A examples, differentiable with respect to the
@@ -66,9 +72,9 @@ class Parameter(ABC):
         """Find the nearest feasible values. By default, all values are feasible.
 
         Args:
-            values: Values of A examples, shape (A, D).
-            within: Norm-ball that must contain the result. Its centers are
-                feasible. None for no norm-ball.
+            values: D values in each of A examples, shape (A, D).
+            within: Norm-balls that must contain the result, with feasible
+                centers. None for no norm-balls.
 
         Returns:
             Feasible values, shape (A, D), nearest in the Euclidean sense.
@@ -85,53 +91,58 @@ class Parameter(ABC):
         """Take a step of projected gradient descent.
 
         Args:
-            values: Values of A examples, shape (A, D).
+            values: D values in each of A examples, shape (A, D).
             gradient: Gradient of the cost with respect to the values,
                 shape (A, D).
-            examples: Indices of the examples in the scene, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
             length: Factor of the step of each example, shape (A, 1).
 
         Returns:
-            Values after the step, shape (A, D).
+            Values after the step, which are feasible and lie in the norm-balls,
+            shape (A, D).
         """
         center = self.start[examples]
         return take_step(self.settings, values, gradient, center, self.project_feasible, length)
 
     def search_scale(self, examples: Tensor) -> Tensor:
-        """Return standard deviations of random changes that reach across the norm-ball.
+        """Return how much a search without gradients should change each value at first.
 
-        A change is about as long as the radius of the ball with the norm "l2",
-        and half as long in each value with the norm "linf". Without a radius, it
-        is about as long as `STEPS_OF_SEARCH` steps.
+        With the norm "l2", a random change is about as long as the radius. With
+        the norm "linf", it changes each value by about half the radius. Without
+        a radius, `STEPS_OF_SEARCH` times the step size takes its place.
 
         Args:
-            examples: Indices of the examples in the scene, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
-            Standard deviation of each value, shape (A, D). Values without effect
-            have 0.
+            Standard deviation of the random changes of each value, shape (A, D).
+            It is 0 for values that have no effect.
         """
         settings = self.settings
         center = self.start[examples]
         if settings.radius is not None:
             length = settings.radius
-            is_length_of_value = settings.norm == "linf"
+            limits_each_value = settings.norm == "linf"
         else:
             length = STEPS_OF_SEARCH * settings.step_size
-            is_length_of_value = settings.step == "sign"
+            limits_each_value = settings.step == "sign"
+        # 1 for values that have an effect, and 0 for the others, shape (A, D).
         used = torch.ones_like(center)
         if self.used_mask is not None:
             used = self.used_mask[examples].to(center)
-        if is_length_of_value:
+        if limits_each_value:
             return length / 2 * used
-        return length * used / used.sum(1, keepdim=True).clamp(min=1).sqrt()
+        # n independent numbers with the standard deviation length / √n form a vector that is
+        # about `length` long.
+        used_count = used.sum(1, keepdim=True)
+        return length * used / used_count.clamp(min=1).sqrt()
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
 
         Args:
-            values: Values of A examples, shape (A, D).
-            examples: Indices of the examples in the scene, shape (A,).
+            values: D values in each of A examples, shape (A, D).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Projected values, shape (A, D).
@@ -139,23 +150,22 @@ class Parameter(ABC):
         return project(self.settings, values, self.start[examples], self.project_feasible)
 
     def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
-        """Draw random feasible values for all examples.
+        """Draw random feasible values for all E examples.
 
         With a radius, values are drawn uniformly from the norm-balls and then
-        projected. Without a radius, they are drawn in random directions, as far
-        from the start as the values that an attack reached.
+        projected onto the feasible values. Without a radius, they are drawn in
+        random directions, as far from the start as the values of an attack.
 
         Args:
             generator: CPU generator of the random numbers.
-            reached: Values that an attack reached, shape (E, D). Needed only
-                without a radius.
+            reached: D values in each example at the end of an attack, shape
+                (E, D). Needed only without a radius.
 
         Returns:
             Random values, shape (E, D).
 
         Raises:
             InputError: If there is neither a radius nor `reached`.
-                `StepSettings.sample` raises it.
         """
         if self.settings.radius is None and reached is not None:
             return self._sample_as_far_as(reached, generator)
@@ -163,7 +173,15 @@ class Parameter(ABC):
         return project(self.settings, drawn, self.start, self.project_feasible)
 
     def _sample_as_far_as(self, reached: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw values in random directions, as far from the start as `reached`, shape (E, D)."""
+        """Draw feasible values in random directions from the start of each example.
+
+        Args:
+            reached: Values whose distance from the start the drawn values get, shape (E, D).
+            generator: CPU generator of the random numbers.
+
+        Returns:
+            Random values, shape (E, D).
+        """
         direction = torch.randn(reached.shape, generator=generator).to(reached)
         if self.used_mask is not None:
             direction = direction * self.used_mask

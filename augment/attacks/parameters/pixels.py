@@ -12,12 +12,12 @@ from augment.scene.scene import Scene
 
 
 class Pixels(Parameter):
-    """Offset of each pixel value of the V images of an example, background included.
+    """Attack on the pixels: an offset that is added to each pixel value of an image.
 
-    The scene clamps the sum of image and offset to [0, 1]. A single step along
-    the sign of the gradient, as long as the radius, is FGSM (Goodfellow et al.
-    2014). Several smaller steps are the basic iterative method. With random
-    restarts, they are PGD (Madry et al. 2017).
+    The sum of image and offset is clamped to [0, 1]. With one step of the kind
+    "sign" that is as long as the radius, the attack is FGSM (Goodfellow et al.
+    2014). With several smaller steps, it is the basic iterative method (Kurakin
+    et al. 2016). With random restarts in addition, it is PGD (Madry et al. 2017).
 
     Args:
         scene: Scene to attack.
@@ -38,9 +38,9 @@ class Pixels(Parameter):
         """Return a copy of the conditions with an offset for each pixel value.
 
         Args:
-            values: Offsets of all pixel values of the V images of each example, shape
+            values: Offsets of all pixel values of the V images of each of A examples, shape
                 (A, V · 3 · size²).
-            conditions: Conditions of the A examples.
+            conditions: Light, shape and colors of the A examples.
             examples: Not used. All parameters have this argument.
 
         Returns:

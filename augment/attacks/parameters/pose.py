@@ -23,10 +23,10 @@ from renderer.geometry.skin import Skin
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.vectors import rotation_matrices
 
-# Positions among the attack values of an example: the rotation vector of the
-# object, its shift along x and y, its scale, and three values for the cameras,
-# of which the last is their distance. JOINTS is the position of the first value
-# of the joints, which come last.
+# An attack on the pose changes a vector of values. The following constants are positions in it:
+# of the rotation vector of the object, of its shift along x and y, of the logarithm of its scale,
+# of the three changes of the cameras (the last is the logarithm of their distance), and of the
+# first value of the rotation vectors of the joints, which come last.
 ROTATION = slice(0, 3)
 SHIFT = slice(3, 5)
 SCALE = 5
@@ -34,24 +34,27 @@ CAMERA = slice(6, 9)
 DISTANCE = 8
 JOINTS = 9
 
-# An object that grows and a camera that approaches may each close this share of
-# the gap between them (see `Pose._largest_values`). They never meet because the
-# two shares add up to less than 1.
+# An attack on the pose may let the object grow and the camera approach. Each may close this
+# fraction of the gap between them. The sum is below 1, so they never meet.
 MAX_APPROACH = 0.45
 
 
 class Pose(Parameter):
-    """Pose of an object and of its cameras, divided by the units of `PoseSettings`.
+    """Attack on the pose of an object and of its cameras.
 
-    The first nine values of an example are the rotation vector of the object
-    about the origin, its shift along x and y, the logarithm of its scale, and
-    the changes of the polar angle, the azimuth and the logarithm of the
-    distance of all cameras. They are followed by a rotation vector for each
-    joint, if joints are attacked.
+    The attack values of an example, each divided by its unit in
+    `PoseSettings`, are
 
-    A displacement of vertices (see `Geometry`) comes first, then the rotation
-    of the joints, and then that of the object. If an object has props or a
-    table, it keeps standing on the same ground.
+    - the rotation vector of the object about the origin (3 values),
+    - its shift along x and y (2),
+    - the logarithm of its scale (1),
+    - the changes of the polar angle, the azimuth and the logarithm of the
+      distance of all cameras (3),
+    - a rotation vector for each joint, if joints are attacked (3 each).
+
+    Joints rotate before the object does. If another parameter displaces the
+    vertices, it does so before. An object with props or a table keeps standing
+    on the same ground.
 
     Args:
         scene: Scene to attack, with `ImageSettings.silhouettes`.
@@ -67,6 +70,7 @@ class Pose(Parameter):
     fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: PoseSettings):
+        """Compute units and limits of the attack values. See the class for the arguments."""
         if not scene.settings.silhouettes:
             raise InputError(
                 "silhouettes=False: set silhouettes=True, since an attack on the pose needs them",
@@ -76,8 +80,7 @@ class Pose(Parameter):
         self._vertices = scene.vertices
         self._movable_objects = _movable_objects(scene, settings)
         units = [_pose_units(settings, item) for item in scene.objects]
-        # Shape (objects, D). Objects with fewer joints have units of 0 for the
-        # joints that they lack.
+        # One row of D units for each object. The units of joints that an object lacks are 0.
         self._unit = pad_sequence(units, batch_first=True).to(scene.lights)
         self._limit = self._largest_values(scene, settings)
         used_mask = (self._unit > 0)[scene.object_of]
@@ -88,21 +91,24 @@ class Pose(Parameter):
         """Compute the largest magnitude of each attack value, shape (D,).
 
         Scale and distance are limited, so that the object and a perspective
-        camera do not meet. Joints rotate at most by their unit, which is an
-        attack value of 1. The other values have no limit.
+        camera do not meet. The rotations of joints are at most 1, because their
+        units are their limits. The other values have no limit.
+
+        Args:
+            scene: Scene to attack, with its cameras.
+            settings: Settings of the attack, with the largest shift.
         """
         all_cameras = chain.from_iterable(scene.cameras)
         cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
         distances = [camera.distance for camera in cameras]
         object_radius = float(scene.vertices.norm(dim=-1).max()) + settings.shift
-        # The scale of the object and the distance of the camera change by
-        # factors, so the gap between them is measured as a logarithm. Without
-        # perspective cameras it is infinite.
+        # Logarithm of the factor by which the object can grow before it meets the nearest
+        # perspective camera. It is infinite if there is no such camera.
         log_gap = math.log(min(distances, default=math.inf) / object_radius)
         largest_log_factor = max(MAX_APPROACH * log_gap, 0.0)
 
         limit = self._unit.new_full((self._unit.shape[1],), math.inf)
-        # These two units are the same for all objects. They can be 0.
+        # The units of scale and distance are the same for all objects. A unit may be 0.
         units = self._unit[0, [SCALE, DISTANCE]].clamp(min=1e-9)
         limit[[SCALE, DISTANCE]] = largest_log_factor / units
         limit[JOINTS:] = 1.0
@@ -112,11 +118,11 @@ class Pose(Parameter):
         """Return a copy of the conditions with moved objects and cameras.
 
         Args:
-            values: Pose of the A examples divided by the units of the settings,
-                shape (A, D).
+            values: D attack values of each of A examples: its pose, divided by
+                the units of the settings, shape (A, D).
             conditions: Conditions of the A examples. If another parameter has
                 displaced the vertices, the displaced vertices are moved.
-            examples: Indices of the examples in the scene, shape (A,).
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Conditions with moved vertices and cameras, differentiable with
@@ -136,10 +142,11 @@ class Pose(Parameter):
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
     def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest values whose magnitudes are at most `_limit`.
+        """Find the nearest values at which object and camera do not meet and joints can rotate.
 
         Args:
-            values: Pose of the A examples divided by the units of the settings, shape (A, D).
+            values: D attack values of each of A examples: its pose, divided by the units of the
+                settings, shape (A, D).
             within: Norm-ball that must contain the result, or None.
 
         Returns:
@@ -149,17 +156,17 @@ class Pose(Parameter):
 
 
 def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
-    """Compute the changes of an object and its cameras that attack values of 1 stand for.
+    """Return the units of the attack values of a pose.
 
     Args:
-        settings: Settings of the attack.
-        item: Object, whose skin tells its joints.
+        settings: Settings of the attack, with the units.
+        item: Attacked object. Its skin has its joints.
 
     Returns:
-        Rotation vector in degrees (3 values), shift in world units (2),
-        logarithm of the scale (1), polar angle and azimuth of the cameras in
-        degrees (2), logarithm of their distance (1), and a rotation vector in
-        degrees for each joint that rotates (3 each), shape (D,).
+        Units of the rotation vector in degrees (3 values), the shift in world
+        units (2), the logarithm of the scale (1), polar angle and azimuth of
+        the cameras in degrees (2), the logarithm of their distance (1), and a
+        rotation vector in degrees for each attacked joint (3 each), shape (D,).
     """
     units = [settings.rotation, settings.rotation, settings.rotation]
     units += [settings.shift, settings.shift]
@@ -172,14 +179,18 @@ def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
 
 
 def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObject]:
-    """Create a `_MovableObject` for each object of a scene, in the order of `scene.objects`."""
+    """Create a movable copy of each object of a scene, in the order of `scene.objects`.
+
+    Args:
+        scene: The attacked scene.
+        settings: Settings of the attack, with the joints to rotate.
+    """
     masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
-    # Shape (objects, N), with N vertices in the largest mesh.
+    # One row for each object, one column for each of the N vertices of the largest mesh.
     object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
     movable_objects = []
     for item, object_mask in zip(scene.objects, object_masks, strict=True):
-        # `item.own` is the number of faces of the object itself. It is None if
-        # the mesh contains no props or table.
+        # `item.own` is None if the mesh contains the object only, without props or table.
         stands_on_ground = item.own is not None
         movable_objects.append(
             _MovableObject(
@@ -213,22 +224,22 @@ class _MovableObject:
     rotated_joint_count: int
 
     def move(self, vertices: Tensor, change: Tensor) -> Tensor:
-        """Return the vertices after rotation of the joints and movement of the object.
+        """Move the object: rotate its joints, then scale, rotate and shift it.
 
         Args:
             vertices: Vertices of the object, its props and its table,
                 shape (N, 3).
             change: Change of the pose in degrees, world units and logarithms,
-                in the order of `Pose`, shape (D,).
+                in the order of the attack values of `Pose`, shape (D,).
 
         Returns:
-            Moved vertices, shape (N, 3). If the object has a ground, its lowest
-            vertex lies on it.
+            Vertices after the movement, shape (N, 3). Props and table do not
+            move. If the object stands on a ground, its lowest vertex stays on it.
         """
         bent = self._bend(vertices, change[JOINTS : JOINTS + 3 * self.rotated_joint_count])
         scaled = change[SCALE].exp() * bent
         rotated = scaled @ rotation_matrices(change[ROTATION]).T
-        # The shift along z is 0.
+        # Append 0 for the shift along z.
         shift = F.pad(change[SHIFT], (0, 1))
         moved = rotated + shift
         if self.ground_height is not None:
@@ -237,7 +248,7 @@ class _MovableObject:
         return torch.where(self.object_mask[:, None], moved, bent)
 
     def _bend(self, vertices: Tensor, joint_rotations: Tensor) -> Tensor:
-        """Return the vertices after rotation of the J joints, shape (N, 3).
+        """Rotate the J joints, and return the vertices that they move, shape (N, 3).
 
         Args:
             vertices: Vertices of the object, its props and its table,
@@ -247,25 +258,26 @@ class _MovableObject:
         """
         if self.skin is None or not self.rotated_joint_count:
             return vertices
-        # Shape (J, 3, 3).
+        # One rotation matrix for each joint, shape (J, 3, 3).
         rotations = rotation_matrices(joint_rotations.view(-1, 3))
         # Displacement of each vertex of this object's mesh.
         displacement = self.skin.displacements(rotations)
-        # All meshes of a scene have as many rows of vertices as its largest mesh. A
-        # smaller mesh ends with rows that no face uses.
+        # `vertices` has as many rows as the largest mesh of the scene. The additional rows of a
+        # smaller mesh do not move.
         padding_count = len(vertices) - len(displacement)
         return vertices + F.pad(displacement, (0, 0, 0, padding_count))
 
 
 def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
-    """Return the largest rotation of each joint of an object.
+    """Return the largest rotation of each joint of an object, as an attack permits it.
 
     Args:
-        settings: Settings of the attack.
-        item: Object with a skin.
+        settings: Settings of the attack, with the field `joints`.
+        item: Object, whose mesh has a skin with joints.
 
     Returns:
-        Rotation of each joint of the skin in degrees. The list is empty if no joint is to move.
+        Largest rotation of each joint of the skin about each axis, in degrees. The list is empty
+        if no joint is attacked.
 
     Raises:
         InputError: If the object has no skin, or lacks a joint that the settings name.

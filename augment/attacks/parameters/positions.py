@@ -13,10 +13,10 @@ from renderer.light.local_lights import LOCAL_LIGHTS
 
 
 class Positions(Parameter):
-    """Position of each lamp, as x, y and z in world units.
+    """Attack on the position of each lamp: x, y and z in world units.
 
-    The shadows of each image are those of the changed positions. The gradient
-    treats shadows as fixed.
+    Shadows are cast from the changed positions. The gradient treats shadows as
+    fixed.
 
     Args:
         scene: Scene to attack.
@@ -29,13 +29,16 @@ class Positions(Parameter):
     name = "positions"
 
     def __init__(self, scene: Scene, settings: StepSettings):
+        """Start at the positions of the lamps of the scene. See the class for the arguments."""
         light = scene.basis.movable_light
         if light is None:
             kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
             raise InputError(
-                f"{self.name}: the scene has no {kinds}: build it with {kinds}=...", self.name
+                f"{self.name} cannot be attacked, because the scene has no {kinds}: "
+                f"build the scene with {kinds}=...",
+                self.name,
             )
-        # Shape (L, 3) for L lamps. All examples start at the same positions.
+        # All examples start at the same positions of the L lamps, shape (L, 3).
         positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
@@ -43,8 +46,9 @@ class Positions(Parameter):
         """Return a copy of the conditions with moved lamps.
 
         Args:
-            values: x, y and z of the L lamps in world units, shape (A, 3 L).
-            conditions: Conditions of the A examples.
+            values: x, y and z of the L lamps in each of A examples, in world units, shape
+                (A, 3 L).
+            conditions: Light, shape and colors of the A examples.
             examples: Not used. All parameters have this argument.
 
         Returns:

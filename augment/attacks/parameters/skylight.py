@@ -17,19 +17,17 @@ from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
 from renderer.settings import TURBIDITY
 
-# `Skylight` divides the turbidity by this unit to get an attack value. The
-# turbidity then has a range of 2 (from 2 / 4 to 10 / 4). With the default of
-# `SkylightSettings.sun`, this is of the same order as the ranges of the zenith
-# angle (1.6) and of the azimuth (6.3), so one radius and one step size suit all
-# three values.
+# An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
+# divided by this unit. The turbidity, from 2 to 10, then has the range 2. The angles in radians
+# have the ranges 1.6 and 6.3. The ranges are of the same order, so one radius suits all values.
 TURBIDITY_UNIT = 4.0
 
 
 class Skylight(Parameter):
-    """Zenith angle and azimuth of the sun, and turbidity, divided by their units.
+    """Attack on a daylight sky: zenith angle and azimuth of the sun, and turbidity (haze).
 
-    The unit of both angles is `SkylightSettings.sun`, in degrees. The unit of the
-    turbidity is `TURBIDITY_UNIT`.
+    The attack values are the angles divided by `SkylightSettings.sun`, and the
+    turbidity divided by `TURBIDITY_UNIT`.
 
     The sky replaces the environment lighting of the scene. It is multiplied by
     a constant factor, so that the initial sky has the mean luminance of the
@@ -43,6 +41,7 @@ class Skylight(Parameter):
     name = "skylight"
 
     def __init__(self, scene: Scene, settings: SkylightSettings):
+        """Compute the initial sky and its brightness. See the class for the arguments."""
         self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
@@ -64,23 +63,22 @@ class Skylight(Parameter):
         """Return a copy of the conditions with the sky in place of the environment lighting.
 
         Args:
-            values: Zenith angle, azimuth and turbidity, divided by their units,
-                shape (A, 3).
-            conditions: Conditions of the A examples.
-            examples: Indices of the examples in the scene, shape (A,).
+            values: Zenith angle, azimuth and turbidity of each of A examples,
+                divided by their units, shape (A, 3).
+            conditions: Light, shape and colors of the A examples.
+            examples: Index of each of the A examples in the scene, shape (A,).
 
         Returns:
             Conditions with the light of the sky, differentiable with respect to
             the values.
         """
-        # The angles are converted in float64, which adds no rounding error.
+        # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
-        # Shape (A, 49, 3).
+        # RGB of the 49 harmonic coefficients of the sky model, shape (A, 49, 3).
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
-        # The environment lighting may have a higher degree than the sky model.
-        # The sky then has zeros as its last coefficients.
+        # The lighting of the scene may have more coefficients. Those of the sky are then 0.
         missing_count = self._basis.size - sky.shape[-2]
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
@@ -89,13 +87,14 @@ class Skylight(Parameter):
         """Find the nearest values for which the sky model is defined.
 
         Args:
-            values: Zenith angle, azimuth and turbidity, divided by their units, shape (A, 3).
+            values: Zenith angle, azimuth and turbidity of each of A examples, divided by their
+                units, shape (A, 3).
             within: Norm-ball that must contain the result, or None.
 
         Returns:
             Feasible values, shape (A, 3).
         """
-        # The sky model is defined for these ranges, and for any azimuth.
+        # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY
         low = values.new_tensor(

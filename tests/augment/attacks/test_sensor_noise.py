@@ -11,7 +11,7 @@ from torch import Tensor
 import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
 from augment.attacks.descent import Criterion
-from augment.attacks.eot import NOISE_DRAWS, stored
+from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise
 from augment.attacks.optimizers import descend
 from augment.losses import NO_CLASS
 from augment.service import Renders
@@ -102,7 +102,7 @@ def test_without_noise_every_image_with_a_lead_counts(with_lead):
 
 def noisy_images(images: Tensor, rows: Tensor, seed: int) -> list[Tensor]:
     """Return the noisy images of all draws."""
-    return list(stored(images, 1.0, rows, seed, "noise"))
+    return list(add_sensor_noise(images, 1.0, rows, seed, "noise"))
 
 
 def test_noise_depends_on_the_seed_and_the_example_alone():
@@ -132,7 +132,7 @@ def test_noisy_images_have_8_bits():
 def test_noise_comes_before_rounding():
     """A gray between two steps becomes either of them, as often as it is close to it."""
     gray = torch.full((1, 1, 3, 200, 200), 100.25 / 255)
-    dithered = 255 * next(stored(gray, 0.6, torch.arange(1), 0))
+    dithered = 255 * next(add_sensor_noise(gray, 0.6, torch.arange(1), 0))
     assert dithered.mean().item() == pytest.approx(100.25, abs=0.01)
 
 
