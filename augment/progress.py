@@ -98,10 +98,10 @@ class Phases:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Measure the seconds of a `with` block, and add them to those of a part.
+        """Measure how long a `with` block takes, and add the seconds to those under a name.
 
         Args:
-            name: Name of the part of the computation.
+            name: Name of the part of the computation that the block is.
         """
         start = self._now()
         try:

@@ -52,10 +52,11 @@ class Population:
     drawn: np.ndarray = field(init=False)
 
     def ask(self) -> Tensor:
-        """Draw P new candidates.
+        """Draw the P candidates of a step.
 
         Returns:
-            Their attack values, which may be outside of the norm-ball, shape (P, D).
+            D attack values of each candidate, which may be outside of the norm-ball, shape
+            (P, D).
         """
         self.drawn = np.stack(self.strategy.ask())
         return self._unprojected()
@@ -106,7 +107,7 @@ class CMAES(GradientFree):
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the problem, shape (A,).
+            examples: Index of each attacked example in the scene, shape (A,).
             start: Initial values, shape (A, D).
 
         Returns:

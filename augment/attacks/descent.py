@@ -241,7 +241,7 @@ class Descent:
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the problem,
+            examples: Index of each attacked example in the scene,
                 shape (A,).
             start: First initial values, shape (A, D).
             restarts: Further initial values, each of shape (A, D). They are
@@ -269,7 +269,7 @@ class Descent:
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the problem,
+            examples: Index of each attacked example in the scene,
                 shape (A,).
             start: Initial values, shape (A, D).
 
@@ -515,7 +515,7 @@ class Descent:
 
         Args:
             images: Images of V views of the A examples, shape (A, V, 3, H, W).
-            examples: Index of each example in the problem, shape (A,).
+            examples: Index of each example in the scene, shape (A,).
             criterion: Source and target classes of the A examples.
 
         Returns:
@@ -660,7 +660,7 @@ class State:
 
     Attributes:
         criterion: Source and target classes of the A examples.
-        examples: Index of each example in the problem, shape (A,).
+        examples: Index of each example in the scene, shape (A,).
         batch_size: Number of images that the classifier sees at a time. It is
             halved when memory runs out.
         active_rows: Rows of the examples that still take steps, shape (N,).
@@ -692,7 +692,7 @@ class State:
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the problem,
+            examples: Index of each attacked example in the scene,
                 shape (A,).
             start: Initial values, shape (A, D).
             batch_size: Number of images that the classifier sees at a time.

@@ -34,7 +34,7 @@ class GradientFree(Descent):
 
         Args:
             criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the problem, shape (A,).
+            examples: Index of each attacked example in the scene, shape (A,).
             start: Initial values, shape (A, D).
 
         Returns:

@@ -56,7 +56,7 @@ def descend(
             transformations).
         phases: Timer to which the seconds of the classifier passes are added.
             None for no timer.
-        examples: Index of each attacked example in the problem, shape (A,).
+        examples: Index of each attacked example in the scene, shape (A,).
             None attacks all examples.
         start: Initial attack values, shape (A, D). None starts at
             `problem.start`.

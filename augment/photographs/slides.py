@@ -168,9 +168,9 @@ def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Gene
     cosine = scale * angle.cos()
     sine = scale * angle.sin()
     zero = torch.zeros(count)
-    # Affine maps from positions in the pictures to positions in the photographs, (count, 2, 3).
     first_row = torch.stack([cosine, -sine, zero], dim=1)
     second_row = torch.stack([sine, cosine, zero], dim=1)
+    # Affine maps from positions in the pictures to positions in the photographs, (count, 2, 3).
     maps = torch.stack([first_row, second_row], dim=1)
     grid = F.affine_grid(maps, [count, 3, size, size], align_corners=False)
 

@@ -178,7 +178,7 @@ class DirectRenderer:
 
     def __post_init__(self) -> None:
         """Create empty caches."""
-        # Rasterized views of unmoved objects. A key is the index of an object with a camera.
+        # Rasterized views of unmoved objects. A key has the index of the object, and the camera.
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}

@@ -491,8 +491,8 @@ def _find_seen_points(
     forward = ends - starts
     # Table and wall are the planes normal · p = level.
     levels = torch.tensor([room.height, -room.wall], dtype=torch.float64)
-    # A ray p = starts + length · forward meets each plane at one length, shape (S, P, 2).
     falling = (forward @ normals.T).clamp(max=FALLING)
+    # Length at which a ray p = starts + length · forward meets each plane, shape (S, P, 2).
     lengths = (levels - starts @ normals.T) / falling
     points = starts + lengths.amin(2, keepdim=True) * forward
     is_on_wall = lengths[..., WALL] < lengths[..., TABLE]
