@@ -308,7 +308,7 @@ def save_lights(
     Returns:
         Basis and coefficients of each light, the environment light first.
     """
-    lights = []
+    lights: list[tuple[Any, Tensor]] = []
     for rows, basis_of_light in parts_of(basis):
         coefficients = light[rows]
         # The first light is the environment.
