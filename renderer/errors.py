@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-# Largest magnitude of numbers in arguments. The product of three such numbers does not
-# overflow in float32. An overflow would give infinity, and then NaN.
+# Largest magnitude of numbers in arguments. The product of three such numbers
+# does not overflow in float32. An overflow would give infinity, and then NaN.
 MAX_MAGNITUDE = 1e12
-# Largest factor for lights, albedo and lengths in settings. Products of two such factors
-# stay below MAX_MAGNITUDE.
+# Largest factor for lights, albedo and lengths in settings.
+# Products of two such factors stay below MAX_MAGNITUDE.
 MAX_SCALE = 1e5
-# Texts in the errors of torch, CUDA, cuDNN and cuBLAS that say that memory ran out.
+# Texts in the errors of torch, CUDA, cuDNN
+# and cuBLAS that say that memory ran out.
 OUT_OF_MEMORY = (
     "out of memory",
     "can't allocate memory",
@@ -81,7 +82,8 @@ class InputError(ValueError):
         """
         if not key:
             return self
-        # An argument such as "light.turbidity" or "light[0]" belongs to the field "light".
+        # An argument such as "light.turbidity" or
+        # "light[0]" belongs to the field "light".
         field = self.argument.partition(".")[0].partition("[")[0]
         if field and field in names:
             return InputError(f"{key}.{self}", f"{key}.{self.argument}")
@@ -153,7 +155,8 @@ def require_file(path: str | Path, advice: str) -> None:
     Raises:
         InputError: If the path is not a regular file.
     """
-    # isfile returns False for an invalid name, and in a folder without permission.
+    # isfile returns False for an invalid name,
+    # and in a folder without permission.
     if os.path.isfile(path):
         return
     problem = "is not a regular file" if os.path.exists(path) else "does not exist"
@@ -178,7 +181,8 @@ def require_range(name: str, value: float | None, least: float, most: float) -> 
     try:
         is_inside = bool(least <= value <= most)
     except (TypeError, ValueError, RuntimeError) as error:
-        # The comparison fails for a string, a complex number or an array of several numbers.
+        # The comparison fails for a string, a complex
+        # number or an array of several numbers.
         raise InputError(f"{name}={_short_text(value)} must be a number", name) from error
     if not is_inside:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
@@ -325,8 +329,8 @@ def _largest_magnitude(tensor: Tensor) -> float:
     if not tensor.numel():
         return 0.0
     values = tensor.detach()
-    # aminmax copies a tensor that is not contiguous. If a matrix is not contiguous, its
-    # transpose usually is, and aminmax does not copy it.
+    # aminmax copies a tensor that is not contiguous. If a matrix is not
+    # contiguous, its transpose usually is, and aminmax does not copy it.
     if values.ndim == 2 and not values.is_contiguous():
         values = values.T
     lowest, highest = values.aminmax()

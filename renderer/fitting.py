@@ -45,81 +45,85 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
-# Polar angles in degrees of the first cameras of a search: the angles between +z and the
-# direction to the camera.
+# Polar angles in degrees of the first cameras of a search:
+# the angles between +z and the direction to the camera.
 FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)
 # Number of first cameras at each polar angle, with equally spaced azimuths.
 FIRST_AZIMUTH_COUNT = 16
-# Width in world units that a first camera shows, before it is changed so that the mesh looks
-# as large as the object in the photograph.
+# Width in world units that a first camera shows, before it is changed
+# so that the mesh looks as large as the object in the photograph.
 FIRST_WIDTH = 2.0
-# Width and height in pixels of the small images in which cameras are searched. The best
-# cameras are then refined in images of the full size.
+# Width and height in pixels of the small images in which cameras are
+# searched. The best cameras are then refined in images of the full size.
 COARSE_SIZE = 32
-# Number of first cameras with the smallest errors that the search refines, and also the
-# largest number of cameras that the search returns.
+# Number of first cameras with the smallest errors that the search
+# refines, and also the largest number of cameras that the search returns.
 KEPT_CAMERAS = 3
-# Largest number of steps when one camera is refined with the Gauss-Newton method.
+# Largest number of steps when one camera
+# is refined with the Gauss-Newton method.
 MAX_STEPS = 20
-# The refinement of a camera ends if a step changes the squared error, or the camera, by less
-# than this fraction.
+# The refinement of a camera ends if a step changes the
+# squared error, or the camera, by less than this fraction.
 MIN_GAIN = 1e-3
-# Step sizes of numerical derivatives, times the image size in pixels. The five parameters
-# of a camera are the polar angle and the azimuth in radians, the relative width, and the
-# shifts right and up as fractions of the width.
+# Step sizes of numerical derivatives, times the image size in pixels. The
+# five parameters of a camera are the polar angle and the azimuth in radians,
+# the relative width, and the shifts right and up as fractions of the width.
 DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
-# Smallest angle in radians between a refined camera and +z or -z. Exactly there, the azimuth
-# would have no effect.
+# Smallest angle in radians between a refined camera and +z
+# or -z. Exactly there, the azimuth would have no effect.
 MIN_POLE_ANGLE = 0.02
 # Number of samples along one side of a pixel in renders.
 SAMPLES = 8
-# Two cameras count as the same one if all their axes differ by less than this angle in
-# degrees.
+# Two cameras count as the same one if all their
+# axes differ by less than this angle in degrees.
 MIN_CAMERA_ANGLE = 2.0
-# A camera of the search in small images is refined in full size if its squared error is at
-# most this multiple of the smallest squared error.
+# A camera of the search in small images is refined in full size if its
+# squared error is at most this multiple of the smallest squared error.
 MAX_ERROR_RATIO = 3
-# Weight of the smoothness penalty of the light, relative to the squared brightness of the
-# object under uniform light. Without a penalty, light from directions that the object hardly
-# reflects could become arbitrarily bright.
+# Weight of the smoothness penalty of the light, relative to the squared
+# brightness of the object under uniform light. Without a penalty, light from
+# directions that the object hardly reflects could become arbitrarily bright.
 SMOOTHNESS_WEIGHT = 1e-6
-# A pixel of the photograph with this linear value or more counts as clipped: the scene may
-# have been brighter than the photograph can show.
+# A pixel of the photograph with this linear value or more counts as
+# clipped: the scene may have been brighter than the photograph can show.
 CLIPPED_VALUE = 0.995
-# The light is fitted up to this many times. Each fit ignores the clipped pixels that the last
-# fit made brighter than 1.
+# The light is fitted up to this many times. Each fit ignores
+# the clipped pixels that the last fit made brighter than 1.
 CLIPPING_ROUNDS = 3
-# Smallest radiance of a light in all directions of a grid, as a fraction of its mean
-# radiance. The margin keeps the radiance positive between the directions.
+# Smallest radiance of a light in all directions of a grid, as a fraction of its
+# mean radiance. The margin keeps the radiance positive between the directions.
 MIN_RADIANCE_RATIO = 0.01
-# Largest number of iterations of SciPy's `nnls`, per direction of the grid in which the
-# radiance of a light is constrained. Three iterations are usual.
+# Largest number of iterations of SciPy's `nnls`, per direction of the grid in
+# which the radiance of a light is constrained. Three iterations are usual.
 MAX_NNLS_ITERATIONS = 100
-# The radiance of a light is first constrained in every 16th direction of the grid. Directions
-# in which the radiance is negative are added afterwards.
+# The radiance of a light is first constrained in every 16th direction of the
+# grid. Directions in which the radiance is negative are added afterwards.
 FIRST_DIRECTION_STEP = 16
-# Number of subdivisions of the icosphere whose vertices are the directions in which the
-# radiance of a light is constrained, while a camera is searched.
+# Number of subdivisions of the icosphere whose vertices are the directions in
+# which the radiance of a light is constrained, while a camera is searched.
 SEARCH_GRID = 2
-# Number of subdivisions of the icosphere whose vertices are the directions in which the
-# radiance of the returned light is constrained.
+# Number of subdivisions of the icosphere whose vertices are the
+# directions in which the radiance of the returned light is constrained.
 FINAL_GRID = 5
-# The object covers a pixel completely if its share of the pixel is larger than this. A limit
-# of 0.99 would be too low: a white background in the other hundredth of the pixel can be
-# brighter than the object, for example in the blue channel of a banana.
+# The object covers a pixel completely if its share of the pixel
+# is larger than this. A limit of 0.99 would be too low: a white
+# background in the other hundredth of the pixel can be brighter
+# than the object, for example in the blue channel of a banana.
 WHOLE_PIXEL = 0.999
-# A pixel on the border of the object gets the mean color of the pixels that the object covers
-# completely and that are at most this many rows and columns away.
+# A pixel on the border of the object gets the mean color of the pixels that the
+# object covers completely and that are at most this many rows and columns away.
 BORDER = 2
-# Side of the square window that is cut around an object, divided by the longer side of the
-# object's bounding box.
+# Side of the square window that is cut around an object,
+# divided by the longer side of the object's bounding box.
 WINDOW_SCALE = 1.6
-# A pixel of an 8-bit mask belongs to the object if its value is larger than this.
+# A pixel of an 8-bit mask belongs to the
+# object if its value is larger than this.
 MASK_THRESHOLD = 127
-# First guess of the angle between +z and the direction to the camera, in degrees.
+# First guess of the angle between +z and
+# the direction to the camera, in degrees.
 GUESSED_POLAR = 60.0
-# A window of the photograph is cut and fitted again if the first fit changes a component of
-# the axes of the window by more than this.
+# A window of the photograph is cut and fitted again if the first fit
+# changes a component of the axes of the window by more than this.
 MAX_AXIS_CHANGE = 1e-3
 # Smallest number of pixels of an image that the object must cover.
 MIN_COVERED_PIXELS = 16
@@ -205,7 +209,8 @@ def fit_photograph(
             "the mask has no white pixels: give a mask that is white where the object is, "
             "or a box around the object"
         )
-    # Center (column, row) of the object's bounding box in the photograph, in pixels.
+    # Center (column, row) of the object's
+    # bounding box in the photograph, in pixels.
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     # Side of the window in pixels.
     side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
@@ -213,15 +218,17 @@ def fit_photograph(
     camera_image = Photograph(photograph, focal_length)
     fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
 
-    # The window needs the direction of the world's z-axis in the axes of the photograph's
-    # camera: right, up and back. For the first fit, this direction is guessed.
+    # The window needs the direction of the world's z-axis
+    # in the axes of the photograph's camera: right, up and
+    # back. For the first fit, this direction is guessed.
     guessed_polar = math.radians(GUESSED_POLAR)
     guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
     window = camera_image.window(center, side, guessed_up)
     scene = fit.fit(window, None)
     # The first fit gives a better direction of the z-axis for the second fit.
     up = _up_direction(scene.camera, window)
-    # The camera of the photograph is upright, so the z-axis does not point to its right.
+    # The camera of the photograph is upright,
+    # so the z-axis does not point to its right.
     up[0] = 0
     upright_window = camera_image.window(center, side, up)
     if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
@@ -437,7 +444,8 @@ def fit_scene(
         start_cameras = [start]
     refined_cameras = [target.refine_camera(camera) for camera in start_cameras]
     _, best_camera = target.rank_cameras(refined_cameras)[0]
-    # Bounces are slow to compute, so only the returned light is fitted with bounces.
+    # Bounces are slow to compute, so only the
+    # returned light is fitted with bounces.
     target_with_bounces = target._replace(options=replace(options, bounces=bounces))
     return target_with_bounces.fit_final_light(best_camera)
 
@@ -461,8 +469,9 @@ def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list
         for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov):
             first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
     ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
-    # All azimuths fit a round object equally well, so the best cameras may all have the same
-    # polar angle. The best camera of each polar angle is therefore refined, too.
+    # All azimuths fit a round object equally well, so the
+    # best cameras may all have the same polar angle. The best
+    # camera of each polar angle is therefore refined, too.
     best_of_polar: dict[float, Camera] = {}
     for camera in ranked_cameras:
         best_of_polar.setdefault(camera.polar, camera)
@@ -491,7 +500,8 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
     for camera in cameras:
         is_new = True
         for kept_camera in kept_cameras:
-            # Cosines of the angles between the axes right, up and back of both cameras.
+            # Cosines of the angles between the axes
+            # right, up and back of both cameras.
             cosines = (camera.axes() * kept_camera.axes()).sum(axis=1)
             is_new = is_new and float(cosines.min()) < max_cosine
         if is_new:
@@ -556,19 +566,22 @@ class _Target(NamedTuple):
         Returns:
             Resampled photograph with `size` pixels per side.
         """
-        # 1 in pixels that the object covers completely, and 0 elsewhere, shape (1, H, H).
+        # 1 in pixels that the object covers
+        # completely, and 0 elsewhere, shape (1, H, H).
         is_inside = (mask > WHOLE_PIXEL).double()[None]
-        # Side of the square of pixels around each pixel over which colors are averaged.
+        # Side of the square of pixels around each
+        # pixel over which colors are averaged.
         side = 2 * BORDER + 1
         mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
         inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
-        # Mean color of those pixels of the square that lie inside of the object.
+        # Mean color of those pixels of the square
+        # that lie inside of the object.
         border_color = mean_color / inside_fraction.clamp(min=1e-9)
         color = torch.where(is_inside > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
-        # The background becomes black behind a bright object, and white behind a dark one,
-        # so that the silhouette stands out.
+        # The background becomes black behind a bright object, and
+        # white behind a dark one, so that the silhouette stands out.
         is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum())
         gray = 0.0 if is_bright else 1.0
         image = object_image + gray * (1 - mask)
@@ -593,7 +606,8 @@ class _Target(NamedTuple):
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
         unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
-        # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
+        # Radiance of the P covered pixels under
+        # each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
         no_coverage = self.mask.new_zeros(self.size**2)
@@ -605,18 +619,20 @@ class _Target(NamedTuple):
         is_clipped = image >= CLIPPED_VALUE
         is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
-            # Least squares over the used pixels of each channel. The normal equations have
-            # a matrix of shape (3, 49, 49) and a right side of shape (3, 49).
+            # Least squares over the used pixels of each channel.
+            # The normal equations have a matrix of
+            # shape (3, 49, 49) and a right side of shape (3, 49).
             used_transfer = transfer * is_used[:, None]
             normal_matrix = used_transfer @ transfer.mT
             object_radiance = (image - background[pixels])[..., None]
             right_side = (used_transfer @ object_radiance)[..., 0]
             penalty = self.penalty(normal_matrix)
             light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
-            # Values of the covered pixels in a render with this light, shape (3, P).
+            # Values of the covered pixels in a render
+            # with this light, shape (3, P).
             rendered = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
-            # A clipped pixel may be brighter than the photograph shows. The next fit
-            # ignores it if the render is brighter than 1 there.
+            # A clipped pixel may be brighter than the photograph shows. The
+            # next fit ignores it if the render is brighter than 1 there.
             is_trusted = is_covered & ~(is_clipped & (rendered > 1))
             if torch.equal(is_trusted, is_used):
                 break
@@ -660,8 +676,8 @@ class _Target(NamedTuple):
         Returns:
             Weight of each coefficient, shape (49,).
         """
-        # Coefficient 0 is uniform light. The small summand keeps the weights above 0, even if
-        # the object is black.
+        # Coefficient 0 is uniform light. The small summand keeps
+        # the weights above 0, even if the object is black.
         squared_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
         return SMOOTHNESS_WEIGHT * squared_brightness * (1 + (band * (band + 1)).square())
@@ -730,7 +746,8 @@ class _Descent:
         camera = self._first_camera
         right = camera.right / camera.width
         up = camera.up / camera.width
-        # Bounds of the parameters: polar angle, azimuth, relative width, right and up.
+        # Bounds of the parameters: polar angle,
+        # azimuth, relative width, right and up.
         lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
         polar = math.radians(camera.polar)
@@ -769,7 +786,8 @@ class _Descent:
             right=width * right,
             up=width * up,
         )
-        # The distance changes with the width, so that the field of view stays the same.
+        # The distance changes with the width, so
+        # that the field of view stays the same.
         if isinstance(moved, PerspectiveCamera):
             moved = replace(moved, distance=moved.distance * relative_width)
         return moved
@@ -832,11 +850,12 @@ def _fit_channels(
         channel, the expected light is zero.
     """
     regularized = normal_matrix + torch.diag(penalty)
-    # The brightest channel reflects most of a uniform light, which is coefficient 0.
+    # The brightest channel reflects most of a
+    # uniform light, which is coefficient 0.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
-    # The expected light of a channel is the multiple of `best_light` with the smallest
-    # squared error.
+    # The expected light of a channel is the multiple
+    # of `best_light` with the smallest squared error.
     squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
     factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
@@ -875,7 +894,8 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
         lower = np.linalg.cholesky(matrix)
         # L⁻¹ w is the value of y without constraints.
         unconstrained = solve_triangular(lower, right_side, lower=True)
-        # The columns of L⁻¹ Rᵀ are the vectors whose dot product with y must not be negative.
+        # The columns of L⁻¹ Rᵀ are the vectors whose
+        # dot product with y must not be negative.
         constraints = solve_triangular(lower, radiance_rows.T, lower=True)
         nearest = _nearest_in_cone(unconstrained, constraints)
         # The light is x = L⁻ᵀ y.
@@ -928,8 +948,9 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
-    # The product of column 0 and coefficient 0 is the mean radiance of the light. Reducing
-    # the column therefore subtracts the smallest allowed radiance.
+    # The product of column 0 and coefficient 0 is the
+    # mean radiance of the light. Reducing the column
+    # therefore subtracts the smallest allowed radiance.
     rows[:, 0] *= 1 - MIN_RADIANCE_RATIO
     return rows
 
@@ -949,14 +970,16 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
         Copy of the camera with another width, shift and, if it has perspective,
         distance.
     """
-    # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
+    # Bounding boxes in image coordinates from
+    # -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)
     mesh_high = points.max(0)
     mask_low, mask_high = _mask_box(mask)
     mesh_area = float(np.prod(mesh_high - mesh_low))
     mask_area = float(np.prod(mask_high - mask_low))
-    # A camera that is wider by this factor shows the mesh smaller by this factor.
+    # A camera that is wider by this factor
+    # shows the mesh smaller by this factor.
     factor = math.sqrt(mesh_area / mask_area)
     width = camera.width * factor
     mask_center = (mask_low + mask_high) / 2

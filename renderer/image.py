@@ -18,11 +18,14 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
 
-# Linear value at which the sRGB curve changes from a straight line to a power function.
+# Linear value at which the sRGB curve changes
+# from a straight line to a power function.
 SRGB_KNEE = 0.0031308
-# Encoded value at which the sRGB curve changes from a straight line to a power function.
+# Encoded value at which the sRGB curve changes
+# from a straight line to a power function.
 SRGB_ENCODED_KNEE = 0.04045
-# Weights of the linear red, green and blue in the luminance (Rec. 709, IEC 61966-2-1).
+# Weights of the linear red, green and blue
+# in the luminance (Rec. 709, IEC 61966-2-1).
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -83,7 +86,8 @@ def composite(
     """
     batch_shape = radiance.shape[:-2]
     backgrounds = background.expand(*batch_shape, *background.shape[-3:])
-    # The last axis is over the pixels of an image in row-major order, shape (..., 3, size²).
+    # The last axis is over the pixels of an image
+    # in row-major order, shape (..., 3, size²).
     background_pixels = backgrounds.flatten(-2)
     behind_mesh = background_pixels.index_select(-1, pixels)
     covered = tonemap(radiance, coverage[None], behind_mesh, encoding)
@@ -173,8 +177,9 @@ class _Clamp(torch.autograd.Function):
             Clamped values, same shape as `values`.
         """
         clamped = values.clamp(min=0).clamp_(max=ceiling)
-        # 1.0 for values that clamping did not change, and 0.0 for other values. A product
-        # with booleans would be several times slower than a product with numbers.
+        # 1.0 for values that clamping did not change, and 0.0
+        # for other values. A product with booleans would be
+        # several times slower than a product with numbers.
         is_unclamped = torch.eq(values, clamped, out=torch.empty_like(values))
         ctx.save_for_backward(is_unclamped)
         return clamped
@@ -214,8 +219,9 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
-    # The power function has an infinite derivative at 0. Without the lower limit, its gradient
-    # there would be NaN, although `torch.where` selects the straight line.
+    # The power function has an infinite derivative at 0.
+    # Without the lower limit, its gradient there would be
+    # NaN, although `torch.where` selects the straight line.
     curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 

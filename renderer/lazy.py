@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ast
 
-# Type checkers treat a variable with this name as True. Importing the variable from `typing`
-# would take longer than the rest of this module.
+# Type checkers treat a variable with this name as True. Importing the
+# variable from `typing` would take longer than the rest of this module.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable

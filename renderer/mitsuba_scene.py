@@ -50,17 +50,18 @@ from renderer.surface.texture_bake import with_added_albedo
 
 # Name of the file in which a Mitsuba scene is written.
 SCENE = "scene.xml"
-# Number of samples per pixel in Mitsuba. With 256 samples, the noise under smooth lighting
-# is below 1/255.
+# Number of samples per pixel in Mitsuba. With 256
+# samples, the noise under smooth lighting is below 1/255.
 SAMPLES = 256
-# Default variant of Mitsuba. It does not need the library LLVM, and renders the same bits
-# with any number of threads.
+# Default variant of Mitsuba. It does not need the library
+# LLVM, and renders the same bits with any number of threads.
 VARIANT = "scalar_rgb"
 # Variant of Mitsuba that computes gradients. It needs the library LLVM.
 DIFFERENTIABLE = "llvm_ad_rgb"
 # XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
-# XML tag in a Mitsuba scene file for an object of each type, such as an emitter for "envmap".
+# XML tag in a Mitsuba scene file for an object
+# of each type, such as an emitter for "envmap".
 PLUGIN_TAGS = {
     "path": "integrator",
     "direct": "integrator",
@@ -84,11 +85,12 @@ PLUGIN_TAGS = {
     "box": "rfilter",
     "multijitter": "sampler",
 }
-# Smallest number by which specular factors are divided. They are divided by the albedo scale,
-# which can be 0.
+# Smallest number by which specular factors are divided.
+# They are divided by the albedo scale, which can be 0.
 MIN_DIVISOR = 1e-6
-# Smallest parameter `specular` of Mitsuba's material "principled". With 0, metals would
-# reflect nothing. With 1e-4, the reflectance at normal incidence is 8e-6.
+# Smallest parameter `specular` of Mitsuba's material
+# "principled". With 0, metals would reflect nothing.
+# With 1e-4, the reflectance at normal incidence is 8e-6.
 MIN_SPECULAR = 1e-4
 
 
@@ -121,7 +123,8 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
             f"the variant {variant} of Mitsuba needs LLVM, which was not found ({error}): install "
             "libllvm19, or set DRJIT_LIBLLVM_PATH"
         ) from error
-    # Mitsuba needs two threads. With one, it would wait forever when it reads an .exr file.
+    # Mitsuba needs two threads. With one, it would
+    # wait forever when it reads an .exr file.
     drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
         yield module
@@ -143,7 +146,8 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
     """
     converted = dict(scene)
     for name, value in scene.items():
-        # A dictionary of the type "rgb" is a color, which Mitsuba itself converts.
+        # A dictionary of the type "rgb" is a
+        # color, which Mitsuba itself converts.
         if isinstance(value, dict) and value["type"] != "rgb":
             converted[name] = load(module, value)
         elif isinstance(value, np.ndarray):
@@ -269,8 +273,8 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
         no_added_albedo = np.zeros((len(mesh.faces), 3))
         mesh, _ = with_added_albedo(mesh, no_added_albedo, encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    # Faces with the same key become one part. The key is the index of the texture and, if the
-    # mesh has gloss, the three values of the gloss.
+    # Faces with the same key become one part. The key is the index of the
+    # texture and, if the mesh has gloss, the three values of the gloss.
     keys = mesh.texture_ids[:, None]
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
@@ -337,8 +341,8 @@ def shape(
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)
     buffers["faces"] = faces.astype(np.uint32).ravel()
-    # The texture coordinate v = 0 is the upper edge of a texture in Mitsuba, and the lower
-    # edge in our meshes.
+    # The texture coordinate v = 0 is the upper edge of a
+    # texture in Mitsuba, and the lower edge in our meshes.
     texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
     values_by_name = {"positions": positions, "normals": normals, "texcoords": texcoords}
     for name, values in values_by_name.items():
@@ -375,8 +379,9 @@ def write_mitsuba_scene(
     folder.mkdir(parents=True, exist_ok=True)
     local_emitters = _local_emitters(folder, local_lights, albedo_scale)
     sky = environment({"filename": light}, math.pi * albedo_scale)
-    # Rays with random directions from surfaces find the environment with little noise. The
-    # rays that are aimed at emitters are therefore all aimed at local lights, if there are any.
+    # Rays with random directions from surfaces find the environment
+    # with little noise. The rays that are aimed at emitters are
+    # therefore all aimed at local lights, if there are any.
     sky["sampling_weight"] = 0.0 if local_emitters else 1.0
     emitter_samples = 1 if local_emitters else 0
     sensors = []
@@ -509,14 +514,16 @@ class _PartWriter:
 
         part = self._part
         colors = self._albedo_factor * part.colors
-        # Texture coordinates u and v, red, green and blue of each corner, shape (3 F, 5).
+        # Texture coordinates u and v, red, green
+        # and blue of each corner, shape (3 F, 5).
         corner_values = np.concatenate([part.uvs, colors], axis=-1)
         corner_values = corner_values.reshape(-1, 5).astype(np.float32)
         surface = trimesh.Trimesh(
             part.positions.reshape(-1, 3),
             np.arange(len(corner_values)).reshape(-1, 3),
             vertex_normals=part.normals.reshape(-1, 3),
-            # Mitsuba reads the attributes u, v, r, g and b of the vertices of a .ply file.
+            # Mitsuba reads the attributes u, v, r, g
+            # and b of the vertices of a .ply file.
             vertex_attributes=dict(zip("uvrgb", corner_values.T, strict=True)),
             process=False,
         )
@@ -553,12 +560,14 @@ class _PartWriter:
             Entry of the material, of the type "principled".
         """
         roughness, metallic, specular_factor = gloss.tolist()
-        # A metal has no coat and needs the full albedo, but the albedo was multiplied by
-        # `_albedo_factor`. A larger value for metallic compensates for this.
+        # A metal has no coat and needs the full albedo, but
+        # the albedo was multiplied by `_albedo_factor`. A
+        # larger value for metallic compensates for this.
         metallic /= self._albedo_factor
-        # Mitsuba's reflectance at normal incidence is 0.08 · specular. It must be 0.04 times
-        # the specular factor, for a refractive index of 1.5. The lights of the scene are
-        # multiplied by the albedo scale, so the reflectance is divided by it.
+        # Mitsuba's reflectance at normal incidence is 0.08 · specular.
+        # It must be 0.04 times the specular factor, for a refractive
+        # index of 1.5. The lights of the scene are multiplied by the
+        # albedo scale, so the reflectance is divided by it.
         specular = specular_factor / 2 / max(self._albedo_scale, MIN_DIVISOR)
         return {
             "type": "principled",

@@ -27,11 +27,12 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 Array = NDArray[Any]
-# Smallest number of samples along one side of a pixel, if a window of a photograph is
-# resampled to pixels that are larger than those of the photograph.
+# Smallest number of samples along one side of a
+# pixel, if a window of a photograph is resampled to
+# pixels that are larger than those of the photograph.
 MIN_SAMPLES = 8
-# Number of additional rows and columns of pixels that are read on each side of a window. The
-# bicubic interpolation at the border of the window needs them.
+# Number of additional rows and columns of pixels that are read on each side of
+# a window. The bicubic interpolation at the border of the window needs them.
 BORDER = 2
 
 
@@ -72,9 +73,9 @@ class Photograph:
             homography = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
             return Window(homography, side, np.eye(3))
         height, width = self.pixels.shape[:2]
-        # Matrix from a direction (x, y, z) in the axes of the camera to the homogeneous
-        # position (column, row, 1) · (-z) in the photograph. The column is
-        # width / 2 - focal_length · x / z.
+        # Matrix from a direction (x, y, z) in the axes of the camera
+        # to the homogeneous position (column, row, 1) · (-z) in the
+        # photograph. The column is width / 2 - focal_length · x / z.
         to_pixels = np.array(
             [
                 [focal_length, 0, -width / 2],
@@ -89,8 +90,8 @@ class Photograph:
         right = np.cross(z_axis, back)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(back, right), back])
-        # The turned camera sees the point (x, y, 1) of the window in the direction
-        # (x, y, -focal_length).
+        # The turned camera sees the point (x, y, 1) of the
+        # window in the direction (x, y, -focal_length).
         to_direction = np.diag([1.0, 1.0, -focal_length])
         return Window(to_pixels @ axes.T @ to_direction, side, axes)
 
@@ -138,15 +139,17 @@ class Window:
         rectangle = self._needed_rectangle()
         pixels = rectangle.read(photograph, beyond)
         linear = decode(torch.from_numpy(pixels).permute(2, 0, 1) / 255, encoding)[None]
-        # If pixels become larger, their values are means over many samples, as with the box
-        # filter of the renderer. If they become smaller, the nearest pixel would make
+        # If pixels become larger, their values are means over
+        # many samples, as with the box filter of the renderer.
+        # If they become smaller, the nearest pixel would make
         # visible steps, so the values are interpolated.
         mode = "bicubic" if is_enlarged else "nearest"
         resolution = size * samples
-        # Positions of all samples along one side, in pixels from the window center.
+        # Positions of all samples along one side,
+        # in pixels from the window center.
         offsets = ((np.arange(resolution) + 0.5) / resolution - 0.5) * self.side
-        # Heights of samples above the window center, with one row for each row of pixels.
-        # The first row of pixels is at the top.
+        # Heights of samples above the window center, with one row for
+        # each row of pixels. The first row of pixels is at the top.
         heights = -offsets.reshape(size, samples)
         rows = []
         # Resampling one row of pixels at a time needs less memory.

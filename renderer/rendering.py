@@ -44,18 +44,18 @@ from renderer.visibility.rasterizers import choose
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair
-# with its coefficients.
+# Type of a local light for `render`: a `Lamps` or a
+# `Projector` object, alone or in a pair with its coefficients.
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
 # Words with which errors ask for the argument `lights` of `render`.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
-# Default camera for pictures of lights. It looks from the same direction as the first camera
-# of `orbit_cameras`.
+# Default camera for pictures of lights. It looks from the
+# same direction as the first camera of `orbit_cameras`.
 _OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)
-# Choosing the rasterizer "opengl" tests the graphics driver, which takes longer than
-# rendering an image. The choice is therefore cached.
+# Choosing the rasterizer "opengl" tests the graphics driver, which
+# takes longer than rendering an image. The choice is therefore cached.
 _choose = cache(choose)
 
 
@@ -162,8 +162,8 @@ def render(
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
-    # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with
-    # plain numbers instead of tensors.
+    # Rasterizing and ray tracing have no gradients, so they take
+    # a mesh and cameras with plain numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
     fixed_cameras = [camera.fixed() for camera in all_cameras]
     views = build_fragments(
@@ -175,7 +175,8 @@ def render(
         closed=mesh.closed,
     )
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
-    # Object that computes bounces and shadows of environment light. None without both.
+    # Object that computes bounces and shadows
+    # of environment light. None without both.
     transport = build_transport(moved_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
@@ -184,8 +185,8 @@ def render(
         indirect = None
         if transport:
             surface = Surface(moved_mesh, view, settings, given_gloss=gloss)
-            # Function of the albedo and the environment light. It returns the radiance that
-            # shadows and bounces add to the pixels.
+            # Function of the albedo and the environment light. It returns
+            # the radiance that shadows and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
         shaded_view = ShadedView(
             mesh=mesh,

@@ -32,7 +32,8 @@ from renderer.errors import (
 
 # Type variable for any settings class.
 Kind = TypeVar("Kind")
-# Value of the argument `default` of `setting` for a field that the user must set.
+# Value of the argument `default` of `setting`
+# for a field that the user must set.
 REQUIRED = MISSING
 
 # Allowed encodings of image values.
@@ -43,29 +44,31 @@ NORMALS = ("flat", "smooth")
 RASTERIZERS = ("auto", "opengl", "numba", "numpy")
 # Largest number of bounces of light between surfaces.
 MAX_BOUNCES = 100
-# Largest width and height of images in pixels that the settings of commands allow.
+# Largest width and height of images in
+# pixels that the settings of commands allow.
 MAX_SIZE = 4096
-# Largest number of samples in a row of an image. A square image then has at most a billion
-# samples.
+# Largest number of samples in a row of an image. A
+# square image then has at most a billion samples.
 MAX_SAMPLES_PER_ROW = 2**15
-# Default number of samples along one side of a pixel if gradients include visibility changes
-# at silhouettes. Other renders use fewer samples.
+# Default number of samples along one side of a pixel if gradients include
+# visibility changes at silhouettes. Other renders use fewer samples.
 SILHOUETTE_SAMPLES = 8
-# Largest number of samples along one side of a pixel. A pixel then has 4096 samples.
+# Largest number of samples along one side
+# of a pixel. A pixel then has 4096 samples.
 MAX_SAMPLES = 64
-# Largest degree of the spherical harmonics of a light. Highlights on surfaces with the smallest
-# allowed roughness, 0.2, need this degree.
+# Largest degree of the spherical harmonics of a light. Highlights on
+# surfaces with the smallest allowed roughness, 0.2, need this degree.
 MAX_DEGREE = 40
-# Smallest roughness of a surface. Highlights on smoother surfaces would need light of a higher
-# spherical-harmonic degree than MAX_DEGREE.
+# Smallest roughness of a surface. Highlights on smoother surfaces would
+# need light of a higher spherical-harmonic degree than MAX_DEGREE.
 MIN_ROUGHNESS = 0.2
 # Largest number of cameras on an orbit.
 MAX_VIEWS = 10**5
-# Largest number of vertices that `subdivide` can be asked to exceed. Such a mesh takes about 5 GB
-# of memory.
+# Largest number of vertices that `subdivide` can be asked
+# to exceed. Such a mesh takes about 5 GB of memory.
 MAX_VERTICES = 10**7
-# Smallest and largest turbidity (haziness) of the air for the skylight, from clear to hazy. Pure
-# air would have the turbidity 1.
+# Smallest and largest turbidity (haziness) of the air for the
+# skylight, from clear to hazy. Pure air would have the turbidity 1.
 TURBIDITY = (2.0, 10.0)
 
 
@@ -400,8 +403,8 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
             raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
 
 
-# Functions that tell whether a value is accepted for a field, by the type with which the
-# field is annotated.
+# Functions that tell whether a value is accepted for a
+# field, by the type with which the field is annotated.
 _CHECKS: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
     int: is_whole,

@@ -104,8 +104,8 @@ class ShadedView:
         Returns:
             Radiance, shape (3, P).
         """
-        # Autograd adds up gradients in the reverse of this order, so another order would
-        # change the last bits of gradients.
+        # Autograd adds up gradients in the reverse of this order,
+        # so another order would change the last bits of gradients.
         summands = [
             self._environment_radiance(self.fragments),
             self._indirect_radiance(),
@@ -211,7 +211,8 @@ class ShadedView:
             silhouettes may move.
         """
         fragments = self.fragments
-        # Each sample becomes a pixel of a finer image, so that it is shaded alone.
+        # Each sample becomes a pixel of a finer
+        # image, so that it is shaded alone.
         finer_fragments = fragments.by_sample()
         summands = [
             self._environment_radiance(finer_fragments),
@@ -221,7 +222,8 @@ class ShadedView:
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2
-        # Radiance of each sample as a constant, through which no gradients flow.
+        # Radiance of each sample as a constant,
+        # through which no gradients flow.
         sample_radiance = at_samples.detach()
         indirect = self._indirect_radiance()
         if indirect is not None:

@@ -19,11 +19,11 @@ from torch import Tensor
 
 from renderer.errors import InputError, describe, is_flag, is_number
 
-# Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" is a signed
-# integer, and "u" is an unsigned integer.
+# Values of `dtype.kind` for arrays of real numbers: "f" is
+# floating-point, "i" is a signed integer, and "u" is an unsigned integer.
 _NUMBERS = "fiu"
-# Number of bytes of a float64 number. NumPy also has larger floating-point numbers, which
-# torch cannot read.
+# Number of bytes of a float64 number. NumPy also has
+# larger floating-point numbers, which torch cannot read.
 _FLOAT64_BYTES = 8
 
 
@@ -117,7 +117,8 @@ def _as_numbers(value: object) -> np.ndarray | None:
         Contiguous array, or None if the value contains anything but real numbers,
         or lists of unequal lengths.
     """
-    # NumPy calls methods of the value, such as `__array__`. They can raise any exception.
+    # NumPy calls methods of the value, such as
+    # `__array__`. They can raise any exception.
     try:
         array = np.asarray(value)
     except Exception:
@@ -127,7 +128,8 @@ def _as_numbers(value: object) -> np.ndarray | None:
     if array.dtype.kind == "f" and array.dtype.itemsize > _FLOAT64_BYTES:
         array = array.astype(np.float64)
     native_dtype = array.dtype.newbyteorder("=")
-    # `reshape` is needed because ascontiguousarray changes the shape () to (1,).
+    # `reshape` is needed because ascontiguousarray
+    # changes the shape () to (1,).
     return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
 
 
@@ -189,7 +191,8 @@ def as_folder(name: str, value: object) -> Path:
     for ancestor in (path, *path.absolute().parents):
         if not os.path.lexists(ancestor):
             continue
-        # `exists` is False for a symbolic link without a target, which is no file.
+        # `exists` is False for a symbolic link
+        # without a target, which is no file.
         if ancestor.exists() and not ancestor.is_dir():
             raise InputError(
                 f"{name}={path} cannot be a folder, because {ancestor} is a file: give the path of "
@@ -217,7 +220,8 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
     Raises:
         InputError: If the value is not a list, or if an item has another type.
     """
-    # The types Tensor and np.ndarray are iterable, but a value of shape () has no items.
+    # The types Tensor and np.ndarray are iterable,
+    # but a value of shape () has no items.
     is_scalar = isinstance(value, Tensor | np.ndarray) and not value.ndim
     is_unordered_or_text = isinstance(value, str | bytes | Mapping | Set)
     if is_scalar or is_unordered_or_text or not isinstance(value, Iterable):

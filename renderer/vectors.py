@@ -140,8 +140,9 @@ def rotation_matrices(vectors: Tensor) -> Tensor:
     """
     radians = torch.deg2rad(vectors)
     axes = torch.eye(3).to(radians).expand(*radians.shape, 3)
-    # Row i is the cross product of the rotation vector and the unit vector of axis i.
+    # Row i is the cross product of the rotation
+    # vector and the unit vector of axis i.
     cross_products = torch.linalg.cross(radians[..., None, :].expand_as(axes), axes)
-    # The transposed matrix times a vector p is the cross product of the rotation vector
-    # and p. The exponential of this matrix is the rotation.
+    # The transposed matrix times a vector p is the cross product of the
+    # rotation vector and p. The exponential of this matrix is the rotation.
     return torch.matrix_exp(cross_products.mT)

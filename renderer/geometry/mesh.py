@@ -24,13 +24,14 @@ from renderer.geometry.skin import Skin
 from renderer.settings import MAX_VERTICES
 from renderer.validation import as_array, require_whole
 
-# Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes
-# from files in which y points up to our axes, in which z points up.
+# Affine matrix, shape (4, 4), that rotates the y-axis
+# to the z-axis. It converts meshes from files in
+# which y points up to our axes, in which z points up.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
-# Allowed types of each array of a mesh, as values of `dtype.kind`: f is floating-point,
-# i is a signed integer, and u is an unsigned integer.
+# Allowed types of each array of a mesh, as values of `dtype.kind`: f is
+# floating-point, i is a signed integer, and u is an unsigned integer.
 _KINDS = {
     "vertices": "fiu",
     "faces": "iu",
@@ -43,16 +44,17 @@ _KINDS = {
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
-# Corners of the four triangles into which a triangle is divided. Points 0, 1 and 2 are
-# its corners. Points 3, 4 and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
+# Corners of the four triangles into which a triangle is
+# divided. Points 0, 1 and 2 are its corners. Points 3, 4
+# and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
 # Roughness, metallic and specular factor of a face without specular reflection.
 _MATTE = np.array([[1, 0, 0]], dtype=np.float32)
-# Gloss texture with one texel that leaves roughness and metallic unchanged. The stored
-# value 255 means the factor 1.
+# Gloss texture with one texel that leaves roughness and
+# metallic unchanged. The stored value 255 means the factor 1.
 _NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
-# Factors that pack the red, green and blue bytes of a texel into one integer: red in
-# bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
+# Factors that pack the red, green and blue bytes of a texel into one integer:
+# red in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
 _PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
 
 
@@ -111,7 +113,8 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Convert lists to arrays, and check the shapes, types and indices in all fields."""
-        # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
+        # A frozen dataclass forbids assignments,
+        # so fields are set by object.__setattr__.
         for name, kinds in _KINDS.items():
             value = getattr(self, name)
             is_matte = name == "gloss" and value is None
@@ -182,8 +185,9 @@ class Mesh:
         """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
         given_faces = as_array("faces", faces)
-        # astype turns NaN into an arbitrary integer, with a warning. The warning is
-        # suppressed, because the comparison below finds the difference.
+        # astype turns NaN into an arbitrary integer, with
+        # a warning. The warning is suppressed, because
+        # the comparison below finds the difference.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
@@ -194,8 +198,8 @@ class Mesh:
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
         try:
             vertex_colors = np.broadcast_to(color, vertices.shape)
-            # Vertex indices out of range are clipped, because `Mesh(...)` below raises
-            # a better error than `take` would.
+            # Vertex indices out of range are clipped, because
+            # `Mesh(...)` below raises a better error than `take` would.
             corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(
@@ -252,8 +256,8 @@ class Mesh:
             Copy of the mesh, which shares the packed textures with this mesh.
         """
         moved_mesh = replace(self, vertices=vertices, skin=None)
-        # Packing the textures again would take long. A cached property stores its value
-        # in `__dict__`.
+        # Packing the textures again would take long. A
+        # cached property stores its value in `__dict__`.
         moved_mesh.__dict__["packed_textures"] = self.packed_textures
         return moved_mesh
 
@@ -282,15 +286,16 @@ class Mesh:
         centered_vertices = self.vertices - self.vertices.mean(axis=0)
         first_corners = centered_vertices[self.faces[:, 0]]
         doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
-        # Six times the volume of the tetrahedron of each face and the mesh center,
-        # shape (F,). It is negative if the face is turned toward the center.
+        # Six times the volume of the tetrahedron of each
+        # face and the mesh center, shape (F,). It is
+        # negative if the face is turned toward the center.
         sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
         volume_of_part = np.bincount(part_of_face, sixfold_volumes)
         return bool((volume_of_part > 0).all())
 
 
-# The result for the last mesh is cached. The next mesh often has the same faces, for
-# example if it is another instance of the same procedural solid.
+# The result for the last mesh is cached. The next mesh often has the same
+# faces, for example if it is another instance of the same procedural solid.
 @lru_cache(maxsize=1)
 def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
     """Find the connected parts of a mesh, all of which must be closed surfaces.
@@ -307,8 +312,8 @@ def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
     from trimesh.graph import connected_component_labels
 
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    # First and last vertex of each edge of each face, shape (3 F, 2). The edges in
-    # rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
+    # First and last vertex of each edge of each face, shape (3 F, 2).
+    # The edges in rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
     edge_ends = faces[:, EDGES].reshape(-1, 2)
     vertex_count = faces.max(initial=0) + 1
     # An edge from vertex a to vertex b gets the key a · V + b, for V vertices.
@@ -319,13 +324,13 @@ def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
     reversed_key_order = np.argsort(reversed_keys)
     sorted_keys = keys[key_order]
     is_repeated = (np.diff(sorted_keys) == 0).any()
-    # Each edge of a closed surface occurs once in each direction, so the set of keys
-    # equals the set of reversed keys.
+    # Each edge of a closed surface occurs once in each direction,
+    # so the set of keys equals the set of reversed keys.
     if is_repeated or not np.array_equal(sorted_keys, reversed_keys[reversed_key_order]):
         return None
-    # Both orders list the edges by the same keys, so entry i of the first order and
-    # entry i of the second one are the same edge in two neighboring faces. The edge in
-    # row r belongs to face r // 3.
+    # Both orders list the edges by the same keys, so entry i of the
+    # first order and entry i of the second one are the same edge in
+    # two neighboring faces. The edge in row r belongs to face r // 3.
     neighboring_faces = np.stack([key_order, reversed_key_order], axis=1) // 3
     return connected_component_labels(neighboring_faces, node_count=len(faces))
 
@@ -392,8 +397,8 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """
     faces = []
     texture_ids = []
-    # Numbers of vertices and textures of the meshes before the mesh of the loop. The
-    # indices of this mesh grow by these numbers.
+    # Numbers of vertices and textures of the meshes before the mesh
+    # of the loop. The indices of this mesh grow by these numbers.
     vertex_count = 0
     texture_count = 0
     for mesh in meshes:
@@ -630,8 +635,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
-    # The vertex indices of the small faces are valid in the divided mesh, too, because it
-    # has all old vertices.
+    # The vertex indices of the small faces are valid in the
+    # divided mesh, too, because it has all old vertices.
     arrays: dict[str, Any] = {}
     for name in PER_FACE:
         rows_of_small_faces = getattr(small_faces, name)
@@ -681,7 +686,8 @@ def _quartered(mesh: Mesh) -> Mesh:
         skin = replace(skin, carried=np.concatenate([skin.carried, midpoint_shares]))
     # The midpoints follow the old vertices, so their indices begin at V.
     midpoint_vertices = len(mesh.vertices) + edge_of_side
-    # Vertices of the three corners and of the three midpoints of each face, shape (F, 6).
+    # Vertices of the three corners and of the
+    # three midpoints of each face, shape (F, 6).
     points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
     return replace(
         mesh,
@@ -710,8 +716,8 @@ def _shared_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     vertex_count = len(mesh.vertices)
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
-    # A side from vertex a to vertex b gets the key a · V + b, for V vertices. np.unique
-    # sorts these numbers faster than pairs of vertices.
+    # A side from vertex a to vertex b gets the key a · V + b, for V
+    # vertices. np.unique sorts these numbers faster than pairs of vertices.
     side_keys = side_ends @ [vertex_count, 1]
     edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
     # Dividing the key a · V + b by V gives the quotient a and the remainder b.
@@ -733,9 +739,11 @@ def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
         Values at the three corners of each of the four parts of each face, in the
         order of `_QUARTERS`, shape (4 F, 3, D).
     """
-    # Values at both ends of each edge of each face, shape (F, 3 edges, 2 ends, D).
+    # Values at both ends of each edge of each
+    # face, shape (F, 3 edges, 2 ends, D).
     edge_values = corner_values[:, EDGES]
     midpoint_values = edge_values.mean(axis=2)
-    # Values at the three corners and the three midpoints of each face, shape (F, 6, D).
+    # Values at the three corners and the three
+    # midpoints of each face, shape (F, 6, D).
     point_values = np.concatenate([corner_values, midpoint_values], axis=1)
     return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])

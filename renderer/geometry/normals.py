@@ -24,19 +24,20 @@ from renderer.vectors import unit
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
-# `vertex_normals` adds up the area vectors of the faces around a vertex. They cancel
-# if their sum is shorter than this fraction of the sum of their lengths. Such a short
-# sum consists of rounding errors only.
+# `vertex_normals` adds up the area vectors of the faces around a vertex.
+# They cancel if their sum is shorter than this fraction of the sum of
+# their lengths. Such a short sum consists of rounding errors only.
 CANCELLATION = 64 * torch.finfo(torch.float64).eps
-# Ratio of the vertices of a mesh to the corners of the given faces. From this ratio on, it
-# is faster to process only the vertices of these faces than all vertices of the mesh.
+# Ratio of the vertices of a mesh to the corners of the given
+# faces. From this ratio on, it is faster to process only the
+# vertices of these faces than all vertices of the mesh.
 SPARSE_VERTEX_RATIO = 2
-# A triangle counts as a sliver if the sine of the angle at its first corner is at most
-# this number. Below it, a plain float64 cross product of the two edges would have a
-# rounding error of more than about 64 units in the last place.
+# A triangle counts as a sliver if the sine of the angle at its first corner is
+# at most this number. Below it, a plain float64 cross product of the two edges
+# would have a rounding error of more than about 64 units in the last place.
 MAX_SLIVER_SINE = 1 / 16
-# `_halves` multiplies a float64 number by this constant to split its 53 binary digits
-# into two halves (Dekker 1971).
+# `_halves` multiplies a float64 number by this constant to
+# split its 53 binary digits into two halves (Dekker 1971).
 _SPLITTER = 2.0**27 + 1
 
 
@@ -89,8 +90,9 @@ def vertex_normals(
     Raises:
         InputError: If a position is NaN or infinite.
     """
-    # Each corner of a face gets the area vector of the face, shape (3 components,
-    # 3 F corners). The F first corners come first, then all second and third corners.
+    # Each corner of a face gets the area vector of the
+    # face, shape (3 components, 3 F corners). The F first
+    # corners come first, then all second and third corners.
     corner_vectors = area_vectors(vertices, faces).repeat(1, 3)
     vertex_of_corner = faces.T.flatten()
     zero_vectors = corner_vectors.new_zeros(3, len(vertices))
@@ -137,9 +139,9 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
-    # The edge a leads from the first corner of a face to the second corner, and the
-    # edge b to the third corner. The cross product a × b is written out, because
-    # np.cross is several times slower.
+    # The edge a leads from the first corner of a face to the second
+    # corner, and the edge b to the third corner. The cross product a
+    # × b is written out, because np.cross is several times slower.
     ax, ay, az = corners[:, 1] - corners[:, 0]
     bx, by, bz = corners[:, 2] - corners[:, 0]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
@@ -231,10 +233,11 @@ class _AreaVectors(torch.autograd.Function):
             Area vectors, float64, shape (3, F).
         """
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
-        # Positions of the corners of F faces, shape (3 components, 3 corners, F).
+        # Positions of the corners of F faces,
+        # shape (3 components, 3 corners, F).
         corners = corners.unflatten(1, (3, -1))
-        # The edges from the first corner of each face to the second and the third
-        # corner, shape (3 components, 2 edges, F).
+        # The edges from the first corner of each face to the second
+        # and the third corner, shape (3 components, 2 edges, F).
         edges = corners[:, 1:] - corners[:, :1]
         # Products of edges overflow only if the positions are float64.
         is_float64 = vertices.dtype == torch.float64
@@ -242,7 +245,8 @@ class _AreaVectors(torch.autograd.Function):
         edge_u, edge_v = edges.div_(scale).unbind(1)
         area_vectors = _cross(edge_u, edge_v)
         squared_u, squared_v = edges.square().sum(0)
-        # The length |u × v| is |u| |v| times the sine of the angle between u and v.
+        # The length |u × v| is |u| |v| times the
+        # sine of the angle between u and v.
         max_squared_length = MAX_SLIVER_SINE**2 * squared_u * squared_v
         is_sliver = area_vectors.square().sum(0) <= max_squared_length
         slivers = torch.nonzero(is_sliver).squeeze(1)
@@ -269,15 +273,16 @@ class _AreaVectors(torch.autograd.Function):
             the faces have no gradient.
         """
         faces, edge_u, edge_v, scale = ctx.saved_tensors
-        # With g for `upstream`, the gradient of g · (u × v) is v × g with respect to u,
-        # and g × u with respect to v. The edge u ends at the second corner, and the edge
-        # v at the third corner.
+        # With g for `upstream`, the gradient of g · (u × v) is v × g
+        # with respect to u, and g × u with respect to v. The edge u
+        # ends at the second corner, and the edge v at the third corner.
         second_corner_gradient = _cross(edge_v, upstream)
         third_corner_gradient = _cross(upstream, edge_u)
-        # The first corner is the start of both edges, so the signs are reversed.
+        # The first corner is the start of both
+        # edges, so the signs are reversed.
         first_corner_gradient = -second_corner_gradient - third_corner_gradient
-        # Shape (3 components, 3 F corners): all first corners, then all second and
-        # all third corners.
+        # Shape (3 components, 3 F corners): all first
+        # corners, then all second and all third corners.
         corner_gradients = torch.cat(
             [first_corner_gradient, second_corner_gradient, third_corner_gradient], dim=1
         )
@@ -305,8 +310,8 @@ def _sum_at_vertices(
     if vertex_count < SPARSE_VERTEX_RATIO * len(vertex_of_corner):
         zeros = corner_gradients.new_zeros(3, vertex_count)
         return zeros.index_add_(1, vertex_of_corner, corner_gradients).to(dtype)
-    # Most vertices have no face here. Adding up the gradients of the other vertices
-    # alone avoids a float64 tensor of the size of the mesh.
+    # Most vertices have no face here. Adding up the gradients of the other
+    # vertices alone avoids a float64 tensor of the size of the mesh.
     used_vertices, corner_to_used = vertex_of_corner.unique(return_inverse=True)
     zeros = corner_gradients.new_zeros(3, len(used_vertices))
     sums = zeros.index_add_(1, corner_to_used, corner_gradients)
@@ -383,7 +388,8 @@ def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     v, v_error = _difference(c, a)
     ux, uy, uz = u
     vx, vy, vz = v
-    # The components of u × v, with the rounding errors of the products added back.
+    # The components of u × v, with the rounding
+    # errors of the products added back.
     x = _difference_of_products(uy, vz, uz, vy)
     y = _difference_of_products(uz, vx, ux, vz)
     z = _difference_of_products(ux, vy, uy, vx)
@@ -431,7 +437,8 @@ def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     rounded = a * b
     a_high, a_low = _halves(a)
     b_high, b_low = _halves(b)
-    # Subtract `rounded` from the four products of halves, the largest product first.
+    # Subtract `rounded` from the four products
+    # of halves, the largest product first.
     error = (a_high * b_high - rounded) + a_high * b_low + a_low * b_high
     return rounded, error + a_low * b_low
 

@@ -59,13 +59,14 @@ class Skin:
         Returns:
             Displacements of the vertices in the axes of the mesh, shape (V, 3).
         """
-        # Subtracting the identity from the matrix of a joint gives a matrix that maps a
-        # point (x, y, z, 1) to its displacement.
+        # Subtracting the identity from the matrix of a joint gives a
+        # matrix that maps a point (x, y, z, 1) to its displacement.
         identity = torch.eye(4, 3).to(rotations)
         joint_matrices = torch.stack(self._joint_matrices(rotations))
         # Matrices of the J joints, one below the other, shape (4 J, 3).
         displacement_matrix = (joint_matrices - identity).flatten(0, 1)
-        # Each row has the shares of all joints in the position of a vertex, shape (V, 4 J).
+        # Each row has the shares of all joints in
+        # the position of a vertex, shape (V, 4 J).
         carried = torch.from_numpy(self.carried).to(rotations).flatten(1)
         # The matrix product adds up the displacements by all joints.
         return carried @ displacement_matrix
@@ -88,10 +89,12 @@ class Skin:
             translation = pivot - rotation @ pivot
             matrix = torch.cat([rotation.T, translation[None]])
             if parent != NO_PARENT:
-                # The parent rotates and shifts the points that the joint has moved.
+                # The parent rotates and shifts the points
+                # that the joint has moved.
                 parent_rotation = matrices[parent][:3]
                 parent_translation = matrices[parent][3:]
-                # Three rows of zeros above the translation give the shape (4, 3).
+                # Three rows of zeros above the
+                # translation give the shape (4, 3).
                 padded_translation = torch.nn.functional.pad(parent_translation, (0, 0, 3, 0))
                 matrix = matrix @ parent_rotation + padded_translation
             matrices.append(matrix)

@@ -17,12 +17,14 @@ from renderer.camera import PinholeCamera
 from renderer.errors import InputError, require_file
 from renderer.validation import as_path
 
-# Names of the text files in which COLMAP stores cameras and the poses of images.
+# Names of the text files in which COLMAP
+# stores cameras and the poses of images.
 COLMAP_CAMERAS = "cameras.txt"
 COLMAP_IMAGES = "images.txt"
 # Name of the file in which nerfstudio stores cameras.
 TRANSFORMS = "transforms.json"
-# COLMAP's camera models without lens distortion, with their numbers of parameters.
+# COLMAP's camera models without lens
+# distortion, with their numbers of parameters.
 COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 # Names of the parameters of lens distortion in transforms.json.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -92,7 +94,8 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
     """
     cameras_path = folder / COLMAP_CAMERAS
     require_file(cameras_path, "give a folder with cameras.txt and images.txt")
-    # Intrinsic matrix and image size (width, height) of each camera by its id in the file.
+    # Intrinsic matrix and image size (width, height)
+    # of each camera by its id in the file.
     intrinsics_and_size = {}
     cameras = {}
     # The error below names the file that is being read.
@@ -171,7 +174,8 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     values = [float(parameter) for parameter in parameters]
     if len(values) != COLMAP_PARAMETERS[model]:
         raise ValueError(f"{model} with {len(values)} parameters")
-    # PINHOLE has the focal lengths (fx, fy), and SIMPLE_PINHOLE has one for both axes.
+    # PINHOLE has the focal lengths (fx, fy),
+    # and SIMPLE_PINHOLE has one for both axes.
     *focal_lengths, center_x, center_y = values
     return _intrinsic_matrix(focal_lengths[0], focal_lengths[-1], center_x, center_y)
 
@@ -186,7 +190,8 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
         Rotation matrix, shape (3, 3).
     """
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    # The product of this matrix and a vector is the cross product of (x, y, z) and the vector.
+    # The product of this matrix and a vector is the
+    # cross product of (x, y, z) and the vector.
     cross_matrix = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross_matrix + 2 * cross_matrix @ cross_matrix
 
@@ -228,7 +233,8 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
     try:
         scene = json.loads(path.read_text(encoding="utf-8-sig"))
         for frame in scene["frames"]:
-            # A frame is an image of the scene. Its entries override those of the scene.
+            # A frame is an image of the scene. Its
+            # entries override those of the scene.
             intrinsics, size = _transforms_intrinsics({**scene, **frame})
             # Matrix from camera coordinates to world coordinates, shape (4, 4).
             camera_to_world = np.array(frame["transform_matrix"], dtype=float)
@@ -265,8 +271,9 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
             f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
             f"supported: {UNDISTORT}"
         )
-    # A file with square images may have a field of view, but no image size. The focal length
-    # and the principal point are then computed for an image of one pixel.
+    # A file with square images may have a field of view,
+    # but no image size. The focal length and the principal
+    # point are then computed for an image of one pixel.
     width = int(entries.get("w", 1))
     height = int(entries.get("h", width))
     if "fl_x" in entries:

@@ -21,17 +21,20 @@ from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
-    # Importing trimesh takes half a second, so the functions that need it import it.
+    # Importing trimesh takes half a second,
+    # so the functions that need it import it.
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
-# Temporary names of the vertex attributes for colors and normals. trimesh writes attributes
-# whose names begin with an underscore without changing their values. Before the file is
-# written, `_as_one_mesh` renames the attributes to COLOR_0 and NORMAL.
+# Temporary names of the vertex attributes for colors and normals.
+# trimesh writes attributes whose names begin with an underscore
+# without changing their values. Before the file is written,
+# `_as_one_mesh` renames the attributes to COLOR_0 and NORMAL.
 _COLOR = "_COLOR_0"
 _NORMAL = "_NORMAL"
-# Name of the specular factor of a material in glTF. trimesh cannot write this factor. It is
-# first appended to the name of the material, and `_as_one_mesh` moves it to its place.
+# Name of the specular factor of a material in glTF. trimesh
+# cannot write this factor. It is first appended to the name
+# of the material, and `_as_one_mesh` moves it to its place.
 SPECULAR = "specularFactor"
 # Roughness and metallic of a material without specular reflection.
 MATTE = (1.0, 0.0)
@@ -107,8 +110,9 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
 
     first_count = len(mesh.faces) if first is None else first
     is_later = np.arange(len(mesh.faces)) >= first_count
-    # Faces with the same key are written together. The key is the flag `is_later`, the
-    # index of the texture and, if the mesh has gloss, the three values of the gloss.
+    # Faces with the same key are written together. The key
+    # is the flag `is_later`, the index of the texture and,
+    # if the mesh has gloss, the three values of the gloss.
     keys = np.stack([is_later, mesh.texture_ids], axis=1)
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
@@ -157,12 +161,14 @@ def _part_for_trimesh(
 
     colors = mesh.corner_colors[is_in_part]
     uvs = mesh.corner_uvs[is_in_part]
-    # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
+    # Eight values for each corner: color (3),
+    # texture coordinates (2) and normal (3).
     corner_values = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
     vertex_ids, values, faces = _split_vertices(mesh.faces[is_in_part], corner_values)
     linear_colors = decode(torch.from_numpy(values[:, :3]), "srgb")
     y_up_to_z_up = Y_UP_TO_Z_UP[:3, :3]
-    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
+    # A row vector times this matrix is rotated in
+    # the opposite direction: from z up to y up.
     positions = mesh.vertices[vertex_ids] @ y_up_to_z_up
     rotated_normals = values[:, 5:] @ y_up_to_z_up
     return trimesh.Trimesh(
@@ -195,11 +201,11 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
         texture = Image.fromarray(mesh.textures[surface.texture_id])
         if mesh.gloss_textures:
             factors = mesh.gloss_textures[surface.texture_id]
-            # glTF stores roughness in green and metallic in blue, so an empty red channel
-            # is inserted.
+            # glTF stores roughness in green and metallic
+            # in blue, so an empty red channel is inserted.
             gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
-    # Materials need different names. Otherwise trimesh would merge two images with the same
-    # bytes, even if their widths and heights differ.
+    # Materials need different names. Otherwise trimesh would merge two
+    # images with the same bytes, even if their widths and heights differ.
     name = f"texture {surface.texture_id}"
     roughness, metallic = MATTE
     if surface.gloss:
@@ -297,8 +303,9 @@ def _split_vertices(
         - the values of the new vertices, shape (N, D);
         - the faces with indices of new vertices, shape (F, 3).
     """
-    # Corners with the same key become one new vertex. The key of a corner is its original
-    # vertex, followed by its values. Converting the index to float64 does not round it.
+    # Corners with the same key become one new vertex. The key
+    # of a corner is its original vertex, followed by its
+    # values. Converting the index to float64 does not round it.
     keys = np.concatenate([faces[..., None], corner_values], axis=-1)
     corner_keys = keys.reshape(-1, keys.shape[-1])
     vertex_keys, corner_to_vertex = np.unique(corner_keys, axis=0, return_inverse=True)

@@ -12,8 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-# Pattern for the names of temporary files. The new content of a file is first written to a
-# temporary file in the same folder, which then replaces the old file.
+# Pattern for the names of temporary files. The new
+# content of a file is first written to a temporary file
+# in the same folder, which then replaces the old file.
 TEMPORARY = ".pnb-*.tmp"
 
 
@@ -52,15 +53,16 @@ def replacing(
         if previous and target.exists():
             os.replace(target, previous)
         os.replace(temporary, target)
-        # The folder stores the name of the file, so the folder must be flushed, too. Only
-        # POSIX systems can flush folders.
+        # The folder stores the name of the file, so the folder must
+        # be flushed, too. Only POSIX systems can flush folders.
         if durable and os.name == "posix":
             _flush(target.parent)
     except OSError as error:
         # An error of a library has no error number, and is raised as it is.
         if error.errno is None:
             raise
-        # An error of the system names the temporary file. The new error names `path`.
+        # An error of the system names the temporary
+        # file. The new error names `path`.
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):
@@ -112,8 +114,8 @@ def _require_replaceable(target: Path) -> None:
     if not target.is_file():
         number = errno.EISDIR if target.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number))
-    # `os.replace` would replace a read-only file. Opening the file for appending raises an
-    # error if the file is read-only, and changes nothing.
+    # `os.replace` would replace a read-only file. Opening the file for
+    # appending raises an error if the file is read-only, and changes nothing.
     with target.open("ab"):
         pass
 

@@ -15,8 +15,9 @@ from renderer.io.files import atomic_write
 
 # Suffixes of the files in a folder that count as images.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-# A large JPEG file is decoded at a reduced size before it is resized to a small square. The
-# sides of the decoded image are at least this many times as long as those of the square.
+# A large JPEG file is decoded at a reduced size before it is
+# resized to a small square. The sides of the decoded image
+# are at least this many times as long as those of the square.
 MIN_DECODED_RATIO = 16
 
 
@@ -72,7 +73,8 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
     try:
         gray = float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
-        # NaN means that the choice is not a number. It may be the path of a file.
+        # NaN means that the choice is not a
+        # number. It may be the path of a file.
         gray = math.nan
     if math.isnan(gray) and isinstance(choice, str | Path):
         try:
@@ -158,8 +160,8 @@ def eight_bits(image: Image.Image) -> Image.Image:
     if image.mode == "F":
         raise ValueError("the pixels are floating-point numbers, so the value of white is unknown")
     if image.mode.startswith("I"):
-        # Pixels of the mode "I" have 16 bits. `Image.convert` would clip their values at
-        # 255 instead of dividing them by 256.
+        # Pixels of the mode "I" have 16 bits. `Image.convert` would
+        # clip their values at 255 instead of dividing them by 256.
         scaled = np.clip(np.asarray(image) // 256, 0, 255)
         return Image.fromarray(scaled.astype(np.uint8))
     image.load()

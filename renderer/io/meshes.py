@@ -35,27 +35,29 @@ from renderer.io.images import eight_bits
 from renderer.io.skins import skinned, with_skins_as_attributes
 from renderer.validation import as_path, require_flag
 
-# Suffixes of archive files, which are not read. trimesh could read them, but the names of
-# the files inside an archive cannot be checked first.
+# Suffixes of archive files, which are not read. trimesh could read them,
+# but the names of the files inside an archive cannot be checked first.
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 # Pattern for the lines of .mtl files that define a material.
 DEFINED_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 # Pattern for the lines of .obj files that use a material.
 USED_MATERIAL = re.compile(rb"^[ \t]*usemtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-# Pattern for the messages in trimesh's log that say that trimesh left out an image, a
-# material or something else of a file. For .obj, .ply and .dae files, only the log tells.
+# Pattern for the messages in trimesh's log that say that
+# trimesh left out an image, a material or something else of
+# a file. For .obj, .ply and .dae files, only the log tells.
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")
 # Number that stands for the type float32 in glTF 2.0 (section 3.6.2.2).
 FLOAT = 5126
-# Numbers for the kinds of glTF primitives that consist of triangles (glTF 2.0, section
-# 5.24.4): separate triangles, triangle strips and triangle fans.
+# Numbers for the kinds of glTF primitives that consist
+# of triangles (glTF 2.0, section 5.24.4): separate
+# triangles, triangle strips and triangle fans.
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
 # Name of the glTF extension that shifts, scales or rotates a texture.
 TRANSFORM = "KHR_texture_transform"
-# Beginnings of the names of glTF extensions that a reader may ignore, because they do not
-# change the shape of a mesh.
+# Beginnings of the names of glTF extensions that a reader
+# may ignore, because they do not change the shape of a mesh.
 HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
 
 
@@ -109,8 +111,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     if not placed_parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _merge_vertices(concatenate(placed_parts))
-    # The matrices of a scene may have huge numbers or NaN. A comparison with NaN is False,
-    # so `not` also finds NaN.
+    # The matrices of a scene may have huge numbers or NaN. A
+    # comparison with NaN is False, so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
         raise InputError(
             f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: "
@@ -134,7 +136,8 @@ def _merge_vertices(mesh: Mesh) -> Mesh:
     vertex_keys = mesh.vertices
     skin = mesh.skin
     if skin is not None:
-        # The key also has a number. It is the same for vertices that all joints move alike.
+        # The key also has a number. It is the same
+        # for vertices that all joints move alike.
         distinct_shares, shares_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
         vertex_keys = np.column_stack([vertex_keys, shares_of_vertex.ravel()])
     corner_keys = vertex_keys[mesh.faces].reshape(-1, vertex_keys.shape[1])
@@ -217,8 +220,8 @@ def _read_parts(
             continue
         part = _as_mesh(geometry, linear)
         parts[name] = _with_gloss(part, geometry.visual, specular_factors) if gloss else part
-    # trimesh skips a glTF image that it cannot read, and reports no error. Such a file then
-    # has too few textures.
+    # trimesh skips a glTF image that it cannot read, and
+    # reports no error. Such a file then has too few textures.
     if sum(len(part.textures) for part in parts.values()) < textured_count:
         raise ValueError("the image of a texture is missing, or cannot be decoded")
     placed_parts = []
@@ -268,7 +271,8 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
             Path(self.parent, Path(relative_path).name),
         )
         for file in candidates:
-            # `is_file` is False for a named pipe. Reading a pipe might never end.
+            # `is_file` is False for a named pipe.
+            # Reading a pipe might never end.
             if file.is_file() and file.suffix.lower() == ".mtl":
                 self.materials = _as_utf8(file.read_bytes())
                 return self.materials
@@ -380,12 +384,12 @@ def _gltf_tree(content: bytes) -> dict[str, Any]:
         struct.error: If a .glb file is too short.
     """
     if content.startswith(b"glTF"):
-        # A .glb file begins with a header of 12 bytes. Then come the length of the
-        # JSON text (4 bytes), its type (4 bytes), and the JSON text itself.
+        # A .glb file begins with a header of 12 bytes. Then come the length of
+        # the JSON text (4 bytes), its type (4 bytes), and the JSON text itself.
         (json_length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + json_length]
-    # Python's parser accepts NaN and Infinity, which glTF forbids. It passes these names to
-    # `parse_constant`, and `int("NaN")` raises ValueError.
+    # Python's parser accepts NaN and Infinity, which glTF forbids. It passes
+    # these names to `parse_constant`, and `int("NaN")` raises ValueError.
     tree: dict[str, Any] = json.loads(content, parse_constant=int)
     return tree
 
@@ -496,7 +500,8 @@ def _is_textured(tree: dict[str, Any], primitive: dict[str, Any], gloss: bool) -
     extensions = material.get("extensions", {})
     specular_glossiness = extensions.get("KHR_materials_pbrSpecularGlossiness", {})
     metallic_roughness = material.get("pbrMetallicRoughness", {})
-    # The two material models of glTF have different names for the color texture.
+    # The two material models of glTF have
+    # different names for the color texture.
     candidates = [
         metallic_roughness.get("baseColorTexture"),
         specular_glossiness.get("diffuseTexture"),
@@ -506,7 +511,8 @@ def _is_textured(tree: dict[str, Any], primitive: dict[str, Any], gloss: bool) -
     if gloss:
         used_textures.append(metallic_roughness.get("metallicRoughnessTexture") or {})
     for texture in used_textures:
-        # "texCoord" is the number of the set of texture coordinates, and 0 by default.
+        # "texCoord" is the number of the set of
+        # texture coordinates, and 0 by default.
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
             raise ValueError(
                 "a texture is transformed or uses a second set of texture coordinates, "
@@ -665,8 +671,8 @@ def _material_color(material: Material) -> tuple[np.ndarray, Image.Image | None]
     # If a material of an .obj file has no image, trimesh inserts a gray image.
     is_placeholder = material.image == empty_material().image
     image = None if is_placeholder else material.image
-    # "kd" is the color in the .obj file. trimesh's own attribute would be gray if the file
-    # has no color.
+    # "kd" is the color in the .obj file. trimesh's own
+    # attribute would be gray if the file has no color.
     color = material.kwargs.get("kd", np.ones(3))
     return np.clip(color, 0, 1), image
 

@@ -13,11 +13,13 @@ import numpy as np
 
 from renderer.camera import Camera, PerspectiveCamera
 
-# Type of a Mitsuba scene, and of an entry of the scene such as a camera: a dictionary.
+# Type of a Mitsuba scene, and of an entry of
+# the scene such as a camera: a dictionary.
 Scene = dict[str, Any]
 
-# Matrix from the axes of Mitsuba's environment maps to world axes. In Mitsuba's maps, y is
-# up and the middle column shows +z. In our maps, z is up and the middle column shows +x.
+# Matrix from the axes of Mitsuba's environment maps to world
+# axes. In Mitsuba's maps, y is up and the middle column shows
+# +z. In our maps, z is up and the middle column shows +x.
 TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
@@ -34,8 +36,9 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
         Entry for a Mitsuba scene, of the type "path" or "direct".
     """
     if bounces:
-        # Mitsuba's depth counts path segments: two more than the bounces between surfaces,
-        # from the emitter to the first surface and from the last surface to the camera.
+        # Mitsuba's depth counts path segments: two more than
+        # the bounces between surfaces, from the emitter to the
+        # first surface and from the last surface to the camera.
         depth = bounces + 2
         return {"type": "path", "max_depth": depth, "rr_depth": depth, "hide_emitters": True}
     samples = {"emitter_samples": emitter_samples, "bsdf_samples": 1}
@@ -133,8 +136,8 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
         Entry of the camera for a Mitsuba scene, as `sensor` returns it.
     """
     if isinstance(camera, PerspectiveCamera):
-        # The principal point is measured from the image center in halves of the image, and
-        # Mitsuba measures the image center from the principal point.
+        # The principal point is measured from the image center in halves of the
+        # image, and Mitsuba measures the image center from the principal point.
         film_center = (-camera.principal_right / 2, camera.principal_up / 2)
         pose = pose_of(camera)
         aspect = camera.pixel_aspect
@@ -157,7 +160,8 @@ def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
         Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     pose = camera.pose()
-    # The columns are the axes x, y and z and the position. Mitsuba's x and z are opposite.
+    # The columns are the axes x, y and z and the
+    # position. Mitsuba's x and z are opposite.
     pose[:3] *= [-scale, scale, -1, 1]
     return pose
 

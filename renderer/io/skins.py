@@ -25,23 +25,27 @@ import trimesh
 from renderer.geometry.mesh import Mesh, transformed
 from renderer.geometry.skin import Skin
 
-# Name of the vertex attribute to which the inverse bind matrices of a glTF skin are
-# copied. An inverse bind matrix maps vertices of the mesh to the axes of a joint.
+# Name of the vertex attribute to which the inverse bind
+# matrices of a glTF skin are copied. An inverse bind
+# matrix maps vertices of the mesh to the axes of a joint.
 BIND = "_BIND"
-# Beginning of the names of the vertex attributes to which joints are copied. A number
-# follows, as in _JOINTS_0, because each attribute holds four joints per vertex.
+# Beginning of the names of the vertex attributes to which
+# joints are copied. A number follows, as in _JOINTS_0,
+# because each attribute holds four joints per vertex.
 JOINTS = "_JOINTS_"
-# Beginning of the names of the vertex attributes to which weights of joints are copied.
+# Beginning of the names of the vertex attributes
+# to which weights of joints are copied.
 WEIGHTS = "_WEIGHTS_"
-# Beginnings of the names of vertex attributes in glTF that hold joints or their weights.
+# Beginnings of the names of vertex attributes
+# in glTF that hold joints or their weights.
 JOINTS_OR_WEIGHTS = ("JOINTS", "WEIGHTS")
-# The weights of the joints of a vertex should add up to 1. Their sum may differ from 1 by
-# at most this much, because weights with 8 bits are rounded.
+# The weights of the joints of a vertex should add up to 1. Their sum may
+# differ from 1 by at most this much, because weights with 8 bits are rounded.
 MAX_WEIGHT_ERROR = 0.01
 # Number that marks the JSON chunk of a .glb file: the letters "JSON".
 JSON_CHUNK = 0x4E4F534A
-# Number of bytes before the JSON text of a .glb file: 12 of the file header, and 8 of the
-# header of the JSON chunk.
+# Number of bytes before the JSON text of a .glb file: 12 of
+# the file header, and 8 of the header of the JSON chunk.
 GLB_HEADER_BYTES = 20
 
 
@@ -86,8 +90,8 @@ def _glb_with_json(content: bytes, text: bytes) -> bytes:
     """
     # The length of the JSON chunk of a .glb file must be a multiple of 4 bytes.
     text += b" " * (-len(text) % 4)
-    # The first 4 bytes of the file are "glTF". Then come the version, the length of the
-    # file, and the length of the JSON text.
+    # The first 4 bytes of the file are "glTF". Then come the version,
+    # the length of the file, and the length of the JSON text.
     version, _, old_json_length = struct.unpack_from("<III", content, 4)
     other_chunks = content[GLB_HEADER_BYTES + old_json_length :]
     total_length = GLB_HEADER_BYTES + len(text) + len(other_chunks)
@@ -108,8 +112,8 @@ def _copy_skin(mesh: dict[str, Any], skin: int, skins: list[dict[str, Any]]) -> 
     Raises:
         ValueError: If the mesh already has another skin, or if it has no weights.
     """
-    # Two nodes of a file may show the same mesh with different skins. The mesh therefore
-    # remembers the skin of the first node in its entry "extras".
+    # Two nodes of a file may show the same mesh with different skins. The mesh
+    # therefore remembers the skin of the first node in its entry "extras".
     known_skin = mesh.setdefault("extras", {}).setdefault("skin", skin)
     if known_skin != skin:
         raise ValueError("a mesh has two skins, which is not supported")
@@ -151,8 +155,8 @@ def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -
     joint_count = len(skeleton.joints)
     # Weight with which each joint moves each vertex.
     weights = np.zeros((len(part.vertices), joint_count))
-    # Matrix of each joint that maps a vertex of the part to the position in the scene to
-    # which this joint alone would move the vertex, shape (J, 4, 4).
+    # Matrix of each joint that maps a vertex of the part to the position in the
+    # scene to which this joint alone would move the vertex, shape (J, 4, 4).
     matrices = node_matrix[None].repeat(joint_count, axis=0)
     joints_above = skeleton.joints_from(node_number)
     if "skin" in tree["nodes"][node_number]:
@@ -196,7 +200,8 @@ def _with_joints(
     """
     # Vertex positions (x, y, z, 1), shape (V, 4).
     homogeneous = np.insert(part.vertices, 3, 1, axis=1)
-    # Position (x, y, z, 1) of each vertex if each joint alone moved it, shape (V, J, 4).
+    # Position (x, y, z, 1) of each vertex if
+    # each joint alone moved it, shape (V, J, 4).
     moved = np.einsum("jab,vb->vja", matrices, homogeneous)
     carried = (moved * weights[..., None]).astype(np.float32)
     placed = transformed(part, node_matrix)
@@ -236,7 +241,8 @@ class _Skeleton:
         for parent, item in enumerate(nodes):
             for child in item.get("children", []):
                 self._parent_node[child] = parent
-        # A child has more joints above it than its parent, so parents come first.
+        # A child has more joints above it than
+        # its parent, so parents come first.
         self.joints = sorted(
             self._joint_nodes, key=lambda joint: (len(self.joints_from(joint)), joint)
         )
@@ -294,18 +300,20 @@ def _add_weights(
         if not name.startswith(JOINTS):
             continue
         values = attributes[name.replace(JOINTS, WEIGHTS)]
-        # The largest value of an unsigned integer type stands for the weight 1 in glTF.
+        # The largest value of an unsigned integer
+        # type stands for the weight 1 in glTF.
         largest = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
         values = values / largest
-        # A joint with the weight 0 may be any number, so it is replaced by joint 0.
+        # A joint with the weight 0 may be any
+        # number, so it is replaced by joint 0.
         joints = np.where(values == 0, 0, attributes[name])
         if joints.max() >= len(joint_indices):
             raise ValueError(
                 f"a vertex has the joint {joints.max()}, but its skin has {len(joint_indices)} "
                 "joints"
             )
-        # A vertex may have the same joint twice. `weights[...] += values` would then add
-        # only one of both weights.
+        # A vertex may have the same joint twice. `weights[...]
+        # += values` would then add only one of both weights.
         np.add.at(weights, (vertex_rows, joint_indices[joints]), values)
 
 

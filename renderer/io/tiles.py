@@ -118,12 +118,13 @@ def draw_grid(
     column_widths = _column_widths(images, titles)
     title_lines = bool(heading) + bool(titles)
     first_top = MARGIN + TITLE_HEIGHT * title_lines
-    # Left edges of the columns and top edges of the rows. Each list has one more entry:
-    # the position at which another column or row would begin.
+    # Left edges of the columns and top edges of the rows. Each list has one
+    # more entry: the position at which another column or row would begin.
     lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
     tops = list(accumulate((height + GAP for height in row_heights), initial=first_top))
 
-    # Another column would begin at lefts[-1], one GAP after the end of the last column.
+    # Another column would begin at lefts[-1],
+    # one GAP after the end of the last column.
     right = max(lefts[-1] - GAP, MARGIN + _text_width(heading, TITLE_SIZE))
     bottom = max(tops[-1] - GAP, first_top)
     sheet = Image.new("RGB", (right + MARGIN, bottom + MARGIN), PAPER)
@@ -151,7 +152,8 @@ def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str
     """
     columns = zip_longest(*images)
     widths = []
-    # zip_longest fills up with None: an image, a column or a title may be missing.
+    # zip_longest fills up with None: an image,
+    # a column or a title may be missing.
     for column, title in zip_longest(columns, titles):
         title_width = _text_width(title or "", TITLE_SIZE)
         image_widths = [image.width for image in column or () if image]
