@@ -615,33 +615,61 @@ class _Target(NamedTuple):
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
         is_covered = torch.minimum(coverage, self.mask)[pixels] >= min_coverage
-        is_covered = is_covered.expand(CHANNELS, -1)
+        light, rendered, penalties = self._fit_pixels(
+            transfer, background[pixels], image, is_covered.expand(CHANNELS, -1), grid
+        )
+        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
+        differences = rendered_image.clamp(max=1) - self.image
+        residuals = torch.cat([differences.flatten(), penalties.flatten()])
+        return _LightFit(residuals, light, coverage)
+
+    def _fit_pixels(
+        self,
+        transfer: Tensor,
+        background: Tensor,
+        image: Tensor,
+        is_covered: Tensor,
+        grid: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Fit a light to P pixels of the photograph by least squares.
+
+        A pixel that is clipped in the photograph may have been brighter. The fit
+        is repeated without the clipped pixels that the render makes brighter than 1.
+
+        Args:
+            transfer: Radiance of each pixel in each channel under 49 lights, each
+                of which has a single coefficient of 1, shape (3, 49, P).
+            background: Linear values that the background adds, shape (P,).
+            image: Linear values of the photograph, shape (3, P).
+            is_covered: True for the pixels to which the light is fitted,
+                shape (3, P).
+            grid: Number of subdivisions of the icosphere whose vertices are the
+                directions in which the radiance of the light is constrained.
+
+        Returns:
+            A tuple of
+            - the SH coefficients of the light, shape (49, 3);
+            - the values of the pixels in a render with this light, shape (3, P);
+            - the weighted differences between the coefficients of the light and of
+              the expected light, shape (3, 49).
+        """
+        object_radiance = image - background
         is_clipped = image >= CLIPPED_VALUE
         is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
-            # Least squares over the used pixels of each channel.
-            # The normal equations have a matrix of
-            # shape (3, 49, 49) and a right side of shape (3, 49).
+            # Matrix and right side of the normal equations of
+            # each channel, shape (3, 49, 49) and (3, 49).
             used_transfer = transfer * is_used[:, None]
             normal_matrix = used_transfer @ transfer.mT
-            object_radiance = (image - background[pixels])[..., None]
-            right_side = (used_transfer @ object_radiance)[..., 0]
+            right_side = (used_transfer @ object_radiance[..., None])[..., 0]
             penalty = self.penalty(normal_matrix)
             light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
-            # Values of the covered pixels in a render
-            # with this light, shape (3, P).
-            rendered = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
-            # A clipped pixel may be brighter than the photograph shows. The
-            # next fit ignores it if the render is brighter than 1 there.
+            rendered = (light.T[:, None] @ transfer)[:, 0] + background
             is_trusted = is_covered & ~(is_clipped & (rendered > 1))
             if torch.equal(is_trusted, is_used):
                 break
             is_used = is_trusted
-        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
-        differences = rendered_image.clamp(max=1) - self.image
-        penalties = penalty.sqrt() * (light - expected_light).T
-        residuals = torch.cat([differences.flatten(), penalties.flatten()])
-        return _LightFit(residuals, light, coverage)
+        return light, rendered, penalty.sqrt() * (light - expected_light).T
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with the best light of each camera.
@@ -796,7 +824,8 @@ class _Descent:
         """Compute the differences between the photograph and a render with the best light.
 
         Args:
-            parameters: Five parameters of the camera, shape (5,).
+            parameters: Polar angle, azimuth, relative width, and shifts right and up
+                of the camera, shape (5,).
 
         Returns:
             Residuals of the best light, shape (N,). The sum of their squares is the
@@ -807,8 +836,11 @@ class _Descent:
     def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
         """Compute the derivatives of the residuals by central differences.
 
+        The residuals are the differences between the photograph and a render.
+
         Args:
-            parameters: Five parameters of the camera, shape (5,).
+            parameters: Polar angle, azimuth, relative width, and shifts right and up
+                of the camera, shape (5,).
 
         Returns:
             Derivatives of the N residuals with respect to the parameters,

@@ -50,7 +50,11 @@ def attach(
         module = __import__(modules[name], fromlist=[name])
         return getattr(module, name)
 
-    return get_attribute, lambda: names, names
+    def list_names() -> list[str]:
+        """Return the public names of the package."""
+        return names
+
+    return get_attribute, list_names, names
 
 
 def _read_stub(path: str) -> dict[str, str]:

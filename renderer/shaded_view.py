@@ -140,8 +140,8 @@ class ShadedView:
         """Compute the radiance of pixels under environment light, without shadows and bounces.
 
         Args:
-            fragments: The covered samples, in P pixels of the image. They may also be
-                in pixels of a finer image, with one sample each.
+            fragments: The samples that show the shape, in P pixels of the image. They
+                may also be in pixels of a finer image, with one sample each.
 
         Returns:
             Radiance, shape (3, P). None without environment light.
@@ -170,8 +170,8 @@ class ShadedView:
         """Compute the radiance of pixels under each local light (lamps or a projector).
 
         Args:
-            fragments: The covered samples, in P pixels of the image. They may also be
-                in pixels of a finer image, with one sample each.
+            fragments: The samples that show the shape, in P pixels of the image. They
+                may also be in pixels of a finer image, with one sample each.
 
         Returns:
             Radiance under each local light, shape (3, P) each.
@@ -229,6 +229,7 @@ class ShadedView:
         if indirect is not None:
             at_pixels = at_pixels + indirect
             sample_radiance = sample_radiance + self._divide_among_samples(indirect.detach())
+        # Adding these zeros to the radiance adds the gradients of moving silhouettes.
         uncovered_pixels, zeros_with_gradient = moving_outlines(
             fragments, camera, self.vertices, self._faces, sample_radiance, background
         )

@@ -635,8 +635,6 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
-    # The vertex indices of the small faces are valid in the
-    # divided mesh, too, because it has all old vertices.
     arrays: dict[str, Any] = {}
     for name in PER_FACE:
         rows_of_small_faces = getattr(small_faces, name)
@@ -644,6 +642,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         if rows_of_small_faces is not None:
             rows_of_divided_faces = getattr(divided, name)
             arrays[name] = np.concatenate([rows_of_small_faces, rows_of_divided_faces])
+    # The divided mesh has all old vertices, so the vertex
+    # indices of the small faces are valid in it, too.
     return replace(divided, **arrays)
 
 

@@ -271,6 +271,8 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     """
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
+        # Half of the width and of the height that the image shows at a depth
+        # of 1. Both grow with the distance of the principal point from the center.
         half_width = math.tan(math.radians(camera.angle) / 2)
         half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)
