@@ -305,6 +305,8 @@ def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
         Unit vector along the z-axis with the components right, up and back,
         shape (3,).
     """
+    # The z-components of the axes right, up and back of the fitted
+    # camera. These axes are also the axes of the window.
     z_axis_in_window = camera.axes()[:, 2]
     return window.axes.T @ z_axis_in_window
 

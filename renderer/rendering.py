@@ -440,6 +440,7 @@ def _as_light(light: object) -> Tensor:
     if isinstance(light, str):
         raise InputError(f"light is {light!r}: give coefficients, such as nb.load_light({light!r})")
     coefficients = as_tensor("light", light)
+    # `degree_of` raises an error if the shape is wrong.
     degree_of(coefficients)
     return coefficients
 

@@ -463,7 +463,7 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
 
 
 def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
-    """Extend the joints of the first mesh to the vertices of several meshes.
+    """Create a skin with the joints of the first mesh for the vertices of several meshes.
 
     Args:
         meshes: Meshes with V vertices in total. Each has the joints of the first
