@@ -789,8 +789,8 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
     if not (error <= MATRIX_TOLERANCE and is_right_handed and is_affine):
         raise InputError(
-            f"view={matrix.tolist()} is no rotation and translation: give the matrix from world to "
-            "camera coordinates"
+            f"view={matrix.tolist()} is not a rotation with a translation: give the matrix from "
+            "world to camera coordinates"
         )
     return rotation, matrix[:3, 3]
 

@@ -239,7 +239,8 @@ class _AreaVectors(torch.autograd.Function):
         # The edges from the first corner of each face to the second
         # and the third corner, shape (3 components, 2 edges, F).
         edges = corners[:, 1:] - corners[:, :1]
-        # Products of edges overflow only if the positions are float64.
+        # The products are computed in float64, in which
+        # products of numbers from float32 cannot overflow.
         is_float64 = vertices.dtype == torch.float64
         scale = _power_of_two(edges) if is_float64 else edges.new_ones(())
         edge_u, edge_v = edges.div_(scale).unbind(1)

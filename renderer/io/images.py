@@ -66,10 +66,10 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
         >>> gray_or_image("background", 0.5, 2).tolist()
         [[[0.5, 0.5], [0.5, 0.5]]]
     """
-    expected = "give gray values in [0, 1] or image files"
+    advice = "give gray values in [0, 1] or image files"
     # `float` would accept True as 1.
     if isinstance(choice, bool):
-        raise InputError(f"{name}={choice} is no image: {expected}")
+        raise InputError(f"{name}={choice} is no image: {advice}")
     try:
         gray = float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
@@ -82,7 +82,7 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
         except InputError as error:
             raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
-        raise InputError(f"{name}={reprlib.repr(choice)} is no image: {expected}")
+        raise InputError(f"{name}={reprlib.repr(choice)} is no image: {advice}")
     return torch.full((1, size, size), gray)
 
 
