@@ -416,7 +416,7 @@ class AugmentationService:
         Args:
             model: The network, which classifies some of the images.
             problem: The scene of E examples, and the parameters whose values are random.
-            number: How often the renders were made before.
+            number: How often the renders were made before, on which the random numbers depend.
             shard: Indices of the examples that this process renders. The other processes
                 render the other examples.
 
@@ -467,7 +467,7 @@ class AugmentationService:
         Args:
             model: The network to attack.
             problem: The scene of E examples, and the parameters that the attack changes.
-            number: How often the renders were made before.
+            number: How often the renders were made before, on which the random numbers depend.
             shard: Indices of the examples that this process attacks. The other processes
                 attack the other examples.
 
@@ -541,11 +541,11 @@ class AugmentationService:
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
-        """Return the source and the target class of each example.
+        """Return the source and the target class of the attack on each example.
 
-        The attack on an example is untargeted (it lowers the probability of the label) if there
-        are no positive classes, or if the label is a positive class. The targets of all other
-        examples are the positive classes in turn.
+        If there are no positive classes (classes that the network must tell from all others), the
+        attack only lowers the probability of the label. The same holds for examples of a positive
+        class. All other examples are attacked towards a positive class, each class in turn.
         """
         if not self.positive_classes:
             return Criterion(self.labels[:, None])
@@ -567,7 +567,7 @@ class AugmentationService:
 
         Args:
             problem: The scene of E examples, and the attacked parameters.
-            number: How often the renders were made before.
+            number: How often the renders were made before, on which the random numbers depend.
 
         Returns:
             D values of each example, shape (E, D).

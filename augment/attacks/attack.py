@@ -306,7 +306,7 @@ class AttackResult:
         return start + fraction * (self.descent.values.to(start) - start)
 
     def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
-        """Render a view with attack values between those before and after the attack.
+        """Render a view with values that are interpolated between before and after the attack.
 
         Args:
             fraction: 0 for the image before the attack, 1 for the image after it.
@@ -326,7 +326,7 @@ class AttackResult:
         return images[0, view]
 
     def _ball_between(self, fraction: float, example: int) -> Tensor:
-        """Render a white ball in light between that before and that after the attack.
+        """Render a white ball in light that is interpolated between before and after the attack.
 
         Args:
             fraction: 0 for the light before the attack, 1 for the light after it.
@@ -793,7 +793,7 @@ def final_images(
         return images
     rendered = []
     for row, example in enumerate(progress(examples.tolist(), "final images")):
-        # The images of an adversary are not used for rendering.
+        # `Adversary` needs images, but does not use them for rendering.
         adversary = Adversary.of(scene, example, conditions, images[row], images[row], row)
         rendered.append(adversary.render_views(scene.rasterizer))
     return torch.stack(rendered).to(images)

@@ -611,13 +611,13 @@ def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> d
     """Select the successes among the N examples that are correct before the attack.
 
     Args:
-        method: METHOD, "adversarial" or "random".
+        method: Name of the search that found the successes, "adversarial" or "random".
         found: Successes of all E examples.
         result: The attack.
 
     Returns:
-        Masks of the N examples, shape (N,): successes with sensor noise under the key METHOD,
-        and without noise under the key METHOD_without_noise.
+        Two masks of the N examples, shape (N,). Their keys are the name of the search for
+        successes with sensor noise, and this name with "_without_noise" for those without.
     """
     is_clean = result.clean_correct
     return {

@@ -88,7 +88,8 @@ def _load_python(name: str, weights: Path | None) -> Classifier:
     """
     if weights is not None:
         raise InputError(
-            f"weights={weights} is not for python:{name}, which loads its own: leave it out",
+            f"weights={weights} cannot be combined with python:{name}, which loads its own "
+            "weights: remove weights",
             "weights",
         )
     return load_python(name)

@@ -245,7 +245,9 @@ def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.G
     angle = 2 * math.pi * turn
     scale = MAX_ZOOM ** (2 * zoom - 1)
     rotated = turned(points * scale, angle.cos(), angle.sin())
-    return show_photographs(photographs, rotated.permute(1, 2, 3, 0), saturation[:, 0, 0])
+    # `grid_sample` needs the coordinates on the last axis, shape (N, size, size, 2).
+    grid = rotated.permute(1, 2, 3, 0)
+    return show_photographs(photographs, grid, saturation[:, 0, 0])
 
 
 def show_photographs(photographs: Tensor, grid: Tensor, saturation: Tensor) -> Tensor:

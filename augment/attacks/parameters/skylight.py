@@ -47,7 +47,7 @@ class Skylight(Parameter):
         sky_luminance = mean_luminance(initial_sky)
         replaced_lights = scene.lights[:, self._rows]
         scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
-        # Factor of the sky for each example, shape (E,).
+        # Factor by which the sky is multiplied in each example, shape (E,).
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
         self._sun = settings.sun
