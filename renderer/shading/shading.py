@@ -214,7 +214,7 @@ def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tens
         Irradiance, shape (3, S).
     """
     degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
-    # Coefficients of higher degrees do not change the irradiance of a diffuse surface.
+    # Coefficients of higher degrees are ignored, because they hardly change the irradiance.
     light = light[: (degree + 1) ** 2]
     # The coat multiplies each coefficient of the light by a factor, which is a sum over R
     # polynomials of the roughness. One row for each coefficient, one column for each
@@ -517,7 +517,8 @@ def _even_degree(degree: int) -> int:
     Returns:
         Largest even degree of a harmonic, at least 2.
     """
-    return max(min(degree, harmonics.DIFFUSE_DEGREE) - degree % 2, 2)
+    highest = min(degree, harmonics.DIFFUSE_DEGREE)
+    return max(highest - highest % 2, 2)
 
 
 @harmonics.cache_tensors

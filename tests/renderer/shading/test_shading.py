@@ -25,7 +25,7 @@ from renderer.light.harmonics import (
     lambertian_factors,
     nonzero_coefficients,
 )
-from renderer.settings import ImageSettings
+from renderer.settings import MAX_DEGREE, ImageSettings
 from renderer.shading import shading
 from renderer.shading.shading import radiance
 from renderer.surface.albedo import surface_albedo
@@ -62,7 +62,16 @@ def test_irradiance_is_scipys(degree):
     np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 6, DIFFUSE_DEGREE])
+@pytest.mark.parametrize("degree", [DIFFUSE_DEGREE + 1, DIFFUSE_DEGREE + 2, MAX_DEGREE - 1])
+def test_light_above_the_diffuse_degree_has_the_irradiance_of_its_lower_degrees(degree):
+    normals = some_normals(10)
+    light = draw((degree + 1) ** 2, 3)
+    lower_degrees = light[: (DIFFUSE_DEGREE + 1) ** 2]
+    expected = scipy_irradiance(normals, lower_degrees).T
+    np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, DIFFUSE_DEGREE, DIFFUSE_DEGREE + 1])
 def test_derivatives_of_irradiance_are_central_differences(degree):
     normals = some_normals(4).requires_grad_()
     light = draw((degree + 1) ** 2, 3, seed=1).requires_grad_()
