@@ -103,7 +103,7 @@ class TestTrainingOfTwoArms:
     ("arguments", "start"),
     [
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist"),
-        (["run=file/run"], "run=file/run cannot be written to"),
+        (["run=file/run"], "run=PATH/file/run cannot be written to"),
         (["run=odd"], "PATH/odd/train.log cannot be read or written"),
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["compare=[non]"], "compare: "),

@@ -124,7 +124,7 @@ MISTAKES = [
     ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
     ([*EVALUATE, "label=[]"], "label=[]"),
     ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear'"),
-    ([*EVALUATE, "classifier=python:own:build"], "give one network"),
+    ([*EVALUATE, "classifier=python:own:build"], "run=1.10 and classifier=python:own:build do not name one network"),
     ([*EVALUATE_CLASSIFIER, "classifier=python:own:build", "model=python:a:b"], "model=python:a:b"),
     ([*EVALUATE_CLASSIFIER, "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b"),
@@ -178,7 +178,7 @@ def test_a_light_is_not_written_over_itself(call, here, capsys):
     (here / "b.npy").symlink_to("a.npy")
     before = (here / "a.npy").read_bytes()
     assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
-    assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself")
+    assert capsys.readouterr().err.startswith("error: out=b.npy would overwrite the light itself")
     assert (here / "a.npy").read_bytes() == before
 
 
