@@ -65,8 +65,8 @@ VIEW_COUNT = 24
 RANDOM_LIGHT_COUNT = 8
 # Number of views that are attacked with each kind of lighting.
 ATTACKED_COUNT = 12
-# For each projected pattern and each environment map, 6 random setups of light, camera
-# and pose are path-traced.
+# Number of random setups of light, camera and pose that are path-traced for each
+# projected pattern and each environment map.
 SETUPS = 6
 # Projected patterns of the path-traced renders. No training of this project uses them.
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
@@ -85,7 +85,7 @@ NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
 )
-# For each set of test images, the setting of pnb-audit that names their folder.
+# Settings of pnb-audit that name the folders of test images, by the name of the images.
 FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
 SETTABLE_LATER = ("hardened", "photos", "photographs")

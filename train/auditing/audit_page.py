@@ -65,8 +65,8 @@ WORST = 10
 # A network is called safe only if it classifies at least this fraction of the images
 # correctly, both of the tested class and of other objects.
 PASS_THRESHOLD = 0.9
-# For the name of each network and of each folder of test images, the predictions in
-# the order of the images.
+# Predictions in the order of the images, by the name of the network and by the name of
+# the folder of test images.
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
 
 

@@ -147,7 +147,7 @@ def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
         folder: Folder of results of this network.
     """
     summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
-    # For the name of each light, the file has a list: whether each view is recognized.
+    # The file has a list for the name of each light: whether each view is recognized.
     recognized_views = read_json(folder / RECOGNIZED)
     recognized_fraction = {}
     for light, is_recognized in recognized_views.items():

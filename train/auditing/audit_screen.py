@@ -24,7 +24,7 @@ from train.report.first_screen import (
 
 # Width of the picture that shows a view before and after an attack, in pixels.
 PAIR_WIDTH = 400
-# For each kind of lighting, the result of its attack, a dictionary with numbers of
+# Results of attacks by the kind of lighting. A result is a dictionary with numbers of
 # views.
 Counts = Mapping[str, Mapping[str, Any]]
 

@@ -252,7 +252,7 @@ def adversaries(
     # `AttackSettings` has an attribute for each kind of lighting, with the norm-ball.
     settings: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
     if additional:
-        # No margin is as large as MAX_SCALE, so the attack never stops early.
+        # The attack never stops early, because it cannot reach a margin of MAX_SCALE.
         settings |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
@@ -315,9 +315,9 @@ def success_by_light(
     ):
         adversarial = f"adversarial{suffix}"
         random = f"random{suffix}"
-        # For the largest radius there are two attacks: the one in `by_radius`, which
-        # starts where the attack within the next smaller radius ended, and `result`,
-        # which starts at the natural light. Either may succeed.
+        # There are two attacks for the largest radius. The attack in `by_radius` starts
+        # where the attack within the next smaller radius ended. The attack in `result`
+        # starts at the natural light. Either may succeed.
         by_radius[-1][adversarial] |= success[clean].cpu()
         counts[adversarial] = [int((row[adversarial] | row[random]).sum()) for row in by_radius]
         counts[random] = [int(row[random].sum()) for row in by_radius]

@@ -40,14 +40,14 @@ MAX_PICTURE_WIDTH = 900
 # The report says that predictions depend on the light if less than this fraction of
 # the photographs keeps its class under random slides.
 PASS_THRESHOLD = 0.9
-# For each kind of light, the title of its number at the top of the report.
+# Titles of the numbers at the top of the report, by the kind of light.
 NUMBER_TITLES = {
     SLIDE: "Keep their class under a random slide",
     RANDOM: "… after random search",
     ADVERSARIAL: "… after as many passes along the gradient",
 }
 
-# For each kind of light, its description in a sentence.
+# Descriptions of the kinds of light in a sentence.
 IN_LIGHT = {
     SLIDE: "under a random slide",
     RANDOM: "after random search",

@@ -25,7 +25,7 @@ ORIGINAL = "the original network"
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
-# With several positive classes, remedies are compared by top-1 accuracy.
+# Remedies are compared by top-1 accuracy if there are several positive classes.
 TOP1 = "class_top1"
 
 

@@ -625,7 +625,7 @@ def format_reloaded(
     # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
     logits = logits_of(model, images[None], len(images))
     predicted = logits.argmax(2)
-    # With `predicted` as the target class of an "attack", `fooled_in_views` tests whether
+    # The target class of the "attack" is `predicted`. `fooled_in_views` then tests whether
     # the images are still classified as `predicted` when there is noise.
     criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
     is_same_with_noise = fooled_in_views(

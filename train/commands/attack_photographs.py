@@ -15,7 +15,7 @@ from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import shortened
 
-# Without --verbose, warnings about at most 3 unreadable files are printed.
+# Warnings about at most 3 unreadable files are printed if --verbose is not set.
 MAX_UNREADABLE = 3
 
 

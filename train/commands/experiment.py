@@ -40,8 +40,8 @@ from train.training.run import load_runs
 CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
-# With the setting `photographs_first`, a first training on photographs is in this
-# subfolder.
+# Subfolder for a first training on photographs, which the setting `photographs_first`
+# asks for.
 PHOTOGRAPHS = "photographs"
 # The first training on photographs takes these settings from the main training.
 SHARED = ("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light")

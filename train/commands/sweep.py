@@ -37,9 +37,9 @@ from train.system.user_errors import user_message, writable_folder
 from train.system.verbosity import is_verbose, shortened
 from train.training.run import load_runs
 
-# Without --verbose, the table of the finished runs has at most this many lines.
+# Largest number of lines of the table of finished runs, if --verbose is not set.
 MAX_TABLE_LINES = 10
-# Without --verbose, at most this many unfinished runs are listed.
+# Largest number of unfinished runs that are listed, if --verbose is not set.
 MAX_UNFINISHED = 3
 
 

@@ -354,7 +354,7 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
     """
     height, width = images.shape[2:]
     device = images.device
-    # For each row of the result, `rows` has the row of the image that it is copied from,
+    # Row i of the result is copied from row `rows[:, i]` of the image. `rows` has the
     # shape (B, H). `columns` has the same for columns, shape (B, W).
     rows = torch.arange(height, device=device) + shifts[0, :, None]
     rows = _reflect(rows, height)

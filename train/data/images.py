@@ -27,7 +27,7 @@ DECODED_SCALE = 2
 # Index of an image in `ImageFiles.paths`, and seed of its random crop. If the seed
 # is None, the central square of the image is read instead of a crop.
 Key = tuple[int, int | None]
-# For each file that cannot be read, the error message by the path of the file.
+# Error messages of the files that cannot be read, by the path of the file.
 ReadErrors = dict[PurePosixPath, str]
 
 

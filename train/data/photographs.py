@@ -511,7 +511,7 @@ def _read_into(
         errors = pool.map(_read_image, images, paths)
         return list(progress(errors, "photographs", len(paths)))
     finally:
-        # After Ctrl-C, the images that no thread has begun to read are not read.
+        # If Ctrl-C is pressed, images that no thread has begun to read are not read.
         pool.shutdown(cancel_futures=True)
 
 

@@ -28,8 +28,8 @@ from train.system.hashing import content_hash
 # Folders with these names hold splits of a data set. All other folders hold the
 # images of a class.
 SPLIT_NAMES = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")
-# At most 1000 unlabeled images are held out from training. This number is enough to
-# measure to about 1% on which fraction of the images two networks agree.
+# Largest number of unlabeled images that are held out from training. 1000 images are
+# enough to measure to about 1% on which fraction of the images two networks agree.
 HELD_OUT = 1000
 
 

@@ -36,7 +36,7 @@ from train.runs.run_config import read_json
 RELIT = "relit.json"
 # Pictures are written for this many photographs.
 PICTURE_COUNT = 8
-# For each kind of light, the title of its column in tables.
+# Titles of the columns of tables, by the kind of light.
 TITLES = {
     SLIDE: "random slide",
     RANDOM: "random search",
@@ -283,7 +283,8 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     Returns:
         For the index of each chosen photograph, the file name of its picture.
     """
-    # For each kind of light, whether any slide changes the class of each photograph.
+    # Each entry is about one kind of light: whether any slide changes the class of each
+    # photograph, shape (N,).
     is_changed = [changed.any(dim=1) for changed in result.changed.values()]
     change_count = torch.stack(is_changed).sum(dim=0)
     # A rank above all counts puts photographs that never change at the end.

@@ -274,7 +274,7 @@ def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
     return torch.from_numpy(np.stack(channels))
 
 
-# For each name of a pattern, the function that draws it. PATTERNS in
+# Functions that draw the patterns, by the name of the pattern. PATTERNS in
 # train/command_settings.py lists the same names.
 PATTERN_FUNCTIONS = {
     "solid": _solid,

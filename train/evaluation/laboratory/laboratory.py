@@ -45,12 +45,12 @@ COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
 # Another version of one of these packages may render other pixels. The versions are
 # therefore recorded with the renders.
 PACKAGES = ("mitsuba", "numpy", "torch")
-# Half of the width of the square around the object that a projector lights, in world
+# A projector lights a square around the object. This is half of its width, in world
 # units.
 PROJECTOR_HALF_WIDTH = 2.6
 # A built-in light is rendered to an environment map with this many rows.
 BUILT_IN_MAP_HEIGHT = 64
-# Half of the width of the table and of the wall, which are squares, in world units.
+# The table and the wall are squares. This is half of their width, in world units.
 PLANE_HALF_WIDTH = 100.0
 # A corner of a face is shaded with the smooth normal of its vertex only if the cosine
 # between this normal and the normal of the face is at least 0.85. At an edge with a

@@ -25,7 +25,7 @@ FOV = 25.0
 # A setup in an environment map is drawn with projectors of this pattern first. The
 # environment map then replaces the projectors.
 PLAIN_PATTERN = "solid"
-# Half of the width that the camera sees at the object: range of the random draw, in
+# Range of the random draw of half of the width that the camera sees at the object, in
 # world units.
 HALF_WIDTHS = (1.2, 1.9)
 # Factor by which the normalized object is scaled: range of the random draw.
@@ -154,7 +154,7 @@ def _scale_environment(
     weights = cosines * solid_angles
     irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
     white_radiance = float(irradiance.mean()) / math.pi
-    # To move the columns of the map is to rotate it about the vertical axis.
+    # A map whose columns are shifted is rotated about the vertical axis.
     column_offset = rng.integers(radiance.shape[1])
     rotated = np.roll(radiance, column_offset, axis=1)
     return (brightness / white_radiance * rotated).astype(np.float32)

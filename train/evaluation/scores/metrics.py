@@ -46,7 +46,7 @@ METRICS: tuple[str, ...] = (
     *AT_THRESHOLD,
     *TOP_RANKS,
 )
-# For each name of a metric, its title in tables.
+# Titles of the metrics in tables, by the name of the metric.
 TITLES = {
     "recall": "recall",
     "top5": "top-5",
@@ -58,8 +58,8 @@ TITLES = {
     "class_top5": "top-5, mean over classes",
 }
 
-# For each label, its operating point: the threshold on the log-odds above which an
-# image counts as a detection.
+# Operating points by label: thresholds on the log-odds above which an image counts as
+# a detection.
 Thresholds = Mapping[str, float]
 
 
@@ -844,7 +844,7 @@ def thresholds(
     total = counts_up_to[..., -1]
     thresholds_by_rate = []
     for rate in rates:
-        # With floats, 0.29 * 100 would be less than 29 and be rounded down to 28.
+        # A float would be inexact: 0.29 * 100 is less than 29 and would become 28.
         exact_rate = fractions.Fraction(rate)
         allowed_above = exact_rate.numerator * total // exact_rate.denominator
         needed_up_to = total - allowed_above

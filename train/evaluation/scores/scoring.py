@@ -48,7 +48,8 @@ from train.settings import GROUPS
 
 SUMMARY = "summary.json"
 CONTACT_SHEET = "contact_sheet.png"
-# For the images of each class, the 5 most common wrong predictions are listed.
+# Number of wrong predictions that are listed for the images of each class: the 5 most
+# common ones.
 WRONG_CLASSES = 5
 # Words after the number of negatives, if there are several positive classes.
 COUNTED_EACH = ", once for each of these classes"
