@@ -124,7 +124,10 @@ MISTAKES = [
     ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
     ([*EVALUATE, "label=[]"], "label=[]"),
     ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear'"),
-    ([*EVALUATE, "classifier=python:own:build"], "run=1.10 and classifier=python:own:build do not name one network"),
+    (
+        [*EVALUATE, "classifier=python:own:build"],
+        "run=1.10 and classifier=python:own:build do not",
+    ),
     ([*EVALUATE_CLASSIFIER, "classifier=python:own:build", "model=python:a:b"], "model=python:a:b"),
     ([*EVALUATE_CLASSIFIER, "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b"),
