@@ -25,7 +25,7 @@ def photograph(page: Path) -> Image.Image:
         page: HTML file.
     """
     with sync_playwright() as playwright:
-        # Without an installed Chromium, playwright starts its own.
+        # Playwright starts its own Chromium if none is installed.
         chromium = playwright.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )

@@ -30,8 +30,8 @@ class TrainCommand(Command):
         with self.handle_errors():
             if "TORCHELASTIC_RUN_ID" in os.environ:
                 raise InputError(
-                    "torchrun trains one run in several processes: "
-                    "start a sweep with pnb-train --multirun",
+                    "torchrun cannot start a sweep (--multirun), since its processes train one "
+                    "run together: start a sweep with pnb-train --multirun",
                 )
             overrides = self.to_overrides(take_flag(sys.argv[1:]))
             import_function("train.commands.sweep:sweep")(super().__call__, overrides)

@@ -270,9 +270,9 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         with_class_name(item, classes, "scene.hard_negatives")
         for item in settings.scene.hard_negatives
     ]
-    # `ExperimentSettings` removes generated hard negatives of the positive class,
-    # which it may recognize only now. If `scene.views` is set, it then computes the
-    # number of examples again.
+    # `ExperimentSettings` may remove a hard negative, because it now knows the name of the
+    # positive class. If `scene.views` is set, the number of examples follows from the number
+    # of objects, and None lets `ExperimentSettings` compute it again.
     examples = settings.augment.examples if settings.scene.views is None else None
     return replace(
         settings,

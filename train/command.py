@@ -61,7 +61,7 @@ SWEEP_FLAGS = {"--multirun", "-m"}
 HELP_FLAGS = {"--help", "-h"}
 # If an import takes more seconds than this, `import_function` prints a line about it.
 IMPORT_DELAY = 5.0
-# Words for the types of settings in error messages.
+# Words of error messages for the types of settings.
 NOUNS = {
     int: "a whole number",
     float: "a number",
@@ -69,7 +69,7 @@ NOUNS = {
     str: "text",
     list: "a list, such as [a,b]",
 }
-# For some mistakes of the user, Hydra and OmegaConf raise these errors, which do not
+# Hydra and OmegaConf raise these errors for some mistakes of the user. The errors do not
 # name the setting.
 INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
 # The largest float has 309 digits before the decimal point. A whole number with more
@@ -272,15 +272,15 @@ def set_up_process() -> None:
 
     This must happen before torch is imported.
     """
-    # With this variable, Hydra raises errors instead of printing them.
+    # Hydra raises errors instead of printing them if this variable is set.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # With this variable, threads of torch sleep while they wait. Otherwise they
+    # Threads of torch sleep while they wait if this variable is set. Otherwise they
     # slow down other processes.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     reuse_freed_memory()
     if Path(sys.argv[0]).stem.startswith(PREFIX):
-        # Without this variable, child processes would import a file train.py of
-        # the current folder instead of this package.
+        # Child processes would import a file train.py of the current folder instead
+        # of this package if this variable were not set.
         os.environ["PYTHONSAFEPATH"] = "1"
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     warnings.simplefilter("once", UserWarning, append=True)
@@ -340,7 +340,7 @@ def _ended_by_ctrl_c() -> Iterator[None]:
 
     Some modules catch KeyboardInterrupt while they are imported, and would continue.
     """
-    # Only the main thread may set a handler.
+    # Python lets only the main thread set a handler.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -536,7 +536,7 @@ def quoted(text: str) -> str:
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error, and then the chain of errors that caused it."""
+    """Yield an error, then the error that caused it, then the cause of that error, and so on."""
     cause: BaseException | None = error
     while cause is not None:
         yield cause
@@ -626,15 +626,20 @@ def _explain_value(
             value. Empty if the value comes from the command line.
     """
     hint = without_none(keys.get(key))
-    value = getattr(error, "value", None)
-    noun = NOUNS.get(get_origin(hint) or hint)
-    if noun:
-        return f"{key}={'null' if value is None else value} must be {noun}{place}"
+    # The origin of list[str] is list.
+    kind = get_origin(hint) or hint
+    if kind in NOUNS:
+        value = getattr(error, "value", None)
+        shown = "null" if value is None else value
+        return f"{key}={shown} must be {NOUNS[kind]}{place}"
     if is_dataclass(hint):
-        example = f"{key}.{fields(cast(Any, hint))[0].name}=..."
+        first_field = fields(cast(Any, hint))[0].name
+        example = f"{key}.{first_field}=..."
         return f"{key} is a group of settings{place}: set one of them, such as {example}"
     text = _first_line(error)
-    return f"{key}: {text}{place}" if key and key not in text else f"{text}{place}"
+    if key and key not in text:
+        text = f"{key}: {text}"
+    return f"{text}{place}"
 
 
 def _explain_choice(file: str) -> str:

@@ -83,6 +83,7 @@ class ClassifierSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and convert those that YAML reads as another type."""
         super().__post_init__()
         self.classes = class_texts(self.classes)
         self.normalize_light = normalized_light_values(self.normalize_light)
@@ -118,13 +119,14 @@ class AttackCommandSettings(AttackSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that the renderers in `verify` exist."""
         super().__post_init__()
         for name in self.renderers:
             require_choice("verify", name, RENDERERS)
 
     @property
     def renderers(self) -> list[str]:
-        """Names of the renderers in `verify`."""
+        """Names of the renderers that render the written files again, from `verify`."""
         return self.verify.split("+") if self.verify else []
 
 
@@ -142,6 +144,7 @@ class AttackSceneSettings(SceneSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that there is a mesh and a background."""
         for name in ("meshes", "backgrounds"):
             if not getattr(self, name):
                 raise InputError(f"{name} must not be empty: name one or more", name)
@@ -215,6 +218,7 @@ class AttackExperimentSettings(ClassifierSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and add to the scene the lights that are attacked."""
         super().__post_init__()
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
@@ -232,9 +236,9 @@ class AttackExperimentSettings(ClassifierSettings):
     def _check_photographs(self) -> None:
         """Check that the attack "relighting" has photographs, and that it is the only attack."""
         if (self.attack.relighting is None) != (self.photographs is None):
-            raise InputError(
-                "attack=relighting and photographs belong together: set both, or neither",
-            )
+            given = "photographs" if self.attack.relighting is None else "attack=relighting"
+            other = "attack=relighting" if self.attack.relighting is None else "photographs"
+            raise InputError(f"{given} is set without {other}: set both, or neither")
         if self.photographs is not None and (self.attack.parameters or self.reload):
             raise InputError(
                 "attack=relighting attacks photographs alone: "
@@ -243,11 +247,17 @@ class AttackExperimentSettings(ClassifierSettings):
             )
 
     def _add_attacked_lights(self) -> None:
-        """Add to the scene and the renderer what the attacked parameters need."""
+        """Add to the settings what the attacked parameters need.
+
+        An attacked light that the scene lacks, such as a projector, is added with
+        default settings. An attack on the pose needs gradients at silhouettes. An
+        attack on the positions of lamps needs lamps that shine.
+        """
         attacked = self.attack.parameters
-        for name, kind in LOCAL_LIGHT_SETTINGS.items():
-            if name in attacked and getattr(self.scene, name) is None:
-                setattr(self.scene, name, kind())
+        for light, settings_class in LOCAL_LIGHT_SETTINGS.items():
+            is_missing = getattr(self.scene, light, None) is None
+            if light in attacked and is_missing:
+                setattr(self.scene, light, settings_class())
         if "pose" in attacked:
             self.renderer.silhouettes = True
         if "positions" in attacked and self.scene.lamps is None:
@@ -351,12 +361,16 @@ class LabSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that each pattern and each environment gets as many setups."""
         super().__post_init__()
         families = {family for pattern in self.patterns for family in pattern.split("+")}
         for family in sorted(families):
             require_choice("patterns", family, PATTERNS)
         if SLIDES in families and not self.slides:
-            raise InputError(f"patterns has {SLIDES}: name image files in slides=", "patterns")
+            raise InputError(
+                f"patterns has {SLIDES}, but slides is empty: set slides to image files",
+                "patterns",
+            )
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
             raise InputError(
@@ -422,6 +436,7 @@ class AuditSettings(ClassifierSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that there is something to audit: meshes or photographs."""
         super().__post_init__()
         if not self.meshes and self.photographs is None:
             raise InputError(
@@ -464,6 +479,7 @@ class CompareSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that each run is named once."""
         super().__post_init__()
         if not self.runs:
             raise InputError(
@@ -519,6 +535,7 @@ class EvaluateSettings(ClassifierSettings):
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
     def __post_init__(self) -> None:
+        """Check all values, and that the settings name one network."""
         super().__post_init__()
         require_calibration(self.false_positive_rate, self.calibrate)
         # This call only checks the label.
@@ -603,6 +620,7 @@ class FitSettings(Settings):
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
     def __post_init__(self) -> None:
+        """Check all values, and that either a mask or a box says where the object is."""
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
             raise InputError(

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-# For each former key of a setting, the present name of the setting in the same group:
-# augment.arm is now augment.mode.
+# Present name of each setting by its former key. The group is the same: augment.arm is
+# now augment.mode.
 FORMER_KEYS = {
     "augment.arm": "mode",
     "augment.every": "regenerate_every",

@@ -105,7 +105,10 @@ def _choice_lines(groups: Sequence[str]) -> Iterator[str]:
 
 
 def _first_comment(path: Path) -> str:
-    """Return the first sentence of the comment that begins a file of conf/."""
+    """Return the first sentence of the comment at the start of a file of conf/.
+
+    The sentence explains the choice that the file stands for.
+    """
     lines = path.read_text(encoding="utf-8").splitlines()
     comments = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
     text = " ".join(line for line in comments if not line.startswith("@package"))

@@ -21,9 +21,9 @@ from augment.model_passes import eval_mode
 from renderer.errors import InputError, single_line
 from train.settings import WIDERESNET
 
-# Start of the name of an architecture of torchvision.
+# The name of a network begins with this text if it is an architecture of torchvision.
 TORCHVISION = "torchvision:"
-# Start of the name of a Python function.
+# The name of a network begins with this text if a Python function of the user builds it.
 PYTHON = "python:"
 # Version of the description that is stored with the weights of a network. Version 1
 # lacked the size and the normalization of images, and the encoding of renders.
@@ -132,10 +132,10 @@ def _require_shape(depth: int, width: int, dropout: float) -> None:
         InputError: If an argument is outside its range, or if the network would
             have too many parameters.
     """
-    given = f"depth={depth}, width={width}"
     if depth < 10 or (depth - 4) % 6 or width < 1:
         raise InputError(
-            f"{given}: set depth to 10, 16, 22, ..., and width to 1 or more",
+            f"depth={depth}, width={width} is no shape of a WideResNet: "
+            "set depth to 10, 16, 22, ..., and width to 1 or more",
             "depth",
         )
     # Each of three groups of layers has this number of blocks. A block has two
@@ -146,7 +146,8 @@ def _require_shape(depth: int, width: int, dropout: float) -> None:
         parameter_count += block_count * 2 * (3 * 3 * channels**2)
     if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
         raise InputError(
-            f"{given}: {parameter_count:.1g} parameters are too many: set a smaller depth or width",
+            f"depth={depth}, width={width} gives too many parameters ({parameter_count:.1g}): "
+            "set a smaller depth or width",
             "depth",
         )
     if not 0 <= dropout < 1:
@@ -229,8 +230,10 @@ class Dropout(nn.Dropout):
             return x * self._draw_factors(x)
         if distributed.world_size() == 1:
             return super().forward(x)
+        # Each process draws for the shards of all processes, and uses the draws of its own.
         draws = torch.rand(distributed.world_size(), *x.shape, device=x.device)
-        return x * (draws[distributed.rank()] >= self.p) / (1 - self.p)
+        is_kept = draws[distributed.rank()] >= self.p
+        return x * is_kept / (1 - self.p)
 
     def _draw_factors(self, x: Tensor) -> Tensor:
         """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
@@ -245,8 +248,8 @@ class Dropout(nn.Dropout):
         draws = _draw_int16(value_count * distributed.world_size())
         shard_start = distributed.rank() * value_count
         shard_draws = draws[shard_start : shard_start + value_count]
-        # The draws are equally distributed integers, the smallest is -DROPOUT_LEVELS / 2.
-        # Values with one of the `dropped_levels` smallest integers are dropped.
+        # Draws are integers from -DROPOUT_LEVELS / 2 to DROPOUT_LEVELS / 2 - 1. The smallest
+        # `dropped_levels` of these integers mean that a value is dropped.
         dropped_levels = round(self.p * DROPOUT_LEVELS)
         threshold = dropped_levels - DROPOUT_LEVELS // 2
         # `ge_` replaces each draw by 1 if the value is kept, and by 0 if it is dropped.
@@ -316,7 +319,8 @@ def build_network(
         require_architecture(name.removeprefix(TORCHVISION))
     else:
         raise InputError(
-            f"name={name}: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION",
+            f"name={name} is not a network: "
+            f"choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION",
             "name",
         )
     # Architectures raise errors of many types if images are too small for them.
@@ -326,10 +330,9 @@ def build_network(
             network = Normalized(architecture, mean, std)
         _require_logits(network, len(classes), size)
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
-        task = f"{len(classes)} logits for images of {size} pixels per side"
         raise InputError(
-            f"name={name} does not give {task} ({single_line(error)}): "
-            "choose another network or another size",
+            f"name={name} does not give {len(classes)} logits for images of {size} pixels per "
+            f"side ({single_line(error)}): choose another network or another size",
             "name",
         ) from error
     return network

@@ -44,7 +44,15 @@ KEPT_ASIDE_PATTERNS = 5
 RESERVED = ("renders", "test", "before", KEPT_ASIDE)
 # Default of model.name.
 WIDERESNET = "wideresnet"
-# Value of train.freeze with which the last layer alone is trained, as by Kirichenko
+# Training settings that need a network with whose weights the training begins.
+NEEDS_INITIAL_NETWORK = (
+    "distillation_weight",
+    "soup",
+    "eval_mode",
+    "consistency_weight",
+    "interpolate",
+)
+# Value of train.freeze with which only the last layer is trained, as by Kirichenko
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
 # Choices of data.name.
@@ -144,6 +152,7 @@ class DataSettings(Settings):
     seed: int = setting(0, "Seed of the shapes.", minimum=0, maximum=MAX_SEED)
 
     def __post_init__(self) -> None:
+        """Check all values, and that data sets of the user have a path."""
         super().__post_init__()
         if self.name in DATA_SETS_WITH_PATH and not self.path:
             raise InputError(
@@ -360,16 +369,14 @@ class TrainSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that settings that need an initial network have one."""
         if self.init_from == "":
             raise InputError(
                 "init_from is not set: give a run folder, or torchvision:NAME with weights=FILE",
                 "init_from",
             )
         super().__post_init__()
-        for name in (
-            *("distillation_weight", "soup", "eval_mode"),
-            *("consistency_weight", "interpolate"),
-        ):
+        for name in NEEDS_INITIAL_NETWORK:
             value = getattr(self, name)
             if value and not self.init_from:
                 raise InputError(
@@ -410,6 +417,7 @@ class EvaluationSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and that each folder of photographs can have a sub-folder of scores."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
             raise InputError(
@@ -446,7 +454,7 @@ class EvaluationSettings(Settings):
 
 @dataclass(kw_only=True)
 class NetworkSettings(Settings):
-    """Weights, classes, image size and normalization of a user's own network."""
+    """Settings that describe a network of the user: its weights, classes and normalization."""
 
     weights: str | None = setting(
         None,
@@ -474,6 +482,7 @@ class NetworkSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and convert those that YAML reads as another type."""
         super().__post_init__()
         self.classes = class_texts(self.classes)
         self.normalize_light = normalized_light_values(self.normalize_light)
@@ -552,6 +561,7 @@ class ExperimentSettings(NetworkSettings):
     )
 
     def __post_init__(self) -> None:
+        """Check all values, and compute the number of renders."""
         super().__post_init__()
         if self.label is None:
             # The label follows from the meshes and the classes of the network.

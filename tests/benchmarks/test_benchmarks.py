@@ -79,8 +79,8 @@ def view() -> scene.View:
 
 
 def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
-    # With four times as many samples per side, even random samples would reduce
-    # the error to a quarter.
+    # Even random samples would reduce the error to a quarter, with four times as many of
+    # them per side.
     exact = scene.Converged(view)
     light = scene.coefficients(6).float()
     gradient_errors = []

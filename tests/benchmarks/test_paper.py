@@ -163,7 +163,7 @@ def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(
     radius = 0.02
     scene = make_scene(1)
     image = common.render_all(scene)
-    # No value is clamped, so that the sign step lowers each by the radius.
+    # The sign step lowers each value by the radius, because none is clamped.
     assert radius < image.min()
     assert image.max() < 1 - radius
     gray = float(image.mean()) - fraction_of_radius * radius

@@ -18,9 +18,9 @@ from tests.renderer.test_camera import RASTERIZERS, open_torus
 
 SIZE = 64
 INTRINSICS = np.array([[70.0, 0.0, 27.0], [0.0, 76.0, 39.0], [0.0, 0.0, 1.0]])
-# From the axes of OpenCV to those of OpenGL.
+# Matrix from the axes of OpenCV to the axes of OpenGL.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# Where the mesh is, far from the origin of the world.
+# Position of the mesh, far from the origin of the world.
 PLACE = np.array([20.0, -7.0, 3.0])
 
 

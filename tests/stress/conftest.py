@@ -53,7 +53,7 @@ Process = subprocess.Popen[str]
 def write_data(folder: Path) -> None:
     """Write data.npz, class folders, photographs and the textured mesh.obj."""
     rng = np.random.default_rng(0)
-    # With so little contrast, the accuracy changes for many epochs.
+    # The accuracy changes for many epochs, because the contrast is so low.
     save_colored_noise(folder / "data.npz", rng, contrast=8)
     write_images(folder / "images", ("apple", "orange"), rng)
     write_images(folder / "photographs", ("orange", "apple", "other_tomato"), rng)

@@ -49,7 +49,8 @@ def trained_weights() -> dict[str, Tensor]:
     images, labels = renders()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
-            module.momentum = 0.3  # so that the statistics are those of the last steps
+            # The statistics then are those of the last steps.
+            module.momentum = 0.3
     optimizer = torch.optim.AdamW(network.parameters(), 2e-3)
     for _ in range(STEPS):
         rows = torch.randperm(len(images))[:BATCH]

@@ -26,7 +26,7 @@ from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
-from train.runs.run_config import CONFIG, given_command, require_same_run, resumed
+from train.runs.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.runs.run_lock import sole_writer
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
@@ -81,7 +81,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
             the training run, is replaced by its absolute path.
         overrides: Settings on the command line, such as "train.epochs=3".
     """
-    command = given_command(overrides)
+    command = format_command(overrides)
     # The default name of the folder has the time, which differs between processes. All
     # processes take the name of the first one.
     folder = Path(broadcast(str(config.run))).absolute()
@@ -89,7 +89,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     # A resumed run keeps its recorded settings, except for single values that the
     # overrides change. An override that chooses a whole file prevents this.
     if config.train.resume and not any(map(_is_choice, overrides)):
-        config, command = resumed(config, overrides)
+        config, command = resume_config(config, overrides)
     settings = with_label(read_settings(ExperimentSettings, config))
     if settings.photographs_first:
         settings = _train_on_photographs(settings, folder, command)

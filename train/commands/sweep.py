@@ -29,7 +29,7 @@ from train.report.report_page import PAGE, report_of
 from train.report.results import require_new_run, require_replaceable
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
-from train.runs.run_config import given_command, require_same_run
+from train.runs.run_config import format_command, require_same_run
 from train.runs.run_lock import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
@@ -217,7 +217,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
     """
     settings = read_settings(ExperimentSettings, config)
     settings.train.resume = checkpoint.exists(folder)
-    command = given_command([_unescaped(override) for override in overrides])
+    command = format_command([_unescaped(override) for override in overrides])
     (run,) = load_runs({folder: settings}, command)
     run.fit()
     run.score()

@@ -122,7 +122,8 @@ def audit(
             positive_classes = find_positive_classes(label, meshes, items, classifier)
             if len(positive_classes) > 1:
                 raise InputError(
-                    f"meshes are of several classes ({', '.join(positive_classes)}): give one"
+                    f"meshes are of several classes ({', '.join(positive_classes)}): "
+                    "give meshes of one class"
                 )
             negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
             settings = AuditSettings(

@@ -144,13 +144,16 @@ def evaluate(
 def _choose_labels(
     classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
 ) -> list[str]:
-    """Return the names of the positive classes.
+    """Choose the positive classes, on whose photographs recall is measured.
 
     Args:
-        classifier: Network with the names of the classes.
-        folder: Folder of photographs.
-        label: Classes by name or index. None for all classes of the network
-            that have a sub-folder.
+        classifier: Network with the names of its classes.
+        folder: Folder of photographs with a sub-folder for each class.
+        label: Positive classes by name or index. None for all classes of the
+            network that have a sub-folder.
+
+    Returns:
+        Names of the positive classes.
 
     Raises:
         InputError: If a class is unknown, or if no sub-folder is named after a

@@ -46,7 +46,7 @@ from train.training.data import load_data
 from train.training.initial import initial_of
 from train.training.run import Run
 
-# Values of some settings of a section by name. None for the defaults.
+# Values of some settings of a group, such as "train", by name. None for the defaults.
 Section = Mapping[str, Any] | None
 
 
@@ -141,7 +141,7 @@ def harden(
             _trainable_copy(network), *options, normalize_light=normalize_light
         )
         if next(classifier.parameters(), None) is None:
-            raise InputError("network has no parameters: give one whose weights can be trained")
+            raise InputError("network has no parameters: give a network that can be trained")
         items = as_mappings("meshes", meshes, classifier, folder)
         labels = find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
@@ -170,7 +170,7 @@ def harden(
         settings = _read_settings(changes, sections)
         if settings.label is None:
             settings = with_classes_of_meshes(settings, classifier.classes)
-        with sole_writer("out", folder), _state_of_torch_kept():
+        with sole_writer("out", folder), _restores_torch():
             trained = _train(settings, classifier, has_report=out is not None)
     return _copy_with_weights(network, classifier, trained)
 
@@ -192,7 +192,7 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
     if not all(weight.is_leaf for weight in copy.parameters()):
         raise InputError(
             "network contains a module of torch.jit, whose copy cannot be trained: "
-            "give nb.load_classifier('network.pt') of the file that torch.jit.save wrote"
+            "write it with torch.jit.save to network.pt, and give nb.load_classifier('network.pt')"
         )
     return copy
 
@@ -235,8 +235,12 @@ def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
 
 
 @contextmanager
-def _state_of_torch_kept() -> Iterator[None]:
-    """Restore torch's threads, random state and choice of algorithms at the end of the block."""
+def _restores_torch() -> Iterator[None]:
+    """Restore the global state of torch at the end of the block, since training changes it.
+
+    The state is the number of threads, the random generators, and whether cuDNN
+    measures which algorithm is fastest.
+    """
     threads = torch.get_num_threads()
     is_benchmarked = torch.backends.cudnn.benchmark
     try:
@@ -260,6 +264,7 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
     """
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
+    # The caller of `harden` knows the setting data.path as the argument `photographs`.
     with keyed(**{"data.path": "photographs"}):
         data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)

@@ -79,7 +79,7 @@ def _mesh_fields(source: MeshSource, folder: Path) -> dict[str, Any]:
         written = Path(temporary) / "mesh.glb"
         export_mesh(source, written)
         content = written.read_bytes()
-    # With a hash of the mesh in its name, the file does not replace another mesh
+    # The hash of the mesh in the name of the file differs from that of any other mesh
     # that an earlier call wrote to the folder.
     path = folder / f"mesh_{hashlib.sha256(content).hexdigest()[:8]}.glb"
     folder.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,11 +17,14 @@ from renderer.io.files import atomic_write
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
 from train.report.plots import COLORS
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 TRANSFERS = "transfer.jsonl"
 TABLE = "sweep.csv"
 FIGURE = "sweep.png"
-# How the images of an adversary were made, in words. attack.jsonl has results for each
-# of these versions of the images.
+# Versions of the images of an adversary: the words say how they were made. attack.jsonl
+# has results for each version.
 VERSIONS = {
     "float": "computed",
     "reload": "rendered again from the saved files",
@@ -29,7 +32,7 @@ VERSIONS = {
 }
 # Titles of the two methods whose success is compared at each radius.
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
-# Color, line style and marker of these methods in the figure.
+# Color, line style and marker of the attack and of the random search in the figure.
 STYLES = {"adversarial": (COLORS[0], "-", "o"), "random": (COLORS[1], "--", "s")}
 # Suffix of the names of results on images without the simulated noise of a sensor.
 WITHOUT_NOISE = "_without_noise"
@@ -366,15 +369,9 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
     axes = figure.subplots()
     first, *others = norms
-    for method, title in METHODS.items():
+    for method in METHODS:
         rows = [record for record in records if record["method"] == method]
-        radii = [row[first] for row in rows]
-        values = [row["value"] for row in rows]
-        color, line, marker = STYLES[method]
-        axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
-        low = [row["low"] for row in rows]
-        high = [row["high"] for row in rows]
-        axes.fill_between(radii, low, high, color=color, alpha=0.15)
+        _draw_method(axes, method, rows, first)
     proportional = f"; {' and '.join(others)} in proportion" if others else ""
     axes.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate")
     axes.set_xlabel(f"{norms[first]} radius of {first}{proportional}")
@@ -389,3 +386,24 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
     image = io.BytesIO()
     figure.savefig(image, dpi=150)
     atomic_write(path, image.getbuffer())
+
+
+def _draw_method(
+    axes: "Axes", method: str, rows: Sequence[Mapping[str, Any]], parameter: str
+) -> None:
+    """Draw the success rate of one method as a line, in a band that is the 95% interval.
+
+    Args:
+        axes: Axes to draw on.
+        method: Name of the method in METHODS.
+        rows: Rows of sweep.csv with this method, one for each radius.
+        parameter: Attacked parameter whose radius is the x coordinate.
+    """
+    radii = [row[parameter] for row in rows]
+    values = [row["value"] for row in rows]
+    color, line, marker = STYLES[method]
+    title = METHODS[method]
+    axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
+    low = [row["low"] for row in rows]
+    high = [row["high"] for row in rows]
+    axes.fill_between(radii, low, high, color=color, alpha=0.15)

@@ -8,6 +8,7 @@ interval.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
@@ -105,7 +106,7 @@ class Evaluation:
     pools: Mapping[Subset, Pool]
 
 
-# For each method, the evaluations of its runs, in the order of their seeds.
+# Evaluations of the runs of each method, in the order of their seeds.
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
@@ -178,7 +179,9 @@ def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Eval
     pooled = Pooled(predictions, exclude, scores.thresholds)
     _require_sources(exclude, predictions)
     if by == "mesh" and not pooled.by_mesh:
-        raise InputError(f"by=mesh: {path} names no mesh: leave by=mesh out")
+        raise InputError(
+            f"by=mesh needs the mesh of each photograph, but {path} has none: leave by=mesh out"
+        )
     properties = ("label", by) if scores.by_label else (by,)
     return Evaluation(scored.run, pools_of(pooled, *properties))
 
@@ -313,7 +316,7 @@ def class_table(group: Scored) -> Table:
 
 @dataclass(frozen=True)
 class Difference(Estimate):
-    """Difference of a metric between two methods, with its 95% interval.
+    """Difference of a metric between a method and a reference, with its 95% interval.
 
     Attributes:
         before: Mean of the metric over the seeds of the reference.
@@ -417,8 +420,9 @@ def difference_tables(
         overall_only: Whether to leave out the rows of single sources, meshes or classes.
 
     Returns:
-        A table for each pair from `choose_pairs`. It has a row for each subset
-        of the images.
+        A table for each pair of methods that `choose_pairs` returns, such as a
+        method and the network with whose weights it began. It has a row for each
+        subset of the images.
     """
     tables = []
     for method, base in progress(choose_pairs(methods), "differences"):
@@ -563,19 +567,25 @@ def format_short_comparison(
         return str(group_table(evaluations, _title_of_all(exclude), by).known)
     titles = [title for title, members in groups.items() if members is group]
     rows = []
-    for method, members in methods.items():
+    for method, runs_of_method in methods.items():
         if method not in evaluations and not exclude:
+            # A published network has stored metrics, but no predictions.
             scored_runs = group.get(method, ()) if group else ()
             metrics = [_mean_stored_metric(scored_runs, name) for name in SHORT_METRICS]
         else:
             of_method = evaluations.get(method, ())
             metrics = [mean_metric(of_method, ALL, name) for name in SHORT_METRICS]
-        accuracies = [run.accuracy for run in members if run.accuracy is not None]
-        accuracy = Estimate(fmean(accuracies)) if accuracies else None
-        values = [_format_value(metric) for metric in (accuracy, *metrics)]
-        rows.append([method, len(members), *values, _format_gain(evaluations, method)])
+        values = [_format_value(metric) for metric in (_mean_accuracy(runs_of_method), *metrics)]
+        gain = _format_gain(evaluations, method)
+        rows.append([method, len(runs_of_method), *values, gain])
     header = ["network", "runs", "test accuracy", *map(metric_title, SHORT_METRICS)]
     return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).known)
+
+
+def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:
+    """Average the accuracy on the test images over runs. Return None if it is unknown for all."""
+    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
+    return Estimate(fmean(accuracies)) if accuracies else None
 
 
 def _title_of_all(exclude: Sequence[str]) -> str:
@@ -650,7 +660,8 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
     """
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
-        first, second = (next(iter(group.values()))[0].folder for group in found[:2])
+        first = _first_folder(found[0])
+        second = _first_folder(found[1])
         raise InputError(
             f"{second} has other photographs or sources than {first}: "
             "score both networks on the same folder with pnb-evaluate",
@@ -661,6 +672,12 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
             "give a name in the setting evaluate.photos of the runs",
         )
     return found[0] if found else None
+
+
+def _first_folder(group: Scored) -> Path:
+    """Return the folder of the scores of the first run in a group."""
+    first_runs = next(iter(group.values()))
+    return first_runs[0].folder
 
 
 def _is_scored_on(group: Scored, photographs: str) -> bool:

@@ -149,7 +149,7 @@ def _draw_curves(
             marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
             x, y = zip(*line, strict=True)
             axes.plot(x, y, marker=marker, ms=4, label=name, **style(index))
-            # Without a label, the other lines of the method have no entry in the legend.
+            # The other lines of the method get no label, and so no entry in the legend.
             name = None
     axes.set(xlabel=x_title)
     axes.locator_params(axis="x", integer=True, min_n_ticks=1)
@@ -166,7 +166,7 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     Returns:
         The plot. None if no seed has both positive and negative images.
     """
-    # For each method, the seeds that have both positive and negative images.
+    # Seeds of each method that have both positive and negative images.
     known = {}
     for method, pairs in methods.items():
         known[method] = [

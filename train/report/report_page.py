@@ -465,15 +465,30 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
     return None
 
 
-def _compare_on(group: Scored) -> FirstScreen | None:
-    """Compare two networks on the images that both were scored on.
-
-    If a method began with a trained network, the network of the last such method
-    is compared with it. Otherwise, the network of the last method is compared
-    with that of the first method.
+def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
+    """Choose which two networks the first screen compares.
 
     Args:
         group: Runs of each method with their scores on the same images.
+        pairs: Pairs of a method and the reference that it can be compared with.
+
+    Returns:
+        The last pair of a method and the trained network that it began with. If
+        all methods began with random weights, the last pair.
+    """
+    hardened = []
+    for method, reference in pairs:
+        first_run = group[reference][0].run
+        if first_run.method == summary.INITIAL:
+            hardened.append((method, reference))
+    return hardened[-1] if hardened else pairs[-1]
+
+
+def _compare_on(group: Scored) -> FirstScreen | None:
+    """Make the first screen, which compares two networks on the images that both were scored on.
+
+    Args:
+        group: Runs of each method with their scores on these images.
 
     Returns:
         The first screen. None if there is only one network.
@@ -482,13 +497,16 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
         return None
-    # Pairs of a method and the network that it began with.
-    with_initial = [pair for pair in pairs if group[pair[1]][0].run.method == summary.INITIAL]
-    is_hardening = bool(with_initial)
-    method, base = with_initial[-1] if is_hardening else pairs[-1]
+    method, base = _choose_pair(group, pairs)
+    is_hardening = group[base][0].run.method == summary.INITIAL
+    # All runs of a method have the same labels and images, so the first one stands for all.
     scored = group[method][0]
-    names = ("before hardening", "after hardening") if is_hardening else (base, method)
-    subjects = NETWORKS if is_hardening else (f"the network “{base}”", f"the network “{method}”")
+    if is_hardening:
+        names = ("before hardening", "after hardening")
+        subjects = NETWORKS
+    else:
+        names = (base, method)
+        subjects = (f"the network “{base}”", f"the network “{method}”")
     images = images_folder(scored.run, scored.name)
     labels = scored.scores.labels
     rows = {}
@@ -509,19 +527,20 @@ def _compare_on(group: Scored) -> FirstScreen | None:
 
 
 def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> list[str]:
-    """List the classes whose images show the objects of the training.
+    """List the positive classes whose test images show the same objects as the training images.
 
-    A run renders its own test images. A class without generated solids has no
-    other objects than those of the training.
+    These are test images that the run has rendered itself, of classes for which
+    the library cannot generate other objects.
 
     Args:
-        scored: A run with its scores.
-        images: Folder of the images that were scored. None if it is unknown.
+        scored: The run with its scores.
+        images: Folder of the scored images. None if it is unknown.
 
     Returns:
         Names of the classes in words.
     """
-    if images != scored.run.folder / KEPT_ASIDE:
+    is_rendered_by_run = images == scored.run.folder / KEPT_ASIDE
+    if not is_rendered_by_run:
         return []
     labels = scored.scores.labels
     return [in_words(label) for label in labels if not can_be_generated(label)]

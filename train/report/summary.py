@@ -29,7 +29,7 @@ from train.runs.run_log import BEFORE, PHASES, read_metrics
 from train.runs.saved_networks import PUBLISHED, load_selected
 from train.settings import label_names, published
 
-# With more methods than this, methods are named by numbers instead of by their settings.
+# Methods are named by numbers instead of by their settings if there are more than this.
 MAX_NAMED = 30
 # A method whose settings need a longer name than this is named by a number.
 LONGEST_NAME = 56
@@ -106,14 +106,14 @@ class PhotographScores:
             "images": self.images,
             "label": [*self.labels] if has_several else self.labels[0],
         }
-        entries |= _published(self.metrics)
+        entries |= _as_dictionaries(self.metrics)
         if self.thresholds:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point
         if has_several:
             by_label = {}
             for label, metrics in self.by_label.items():
-                by_label[label] = _published(metrics)
+                by_label[label] = _as_dictionaries(metrics)
             entries["by_label"] = by_label
         return entries
 
@@ -131,20 +131,21 @@ def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
     return {name: read_metric(summary, name) for name in METRICS}
 
 
-def _published(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to plain values for the file of a published network.
+def _as_dictionaries(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
+    """Convert metrics to dictionaries, which the file of a published network can hold.
 
     Args:
         metrics: Metrics by name. None if a metric is unknown.
 
     Returns:
-        The fields of each metric, such as "value", "low" and "high", by the
-        name of the metric. An unknown metric has no fields.
+        Dictionary for each metric, by the name of the metric. It has the fields
+        of `Estimate`, such as "value", "low" and "high". It is empty if the
+        metric is unknown.
     """
-    published = {}
+    dictionaries: dict[str, dict[str, Any]] = {}
     for name, estimate in metrics.items():
-        published[name] = {} if estimate is None else asdict(estimate)
-    return published
+        dictionaries[name] = {} if estimate is None else asdict(estimate)
+    return dictionaries
 
 
 @dataclass(frozen=True)
@@ -468,8 +469,8 @@ def _title_of(group: Scored) -> str:
         negative images follow if they are known.
     """
     members = [scored for scored_runs in group.values() for scored in scored_runs]
-    # The user has chosen the names of the sub-folders of a training run. Only a
-    # training run has epochs.
+    # The name of the sub-folder comes from a training run if there is one, because the user
+    # has chosen this name. Only a training run has epochs.
     of_training = [scored for scored in members if scored.run.epochs]
     first = of_training[0] if of_training else members[0]
     auc = first.scores.metrics["auc"]
@@ -771,7 +772,7 @@ def _example_row(line: Mapping[str, Any]) -> ExampleRow:
     """
     return ExampleRow(
         number=int(line["example"]),
-        # A dictionary has a class once if several views show it.
+        # The dictionary removes the class of a view if an earlier view has the same class.
         label=", ".join(dict.fromkeys(map(str, line["label"]))),
         before=_format_predictions(line["predicted_before"], line["confidence_before"]),
         after=_format_predictions(line["predicted"], line["confidence"]),
@@ -909,10 +910,13 @@ def _walk(folder: Path) -> Iterator[Path]:
         path = Path(root)
         names = set(file_names)
         subfolders.sort()
-        is_run = bool(names & files_of_run)
+        is_run = not names.isdisjoint(files_of_run)
+        is_other_result = not names.isdisjoint(files_of_others)
+        # A run that has not finished an epoch has only these files.
+        is_started_run = {CONFIG, "train.log"} <= names
         if is_run:
             scored = {name for name in subfolders if (path / name / SUMMARY).is_file()}
             # os.walk continues with the folders that stay in this list.
             subfolders[:] = [name for name in subfolders if name not in {BEFORE, *scored}]
-        if is_run or names & files_of_others or names >= {CONFIG, "train.log"}:
+        if is_run or is_other_result or is_started_run:
             yield path

@@ -18,22 +18,23 @@ from renderer.io.files import atomic_write
 from train.networks import VERSION
 from train.system.hashing import content_hash
 
-# Files of the last and the second to last checkpoint, and of the network that
-# validated best.
+# Files in the folder of a run: the last checkpoint, the checkpoint before it, and the
+# network with the highest validation accuracy.
 LAST = "last.pt"
 PREVIOUS = "previous.pt"
 BEST = "best.pt"
-# Key of the hash in a checkpoint.
+# Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write a checkpoint with `atomic_write`.
+    """Write a checkpoint with the hash of its content. The file is never half written.
 
     Args:
         path: Path of the file.
-        state: Tensors and plain values.
-        previous: Path to which an existing file is moved. None replaces it.
+        state: Content of the checkpoint: tensors and plain values.
+        previous: Path to which an existing file `path` is moved. None to
+            replace it.
     """
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
@@ -41,13 +42,13 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint.
+    """Read a checkpoint that `save` wrote, and check its hash.
 
     Args:
         path: The file.
 
     Returns:
-        The state that `save` wrote, on the CPU.
+        Content of the checkpoint, with all tensors on the CPU.
 
     Raises:
         InputError: If the file is missing, damaged or not a checkpoint.
@@ -55,10 +56,13 @@ def load(path: Path) -> dict[str, Any]:
     require_file(path, "give a run folder that holds a checkpoint")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(state, dict) or state.pop(HASH, None) != content_hash(state):
+        if not isinstance(state, dict):
+            raise ValueError("it is not a dictionary")
+        stored_hash = state.pop(HASH, None)
+        if stored_hash != content_hash(state):
             raise ValueError("its content does not match its hash")
     except Exception as error:
-        # torch raises errors of many types if a file is damaged or no checkpoint.
+        # `torch.load` raises errors of many types for a damaged file.
         raise InputError(
             f"checkpoint {path} is damaged or not a checkpoint: use another checkpoint of the run",
         ) from error
@@ -66,51 +70,56 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Check that a state can be used.
+    """Check that the content of a checkpoint has an architecture and finite weights.
 
     Args:
-        state: The state.
-        path: The file that an error names.
+        state: Content of the checkpoint.
+        path: File of the checkpoint, for the error message.
 
     Returns:
-        The same state.
+        The same content.
 
     Raises:
-        InputError: If it lacks finite weights or an architecture, or comes from a later version.
+        InputError: If the architecture or the weights are missing, if a weight is not finite, or
+            if a later version of the library wrote the file.
     """
     try:
         version = state["architecture"].get("version", 1)
-        finite = all(value.isfinite().all() for value in state["model"].values())
+        is_finite = all(value.isfinite().all() for value in state["model"].values())
     except (LookupError, AttributeError) as error:
         raise InputError(
-            f"checkpoint {path} has no architecture or weights: use another one",
+            f"checkpoint {path} has no architecture or weights: use another checkpoint",
         ) from error
     if version not in range(VERSION + 1):
         raise InputError(
-            f"checkpoint {path} was written by a later version ({version!r}): install that version",
+            f"checkpoint {path} has format version {version!r}, and this library knows versions "
+            f"up to {VERSION}: install the later version of the library that wrote it",
         )
-    if not finite:
-        raise InputError(f"checkpoint {path} has NaN or infinity in its weights: use another one")
+    if not is_finite:
+        raise InputError(
+            f"checkpoint {path} has NaN or infinity in its weights: use another checkpoint"
+        )
     return state
 
 
 def exists(folder: Path) -> bool:
-    """Return whether a folder holds a checkpoint to resume from."""
+    """Return whether the folder of a run holds a checkpoint from which the run can continue."""
     return any((folder / name).exists() for name in (LAST, PREVIOUS))
 
 
 def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Read the newest whole checkpoint of a run.
+    """Read the newest undamaged checkpoint of a run: last.pt, or else previous.pt.
 
     Args:
-        folder: The folder of the run.
+        folder: Folder of the run.
 
     Returns:
-        The state, and the fault of last.pt if it is damaged and previous.pt was
-        read. The fault is None if last.pt was read.
+        Pair of the content, and None. If last.pt is missing or damaged, the
+        content is that of previous.pt, and a sentence that says what is wrong
+        with last.pt replaces None.
 
     Raises:
-        InputError: If there is no whole checkpoint.
+        InputError: If there is no undamaged checkpoint.
     """
     try:
         return load(folder / LAST), None
@@ -121,21 +130,22 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the states of torch's random generators.
+    """Return the states of the random generators of torch.
 
     Returns:
-        State of the CPU under "cpu", and a list with the state of each GPU under
-        "cuda".
+        Mapping with two keys: "cpu" has the state of the generator of the CPU,
+        and "cuda" a list with the state of the generator of each GPU.
     """
     states = cuda.get_rng_state_all() if cuda.is_available() else []
     return {"cpu": torch.get_rng_state(), "cuda": states}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Restore random generators, on as many GPUs as both machines have.
+    """Set the random generators of torch to states that `random_state` returned.
 
     Args:
-        state: States under "cpu" and "cuda", as `random_state` returns them.
+        state: The states. If this machine has fewer or more GPUs than the
+            machine of the states, the surplus is ignored.
     """
     torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):

@@ -7,8 +7,9 @@ from tqdm import tqdm
 
 from train.runs.run_log import PHASES
 
-# Diagnostics of the attack that `epoch_metrics` records for each round, if an epoch
-# has several rounds.
+# Measurements of the attack on the training renders. A round is a part of the training
+# with the same renders. If an epoch has several rounds, the log has these measurements
+# of each round.
 SHOWN = ("attack_success_before", "attack_success", "steps")
 
 
@@ -18,29 +19,31 @@ def epoch_metrics(
     diagnostics: list[Mapping[str, float]],
     seconds: Mapping[str, float],
 ) -> dict[str, float]:
-    """Name the metrics of an epoch as metrics.jsonl and TensorBoard have them.
+    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
 
     Args:
-        trained: Metrics on the training images.
-        validated: Metrics on the validation images.
-        diagnostics: Diagnostics of the attack, for each round of renders.
-        seconds: Time that each phase of the epoch took.
+        trained: Metrics on the training images by name.
+        validated: Metrics on the validation images by name.
+        diagnostics: Measurements of the attack on the renders by name, for each
+            round. A round is a part of the epoch with the same renders.
+        seconds: Seconds of each phase of the epoch by the name of the phase.
 
     Returns:
-        Metrics by names such as "train/loss". The part before the slash is:
+        Metrics by names such as "train/loss". A name begins with:
 
-        - "train" or "validation";
-        - "augment", for means of the diagnostics over the rounds;
-        - "seconds";
-        - "round_1", "round_2" and so on, if there are several rounds.
+        - "train/" or "validation/" for metrics on these images;
+        - "augment/" for means of `diagnostics` over the rounds;
+        - "seconds/" for the times;
+        - "round_1/", "round_2/" and so on for `diagnostics` of each round, if
+          there are several rounds.
     """
-    augment = {}
+    means = {}
     for name in diagnostics[0]:
-        augment[name] = fmean(of_round[name] for of_round in diagnostics)
+        means[name] = fmean(of_round[name] for of_round in diagnostics)
     groups = {
         "train": trained,
         "validation": validated,
-        "augment": augment,
+        "augment": means,
         "seconds": seconds,
     }
     if len(diagnostics) > 1:
@@ -54,17 +57,17 @@ def epoch_metrics(
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
-    """Write the line of an epoch for the console.
+    """Write the line that the console shows after an epoch.
 
     Args:
-        epoch: The epoch, from 1.
-        epochs: The number of epochs.
-        metrics: The metrics of the epoch, by the names of `epoch_metrics`.
+        epoch: Number of the epoch, from 1.
+        epochs: Number of all epochs.
+        metrics: Metrics of the epoch, as `epoch_metrics` returns them.
 
     Returns:
-        The line. If the renders were attacked, it has the fraction of
-        successes among the clean-correct renders, which are the renders that
-        the network classifies correctly before the attack.
+        Line with the loss, the accuracies and the time. If the renders were
+        attacked, it also has the success rate of the attack among the
+        clean-correct renders, which are classified correctly before the attack.
     """
     total = sum(metrics[f"seconds/{name}"] for name in PHASES)
     parts = [
@@ -74,7 +77,8 @@ def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
     ]
     success = attack_success(metrics, "augment/")
     if success is not None:
-        # "attack_success_before" is the fraction that is misclassified before the attack.
+        # "attack_success_before" is the fraction of renders that are misclassified
+        # before the attack.
         correct = 1 - metrics["augment/attack_success_before"]
         parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
     duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"
@@ -85,18 +89,19 @@ def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
 
 
 def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
-    """Compute how often an attack succeeds on examples that are correct before it.
+    """Compute the success rate of an attack on renders that are classified correctly before it.
+
+    With the fraction b of misclassified renders before the attack, and the
+    fraction a after it, the rate is (a - b) / (1 - b).
 
     Args:
-        diagnostics: Values by name. "attack_success_before" and
-            "attack_success" are the fractions of all examples that are
-            misclassified before and after the attack.
-        prefix: Text before the names of the diagnostics, such as "augment/".
+        diagnostics: Values by name. "attack_success_before" is b, and
+            "attack_success" is a.
+        prefix: Text before these names, such as "augment/".
 
     Returns:
-        Among the examples that are classified correctly before the attack, the
-        fraction that is misclassified after it. None if no example is correct
-        before, or if there was no attack.
+        The success rate. None if no render is classified correctly before the
+        attack, or if there was no attack.
     """
     before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
     if before == 1:

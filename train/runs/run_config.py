@@ -33,23 +33,24 @@ from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, ma
 CONFIG = "config.yaml"
 # Packages whose versions config.yaml records, in addition to Python and torch.
 PACKAGES = ("torchvision", "numpy")
-# Settings that are not recorded with the command of a run, because each command
-# that resumes the run sets them.
+# Arguments that are left out when the command line of a run is recorded. Whoever
+# resumes the run gives other values.
 NOT_RECORDED = ("run=", "train.resume=")
 
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[str]:
-    """Read a text file, and report every error of reading and parsing as InputError.
+    """Read a text file, whose text is parsed in the block.
 
     Args:
         path: File in UTF-8.
 
     Yields:
-        Text of the file. Errors of the block are reported, too.
+        Text of the file.
 
     Raises:
-        InputError: If the file is missing or damaged. The message names it.
+        InputError: If the file cannot be read, or if the block raises any error.
+            The message names the file.
     """
     try:
         if not path.is_file():
@@ -62,13 +63,13 @@ def opened_text(path: Path) -> Iterator[str]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
+    """Read a JSON file that contains one object.
 
     Args:
         path: The file.
 
     Returns:
-        Contents of the object, which is not empty.
+        Keys and values of the object, at least one.
 
     Raises:
         InputError: If the file is missing or damaged.
@@ -81,13 +82,13 @@ def parse_object(text: str) -> dict[str, Any]:
     """Parse a JSON object.
 
     Args:
-        text: The object as JSON.
+        text: Text such as '{"epoch": 1}'.
 
     Returns:
-        Contents of the object, which is not empty.
+        Keys and values of the object, at least one.
 
     Raises:
-        ValueError: If the text is no JSON, no object, or an empty object.
+        ValueError: If the text is not JSON, not an object, or an empty object.
     """
     parsed = json.loads(text)
     if not isinstance(parsed, dict) or not parsed:
@@ -98,10 +99,11 @@ def parse_object(text: str) -> dict[str, Any]:
 def read_config(path: Path) -> DictConfig:
     """Read a config.yaml that a command wrote.
 
-    The file may come from someone else. Aliases are refused, because a few
-    nested aliases can stand for more values than the memory holds.
-    Interpolations are refused, because they can show the environment variables
-    of the reader. Settings that had other names get their present names.
+    The file may come from someone else. YAML aliases are refused, because a few
+    nested aliases can stand for more values than fit into memory.
+    Interpolations such as "${oc.env:HOME}" are refused, because they can reveal
+    environment variables. Settings that had other names in earlier versions get
+    their present names.
 
     Args:
         path: The file.
@@ -125,15 +127,15 @@ def read_config(path: Path) -> DictConfig:
 
 
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
-    """Write config.yaml with the settings, the facts, hashes of the inputs and versions.
+    """Write config.yaml: settings, facts, hashes of the input files, and versions of packages.
 
     Args:
-        folder: Folder of the file. If it does not exist, it is made.
+        folder: Folder of the file. If it does not exist, it is created.
         settings: Settings of the command, a dataclass.
-        **facts: What the command found at its start, such as the hardware. A
-            fact with an interpolation is left out, because `read_config`
-            refuses interpolations. With the fact `command`, the file also
-            records the folder in which the command was first given.
+        **facts: Facts that are not settings, such as the hardware. A fact that
+            contains "${" is left out, because `read_config` refuses such files.
+            With the fact `command`, the command line, the file also records the
+            folder in which the command was started.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
@@ -148,47 +150,58 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
 
 
 def _working_folder(folder: Path, command: str) -> str:
-    """Return the folder in which a command was first given.
+    """Return the folder in which the command of a run was started for the first time.
 
     Args:
-        folder: Folder of the run, which may hold the config.yaml of an earlier
-            command.
-        command: Command line of this command. If it begins with the recorded
-            command, it continues the run, and the recorded folder is returned.
+        folder: Folder of the run. It may hold a config.yaml that records an
+            earlier command and its working folder.
+        command: Command line of this command. It continues the run if it begins
+            with the recorded command. The recorded folder is then returned.
     """
     with suppress(InputError):
-        before = read_config(folder / CONFIG)
-        if command.startswith(str(before.get("command"))):
-            return before.get("working_folder") or os.getcwd()
+        recorded = read_config(folder / CONFIG)
+        if command.startswith(str(recorded.get("command"))):
+            return recorded.get("working_folder") or os.getcwd()
     return os.getcwd()
 
 
 def decisive_settings(settings: Any) -> dict[str, object]:
-    """Select the settings that change the result of a run.
+    """Select the settings that decide the result of a run.
+
+    The number of threads, for example, is left out. In paths, "<run>" stands for
+    the folder of the run. A run whose folder was moved then has equal settings.
 
     Args:
-        settings: Settings of a command, a dataclass or a DictConfig.
+        settings: Settings of a command: a dataclass, or a DictConfig that was
+            read from config.yaml.
 
     Returns:
-        Values by dotted key. A path inside the folder of the run starts with
-        "<run>", so that a run that was moved has equal settings.
+        Values by dotted key, such as "train.epochs".
     """
     if isinstance(settings, DictConfig):
-        plain: Any = OmegaConf.to_container(settings)
+        nested: Any = OmegaConf.to_container(settings)
     else:
-        plain = asdict(settings)
-    moved = _move_paths(plain, str(plain.get("run")), "<run>")
+        nested = asdict(settings)
+    nested = _move_paths(nested, str(nested.get("run")), "<run>")
+    # Each key gets a dot at its end, so that "run" does not match "runs".
     circumstances = tuple(f"{key}." for key in CIRCUMSTANCES)
-    return {key: value for key, value in dotted(moved) if not f"{key}.".startswith(circumstances)}
+    decisive = {}
+    for key, value in dotted(nested):
+        if not f"{key}.".startswith(circumstances):
+            decisive[key] = value
+    return decisive
 
 
 def _move_paths(value: Any, folder: str, to: str) -> Any:
-    """Replace a folder at the start of all paths in nested settings.
+    """Replace the path of a folder at the start of all texts in nested settings.
 
     Args:
-        value: Settings as nested mappings and lists. Any text may be a path.
-        folder: Folder to replace.
-        to: Text that takes the place of the folder.
+        value: Settings as nested dictionaries and lists. Any text may be a path.
+        folder: Path that is replaced.
+        to: Text that replaces it.
+
+    Returns:
+        Copy of the settings.
     """
 
     def move(text: str) -> str:
@@ -198,62 +211,88 @@ def _move_paths(value: Any, folder: str, to: str) -> Any:
     return mapped(value, move)
 
 
-def given_command(overrides: Sequence[str]) -> str:
-    """Format the command of a training run without the folder of the run.
+def format_command(overrides: Sequence[str]) -> str:
+    """Format the command line of a training run, as config.yaml records it.
 
     Args:
-        overrides: Overrides of the run, such as "train.epochs=3".
+        overrides: Arguments of the command, such as "train.epochs=3".
 
     Returns:
-        Command line.
+        Command line without the arguments in NOT_RECORDED, such as the folder of
+        the run.
     """
     return shlex.join([*program("train"), *_recorded(overrides)])
 
 
 def _recorded(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides without run= and train.resume=, see NOT_RECORDED."""
+    """Return the arguments of a command that config.yaml records.
+
+    The folder of the run and the request to resume it are left out.
+
+    Args:
+        overrides: Arguments such as "train.epochs=3".
+    """
     return [override for override in overrides if not override.startswith(NOT_RECORDED)]
 
 
-def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
-    """Combine the settings of an earlier run with the overrides of a command.
+def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
+    """Combine the settings of an earlier run with the arguments of a command that resumes it.
 
     Args:
         config: Configuration of the command. `config.run` is the folder of the
             earlier run.
-        overrides: Overrides of the command. `config` has their values.
+        overrides: Arguments of the command, such as "train.epochs=20". They
+            replace settings of the earlier run. `config` has their values.
 
     Returns:
-        Configuration, and the command that began the run followed by the new
-        overrides.
+        Pair of the combined configuration, and the command line to record: the
+        command of the earlier run followed by the new arguments.
 
     Raises:
         InputError: If the folder holds no training run.
     """
     folder = Path(config.run).absolute()
-    saved: Any = {}
-    if (folder / CONFIG).is_file():
-        saved = OmegaConf.to_container(read_config(folder / CONFIG))
-    if not isinstance(saved.get("train"), dict) or not isinstance(saved.get("run"), str):
-        raise InputError(
-            f"run={config.run} holds no run to resume: "
-            "give the folder of one, or leave train.resume out",
-        )
+    recorded = _read_recorded(folder)
     names = [item.name for item in fields(ExperimentSettings)]
-    settings = {name: saved[name] for name in names if name in saved}
-    # The baselines of a run lie in folders below it. Their settings name the
-    # folder of the whole run, and their paths need no change.
-    if Path(saved["run"]) not in folder.parents:
-        settings = _move_paths(settings, saved["run"], str(folder))
+    settings = {name: recorded[name] for name in names if name in recorded}
+    # If the folder was moved, the paths of its files have changed. A baseline, which was
+    # trained for comparison, lies in a sub-folder of the recorded folder, and was not moved.
+    is_below_recorded = Path(recorded["run"]) in folder.parents
+    if not is_below_recorded:
+        settings = _move_paths(settings, recorded["run"], str(folder))
     merged = OmegaConf.create(settings)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
         if key != "run":
             value = OmegaConf.select(config, key)
             OmegaConf.update(merged, key, value, merge=False, force_add=True)
-    words = [*shlex.split(str(saved.get("command", ""))), *_recorded(overrides)]
-    # A dictionary removes words that occur twice and keeps the order.
+    words = [*shlex.split(str(recorded.get("command", ""))), *_recorded(overrides)]
+    # A dictionary has each word once, in the same order.
     return merged, shlex.join(dict.fromkeys(words))
+
+
+def _read_recorded(folder: Path) -> dict[str, Any]:
+    """Read the config.yaml of a training run that is to be resumed.
+
+    Args:
+        folder: Folder of the run.
+
+    Returns:
+        Contents of the file as nested dictionaries.
+
+    Raises:
+        InputError: If the folder holds no training run.
+    """
+    recorded: Any = {}
+    if (folder / CONFIG).is_file():
+        recorded = OmegaConf.to_container(read_config(folder / CONFIG))
+    is_training = isinstance(recorded.get("train"), dict)
+    if not is_training or not isinstance(recorded.get("run"), str):
+        raise InputError(
+            f"run={folder} holds no run to resume: "
+            "give the folder of a training run, or leave train.resume out",
+        )
+    return recorded
 
 
 def require_same_run(
@@ -261,9 +300,10 @@ def require_same_run(
     settings: ExperimentSettings,
     finished: bool = False,
 ) -> DictConfig:
-    """Check that a training run in a folder has given settings and input files.
+    """Check that the training run in a folder has the settings and input files of a command.
 
-    A run that is not finished may get more epochs and another evaluation.
+    The command may give a run that is not finished more epochs, and other
+    photographs to score.
 
     Args:
         folder: Folder of the run.
@@ -271,10 +311,10 @@ def require_same_run(
         finished: Whether the run is finished.
 
     Returns:
-        Configuration that the folder has.
+        Configuration of the run in the folder.
 
     Raises:
-        InputError: See `require_same`.
+        InputError: If another setting differs, or if an input file has changed.
     """
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
@@ -290,35 +330,40 @@ def require_same(
     folder: Path,
     settings: Any,
     elsewhere: str,
-    permitted: Callable[[str, Any, Any], bool],
+    is_permitted: Callable[[str, Any, Any], bool],
 ) -> DictConfig:
-    """Check that the config.yaml of a folder has given decisive settings and input files.
+    """Check that an earlier command wrote a folder with the same settings and input files.
+
+    Only settings that decide the result are compared (see `decisive_settings`).
 
     Args:
-        folder: Folder with config.yaml.
-        settings: Settings of the command, a dataclass.
-        elsewhere: Setting that names the folder, for the error message.
-        permitted: Function of a dotted key, its old value and its new value.
-            It returns whether this change is allowed.
+        folder: Folder with the config.yaml of the earlier command.
+        settings: Settings of this command, a dataclass.
+        elsewhere: Setting with which the user can choose another folder, for the
+            error message.
+        is_permitted: Function that is called for each setting that differs, with
+            its dotted key, its old value and its new value. It returns whether
+            the setting may differ.
 
     Returns:
-        Configuration that the folder has.
+        Configuration in config.yaml.
 
     Raises:
-        InputError: If a decisive setting has another value and the change is
-            not allowed, or if an input file has changed.
+        InputError: If a setting differs and may not, or if an input file has
+            changed.
     """
     config = read_config(folder / CONFIG)
-    # A setting that did not exist when the file was written has its default.
-    before = decisive_settings(OmegaConf.structured(type(settings))) | decisive_settings(config)
-    asked = decisive_settings(settings)
-    for key in sorted(before.keys() | asked.keys()):
+    # A setting that the earlier version did not have has its default value.
+    defaults = OmegaConf.structured(type(settings))
+    before = decisive_settings(defaults) | decisive_settings(config)
+    now = decisive_settings(settings)
+    for key in sorted(before.keys() | now.keys()):
         old = before.get(key)
-        new = asked.get(key)
-        if old != new and not permitted(key, old, new):
+        new = now.get(key)
+        if old != new and not is_permitted(key, old, new):
             raise InputError(
                 f"{folder} was made with {key}={old}, not {new}: "
-                f"give its setting, or another folder with {elsewhere}",
+                f"set {key} to the former value, or choose another folder with {elsewhere}",
             )
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
@@ -331,15 +376,14 @@ def require_same(
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
-    """Hash the input files that the settings name.
+    """Compute the SHA-256 of each input file that the settings name.
 
     Args:
         settings: Settings of a command, a dataclass.
 
     Returns:
-        SHA-256 by path. For a file, the hash covers its contents. For the
-        folder of a run, it covers the contents of the selected network. For
-        any other folder, it covers the names and sizes of the files.
+        Hash by path. The hash of a training run covers its selected network. The
+        hash of any other folder covers the names and sizes of its files.
     """
     values = dict(dotted(asdict(settings)))
     texts = _collect_texts([values.get(key) for key in INPUTS])
@@ -348,31 +392,51 @@ def fingerprints(settings: Any) -> dict[str, str]:
 
 
 def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts of a setting that may be paths of input files.
+    """Collect the texts in a setting that may be paths of input files.
 
     Args:
-        value: A text, a mapping with the keys "mesh" and "props", or a list of
-            these. All other values have no path.
+        value: Value of the setting: a text, a mapping that describes an object
+            with its "mesh" and its "props" (other meshes beside it), or a list
+            of these. Any other value has no path.
     """
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("props")]
     if isinstance(value, list):
-        return set().union(*map(_collect_texts, value))
+        texts: set[str] = set()
+        for item in value:
+            texts |= _collect_texts(item)
+        return texts
     return {value} if isinstance(value, str) else set()
 
 
 def _fingerprint(path: Path) -> str:
-    """Hash a file or a folder, see `fingerprints`."""
+    """Compute the SHA-256 of a file, of a training run or of another folder.
+
+    Args:
+        path: File or folder that exists.
+
+    Returns:
+        Hash of the contents of the file, or of the selected network of the run.
+        For another folder, hash of the names and sizes of its files.
+    """
     path = selected_file(path) or path
     if path.is_dir():
         files = [file for file in path.rglob("*") if file.is_file()]
         sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
         return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
-    return _content_hash(path, path.stat().st_size, path.stat().st_mtime_ns)
+    status = path.stat()
+    return _hash_file(path, status.st_size, status.st_mtime_ns)
 
 
 @cache
-def _content_hash(path: Path, size: int, modified: int) -> str:
-    """Hash the contents of a file. A new size or time of change renews the cached hash."""
+def _hash_file(path: Path, size: int, modified: int) -> str:
+    """Compute the SHA-256 of a file. The result is cached.
+
+    Args:
+        path: The file.
+        size: Its size in bytes. With another size, the hash is computed again.
+        modified: Time of its last change. With another time, the hash is
+            computed again.
+    """
     with open(path, "rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 from renderer.errors import InputError
 from renderer.io.files import remove_unfinished
 
-# File that a process locks.
+# Name of the file in a folder that a process locks while it writes to the folder.
 LOCK = ".lock"
 # File with the reason why the last training in the folder failed.
 FAILURE = "failed.txt"
@@ -20,16 +20,16 @@ FAILURE = "failed.txt"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[bool]:
-    """Try to lock a folder until the block ends.
+    """Try to lock a folder until the block ends, so that no other process writes to it.
 
-    With the lock, the function removes files that a stopped process left
-    unfinished.
+    If this succeeds, temporary files that a stopped process left in the folder
+    are removed.
 
     Args:
-        folder: Folder to lock. If it does not exist, it is made.
+        folder: Folder to lock. If it does not exist, it is created.
 
     Yields:
-        Whether this process has the lock. If not, another process has it.
+        True if this process has the lock. False if another process has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
@@ -45,7 +45,9 @@ def locked(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def sole_writer(key: str, *folders: Path) -> Iterator[None]:
-    """Lock folders until the block ends, and then remove the folders that are empty.
+    """Lock folders until the block ends, so that no other process writes to them.
+
+    Folders into which the block has written nothing are removed at the end.
 
     Args:
         key: Setting that names the folders, for the error message.
@@ -69,7 +71,7 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder that holds only the lock file."""
+    """Remove a folder if it holds nothing but the lock file."""
     names = [path.name for path in folder.iterdir()]
     if names == [LOCK]:
         (folder / LOCK).unlink()

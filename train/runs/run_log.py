@@ -21,30 +21,30 @@ from train.runs.run_config import opened_text, parse_object
 from train.runs.run_lock import FAILURE
 
 METRICS = "metrics.jsonl"
-# Subfolder with the images of the epochs.
+# Sub-folder of a run with images of the training renders of some epochs.
 RENDERS = "renders"
-# Subfolder with the scores of the network that the run began with.
+# Sub-folder of a run with the scores of the network before the training.
 BEFORE = "before"
-# Largest width of the images of an attack in pixels. Smaller images are
-# enlarged to about this width.
+# Images of an attack are reduced or enlarged to about this width in pixels.
 EXAMPLE = 128
-# Phases of an epoch, whose seconds are logged. Other phases are parts of these.
+# Phases of an epoch. The log has the seconds of each phase. Together, the phases take
+# the whole time of the epoch.
 PHASES = ("attack", "training", "evaluation", "input_output")
-# Renders in a row of the grid of an epoch.
+# Number of renders in a row of an image with all renders of an epoch.
 GRID_COLUMNS = 20
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Read metrics.jsonl.
+    """Read the metrics of a run from metrics.jsonl.
 
-    The file has one line for each epoch, and then a line with the final scores.
-    If a crash cut the last line short, the line is left out.
+    The file has a line for each epoch, and then a line with the final scores. An
+    incomplete last line, which a crash can leave, is ignored.
 
     Args:
         folder: Folder of the run.
 
     Returns:
-        Metrics by name, for each line. Empty if there is no file.
+        For each line, the metrics by name. Empty if there is no file.
 
     Raises:
         InputError: If the file is damaged.
@@ -53,7 +53,9 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     if not path.is_file():
         return []
     with opened_text(path) as text:
-        lines = [parse_object(line) for line in text.split("\n")[:-1]]
+        # A complete line ends with a line break.
+        complete_lines = text.split("\n")[:-1]
+        lines = [parse_object(line) for line in complete_lines]
         for line in lines:
             if any(not isinstance(value, int | float) for value in line.values()):
                 raise ValueError("a value is not a number")
@@ -63,8 +65,8 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 def remove_run(folder: Path) -> None:
     """Remove the results of a run, before another run starts in its folder.
 
-    The scores on photographs, the log and the report remain, because the next
-    run writes files of the same names.
+    The scores on photographs, the log and the report are not removed, because
+    the new run replaces them.
 
     Args:
         folder: Folder of the run.
@@ -78,9 +80,10 @@ def remove_run(folder: Path) -> None:
 
 
 class RunLog:
-    """Writer of metrics.jsonl, of TensorBoard's events and of images.
+    """Writer of the metrics and images of a training run.
 
-    All methods raise OSError if the disk is full.
+    Metrics go to metrics.jsonl and to TensorBoard, images to the sub-folder
+    renders/. All methods raise OSError if the disk is full.
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
@@ -88,12 +91,12 @@ class RunLog:
 
         Args:
             folder: Folder of the run.
-            history: Metrics of the earlier epochs of a resumed run. They
-                replace the lines of metrics.jsonl, because a resumed run
-                repeats the epochs after its checkpoint.
+            history: Metrics of the epochs before the checkpoint from which a run
+                is resumed. They replace the lines of metrics.jsonl, because the
+                run repeats the epochs after the checkpoint.
         """
-        # This import takes half a second, and programs that only read metrics
-        # do not need it.
+        # This import takes half a second. Programs that only read metrics do not
+        # need it.
         from torch.utils.tensorboard import SummaryWriter
 
         self._metrics = folder / METRICS
@@ -104,13 +107,14 @@ class RunLog:
         self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
-        """Log numbers.
+        """Write the metrics of an epoch, or the final scores, to the log.
 
         Args:
-            values: Numbers by name. TensorBoard groups names such as
-                "train/loss" by the part before the slash.
-            epoch: Number of the epoch, from 1. None for the final scores, which
-                end the log. TensorBoard shows them one step after the last epoch.
+            values: Metrics by name. In TensorBoard, metrics with the same text
+                before the slash, as in "train/loss", form a group.
+            epoch: Number of the epoch, from 1. None for the final scores, after
+                which nothing is logged. TensorBoard shows them as if they
+                belonged to one more epoch.
         """
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
@@ -125,10 +129,12 @@ class RunLog:
             self._board.flush()
 
     def renders(self, images: Tensor, epoch: int) -> None:
-        """Write renders as a grid to TensorBoard and to renders/epoch_EPOCH.png.
+        """Write the training renders of an epoch as one image with a grid of renders.
+
+        The image goes to TensorBoard and to renders/epoch_EPOCH.png.
 
         Args:
-            images: Renders, shape (E, 3, H, W), in [0, 1].
+            images: Renders in [0, 1], shape (N, 3, H, W).
             epoch: Number of the epoch, from 1.
         """
         from torchvision.utils import make_grid
@@ -146,10 +152,11 @@ class RunLog:
         classes: Sequence[str],
         epoch: int,
     ) -> None:
-        """Write successful attacks to renders/attacks_EPOCH.png, one in each row.
+        """Write an image of successful attacks on training renders: renders/attacks_EPOCH.png.
 
-        A row shows the images and white balls in the lighting, before and after
-        the attack. The prediction stands over the label of the image.
+        Each attack has a row with four images: the render before the attack, a
+        white ball in the same lighting, and both after the attack. The predicted
+        class and the true class stand below a render.
 
         Args:
             attack_examples: The attacks.
@@ -157,10 +164,13 @@ class RunLog:
             epoch: Number of the epoch, from 1.
         """
         labels = []
-        for index in attack_examples.labels:
-            labels.append(classes[index] if index >= 0 else "negative")
+        for label in attack_examples.labels:
+            # A negative number is a complementary label: the render shows another object
+            # than the positive class.
+            labels.append(classes[label] if label >= 0 else "negative")
         columns = {}
-        # Index 0 has the state before the attack, and index 1 the state after it.
+        # The fields of `attack_examples` have the state before the attack at index 0,
+        # and the state after it at index 1.
         for index, name in enumerate(("before", "after")):
             images = attack_examples.images[index]
             captions = _captions(attack_examples.predictions[index], classes, labels)
@@ -182,16 +192,17 @@ def _captions(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[tuple[str, str]]:
-    """Write the two captions of each image.
+    """Write the two lines of the caption of each image: predicted class and true class.
 
     Args:
-        probabilities: Probabilities of the classes, shape (N, classes).
+        probabilities: Probability of each class for each image, shape
+            (N, classes).
         classes: Names of the classes.
-        labels: Label of each image in words.
+        labels: Name of the true class of each image.
 
     Returns:
         For each image, the most probable class with its probability, such as
-        "81% orange", and the label.
+        "81% orange", and the true class.
     """
     highest, predicted = torch.max(probabilities, dim=1)
     captions = []

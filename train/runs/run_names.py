@@ -1,4 +1,4 @@
-"""The names of the folders of a sweep's runs."""
+"""Name the folders of the runs of a sweep (several runs that differ in some settings)."""
 
 from __future__ import annotations
 
@@ -11,29 +11,31 @@ from omegaconf import OmegaConf
 
 from train.settings import CIRCUMSTANCES
 
-# Maximum number of characters of a setting in the name of a folder.
+# Largest number of characters of one setting in the name of a folder.
 MAX_PART = 48
-# Maximum number of characters of the name of a folder. File systems take 255.
+# Largest number of characters of the name of a folder. File systems allow 255.
 MAX_NAME = 200
-# Start of the overrides that are settings of Hydra itself.
+# Pattern of arguments that set something of Hydra itself, such as "hydra/launcher=...".
 HYDRAS_OWN = re.compile(r"\+*hydra[./]")
 
 
 def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str = "") -> str:
-    """Name the folder of a run by its settings.
+    """Name the folder of a run by the settings that the command line gives.
 
-    With seed=0 and augment=none, the name is such as
-    `augment-none+seed-0@7d0a3f52`. The settings are in alphabetical order. The
-    name ends with a hash of the settings that decide the result. Characters
-    that a file system or Hydra's command line might refuse are replaced.
+    For the arguments seed=0 and augment=none, the name is
+    `augment-none+seed-0@7d0a3f52`. It has the settings in alphabetical order,
+    and ends with a hash of them. Characters that are special to file systems or
+    to Hydra are replaced by "_".
 
     Args:
-        overrides: The overrides of the run.
-        fixed: Keys that all runs of the sweep share. They are not shown.
-        parent: Folder of the sweep. A run that has a folder there keeps its name.
+        overrides: Arguments of the command line of the run.
+        fixed: Keys of settings that are equal in all runs of the sweep. They are
+            part of the hash, but are not shown.
+        parent: Folder of the sweep. If it has a folder with the same hash, the
+            name of this folder is returned.
 
     Returns:
-        The name of the folder.
+        Name of the folder.
     """
     pairs = []
     for override in overrides:

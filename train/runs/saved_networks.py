@@ -1,4 +1,4 @@
-"""The networks that runs have trained: finding, loading, publishing and exporting them."""
+"""Find, load, publish and export the networks that training runs have saved."""
 
 import io
 import json
@@ -27,21 +27,22 @@ from train.runs.checkpoint import BEST, checked, load
 from train.settings import published
 from train.system.user_errors import keyed
 
-# The name of a trained network among the sources of classifiers is this, and then a folder.
+# A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
-# The file of a published network, in half precision.
+# File of a published network, with weights in half precision.
 PUBLISHED = "model.safetensors"
-# The file of a network that began as a classifier, whose weights have the names of its own file.
+# File in the folder of a run that hardened a classifier of the user. It has the trained weights
+# under the names that they have in the file of the user.
 WEIGHTS = "weights.pt"
-# Facts in the file of a published network besides the weights.
+# Entries in the file of a published network, in addition to the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
-# Entries of the description of a network that are not needed to build it.
+# Entries in the description of a network that are no arguments of `build_network`.
 FACTS = ("version", "encoding", "validation")
-# Entry of the description of a network that normalizes the light of images, with the settings.
+# Entry in the description of a network that normalizes the light of images, with its settings.
 NORMALIZE_LIGHT = "normalize_light"
-# Prefix of the names of the weights of a network that normalizes the light of images.
+# If a network normalizes the light of images, the names of its weights begin with this text.
 LIGHT_PREFIX = "network."
-# `of_one_architecture` cuts the reason in its error to this many characters.
+# Largest number of characters of a reason that an error message quotes.
 LONGEST_REASON = 300
 
 
@@ -53,54 +54,53 @@ def load_network(
     normalization: Normalization = None,
     normalize_light: NormalizeLight = None,
 ) -> Classifier:
-    """Load a classifier by its name: a trained network, or one that was trained elsewhere.
+    """Load a classifier by its name: the network of a training run, or any other classifier.
+
+    The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
+    its own weights, classes, size and normalization, so these must then be None.
 
     Args:
-        name: "run:FOLDER" for the network of a run, or a name that `nb.load_classifier`
-            takes.
-        weights: A local file of weights, if the source brings none.
-        classes: Names of the classes, or a file of them, as for `nb.load_classifier`.
-        size: Pixels per side of the images, as there.
-        normalization: Normalization of the images, as there.
-        normalize_light: Whether the light of each image is normalized first, as there.
+        name: "run:FOLDER" for the network of a run, or a name for `nb.load_classifier`.
+        weights: File of weights.
+        classes: Names of the classes, or a file of them.
+        size: Pixels per side of the images.
+        normalization: Normalization of the images.
+        normalize_light: Normalization of the light of each image.
 
     Returns:
         The classifier.
 
     Raises:
-        InputError: If there is no such network, or the weights are not for it.
+        InputError: If there is no such network, or if the other arguments do not fit it.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
-    folder = _run_of(Path(name))
+    folder = _find_run(Path(name))
     if folder is not None:
-        raise InputError(f"name={name} belongs to a run: give {RUN}{folder}", "name")
+        raise InputError(f"name={name} belongs to a run: give {RUN}{folder} instead", "name")
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
+        # Errors about the folder name the argument `name`, in which the user gave it.
         with keyed(run="name"):
             classifier = load_run(name.removeprefix(RUN), weights)
         return classifier.normalizing_light(normalize_light)
     return load_classifier(name, weights, classes, size, normalization, normalize_light)
 
 
-def _run_of(path: Path) -> Path | None:
-    """Find the run that a path belongs to.
+def _find_run(path: Path) -> Path | None:
+    """Return the folder of a training run if a path is this folder, or its file weights.pt.
 
     Args:
-        path: Any path. The folder of a run has a file best.pt.
+        path: Any path. The folder of a run contains the file best.pt.
 
     Returns:
-        Folder of the run, if the path is this folder or its file weights.pt.
-        Otherwise None.
+        Folder of the run. None if the path does not belong to a run.
     """
-    for folder in (path, path.parent):
-        is_named = folder == path or path.name == WEIGHTS
-        if is_named and (folder / BEST).is_file():
-            return folder
-    return None
+    folder = path.parent if path.name == WEIGHTS else path
+    return folder if (folder / BEST).is_file() else None
 
 
 def load_chosen(settings: ClassifierSettings) -> Classifier:
-    """Load the classifier that the settings of a command choose; see `load_network`."""
+    """Load the classifier that the settings of a command choose."""
     return load_network(
         str(settings.classifier),
         settings.weights,
@@ -116,19 +116,21 @@ def load_run(
     weights: str | Path | None = None,
     model: str | None = None,
 ) -> Classifier:
-    """Load the network that a run selected.
+    """Load the network that a training run selected, or a published network.
 
     Args:
-        run: The folder of the run, a folder below pretrained/, or a file of either.
-        weights: None. A run has its own weights.
-        model: "python:package.module:function", if such a function makes the network. Code runs
-            because the user names it, and never because a file does.
+        run: Folder of the run, folder below pretrained/, or the file of the network in it.
+        weights: Must be None, because a run has its own weights.
+        model: "python:package.module:function" if this function of the user built the network.
+            The file of the network names the function, too, but code from a file is never run
+            unless the user names it. None for any other network.
 
     Returns:
         The network.
 
     Raises:
-        InputError: If there is no such network, `weights` is given, or `model` is missing.
+        InputError: If there is no such network, if `weights` is not None, or if `model` is
+            missing.
 
     Example:
         >>> import norm_balls as nb
@@ -137,7 +139,7 @@ def load_run(
     """
     if weights is not None:
         raise InputError(
-            f"weights={weights} is not for {RUN}{run}, which has its own: leave it out",
+            f"weights={weights} cannot replace the weights of {RUN}{run}: leave weights out",
             "weights",
         )
     require_kind("model", model, str | None, "python:package.module:function, or None")
@@ -146,11 +148,11 @@ def load_run(
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
-            f"the network in {path} is made by {name}: "
+            f"the network in {path} is built by {name}: "
             f"give model={name} to run that code or, "
             f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights",
         )
-    with of_one_architecture(path):
+    with checks_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
         light = shape.pop(NORMALIZE_LIGHT, None)
@@ -159,29 +161,31 @@ def load_run(
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
         classifier.operating_points = _operating_points(state)
         for point in classifier.operating_points:
-            classifier.label(point.label)  # This raises InputError if the class is missing.
+            # This call raises InputError if the network lacks the class.
+            classifier.label(point.label)
         return classifier
 
 
 def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
-    """Read the operating points that are stored with a network.
+    """Read the operating points (thresholds on the log-odds) that are stored with a network.
 
     Args:
-        state: Content of the file of a network. "operating_point" holds the
-            fields of one point, or a list with the fields of several.
+        state: Content of the file of a network. The entry "operating_point" is
+            a mapping with the fields of `OperatingPoint`, or a list of such
+            mappings. It may be missing.
     """
     stored = state.get("operating_point", [])
     if not isinstance(stored, list):
         stored = [stored]
-    return [OperatingPoint(**facts) for facts in stored]
+    return [OperatingPoint(**values) for values in stored]
 
 
 @contextmanager
-def of_one_architecture(path: Path) -> Iterator[None]:
-    """Raise InputError if a file does not fit the network that is built or filled inside.
+def checks_architecture(path: Path) -> Iterator[None]:
+    """Raise InputError if the block cannot load weights into a network of another architecture.
 
     Args:
-        path: The file that the error names.
+        path: File of the weights, for the error message.
     """
     try:
         yield
@@ -194,26 +198,26 @@ def of_one_architecture(path: Path) -> Iterator[None]:
 
 
 def is_classifier(name: str) -> bool:
-    """Return whether `train.init_from` names a classifier, rather than a run or a file.
+    """Return whether a name stands for a classifier that no training run has made.
 
     Args:
-        name: The name.
-
-    Returns:
-        Whether it is the name of a classifier that was trained elsewhere.
+        name: Value of the setting `train.init_from`. A run is named by its folder, and any other
+            classifier as for `nb.load_classifier`, such as "torchvision:resnet50" or
+            "network.onnx".
     """
     source, colon, _ = name.partition(":")
     return source + colon in SOURCES or is_network_file(name)
 
 
 def selected_file(run: Path) -> Path | None:
-    """Find the file of a run's selected network.
+    """Find the file of the network that a training run selected, or of a published network.
 
     Args:
-        run: The folder of the run, a folder below pretrained/, or a file of either.
+        run: Folder of the run, folder below pretrained/, or the file itself.
 
     Returns:
-        best.pt, model.safetensors or the file itself. None if there is no such file.
+        The file best.pt or model.safetensors in the folder, or `run` if it is a file. None if
+        there is no such file.
     """
     found = published(run)
     for file in (found, found / BEST, found / PUBLISHED):
@@ -223,29 +227,32 @@ def selected_file(run: Path) -> Path | None:
 
 
 def is_state_dict(path: Path) -> bool:
-    """Return whether a file has weights alone, as `torch.save(network.state_dict())` writes it."""
+    """Return whether a file has a state dict: weights without a description of their network.
+
+    `torch.save(network.state_dict(), path)` writes such a file.
+    """
     if not path.is_file() or path.suffix == ".safetensors":
         return False
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # torch raises many kinds of errors for files of other programs.
+    except Exception:  # `torch.load` raises errors of many types for other files.
         return False
-    return isinstance(content, dict) and all(
-        isinstance(value, Tensor) for value in content.values()
-    )
+    if not isinstance(content, dict):
+        return False
+    return all(isinstance(value, Tensor) for value in content.values())
 
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
-    """Read a run's selected network.
+    """Read the file of the network that a training run selected, or of a published network.
 
     Args:
-        run: The folder of the run, a folder below pretrained/, or a file of either.
+        run: Folder of the run, folder below pretrained/, or the file itself.
 
     Returns:
-        The file and its content.
+        Pair of the path of the file, and its content.
 
     Raises:
-        InputError: If there is no such file, or it is damaged.
+        InputError: If there is no such file, or if it is damaged.
     """
     path = selected_file(run)
     if path is None:
@@ -259,13 +266,15 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the weights of a network by their names without normalized light.
+    """Return the weights in the file of a network, without a wrapper that normalizes light.
 
     Args:
-        state: Content of a file, as `load_selected` returns it.
+        state: Content of the file, as `load_selected` returns it.
 
     Returns:
-        State dict of the network behind the normalization of light.
+        State dict of the network itself. If the file has a wrapper that
+        normalizes the light of images before the network, its prefix of the
+        names of the weights is removed.
     """
     weights: dict[str, Tensor] = state["model"]
     if NORMALIZE_LIGHT not in state["architecture"]:
@@ -274,12 +283,12 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write the network of a checkpoint in half precision.
+    """Write the network of a checkpoint in half precision, as a file for other users.
 
     Args:
-        path: File in the format safetensors. Its metadata hold the entries in
-            PUBLISHED_FACTS as JSON.
-        state: Checkpoint, with the weights under "model".
+        path: File to write, in the format safetensors. Its metadata have the
+            entries PUBLISHED_FACTS of the checkpoint as JSON.
+        state: Content of the checkpoint, with the weights under "model".
     """
     metadata = {}
     for key in PUBLISHED_FACTS:
@@ -298,8 +307,8 @@ def _load_published(path: Path) -> dict[str, Any]:
         path: The file.
 
     Returns:
-        Weights in single precision under "model", and the facts in
-        PUBLISHED_FACTS that the file has.
+        Mapping with the weights in single precision under "model", and with
+        those of the entries PUBLISHED_FACTS that the file has.
 
     Raises:
         InputError: If the file is damaged.
@@ -311,19 +320,21 @@ def _load_published(path: Path) -> dict[str, Any]:
             for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
                 value = file.get_tensor(name)
                 weights[name] = value.float() if value.is_floating_point() else value
-    except Exception as error:  # safetensors and JSON raise many kinds for a foreign file.
+    except Exception as error:
+        # safetensors and json raise errors of many types for a damaged file.
         raise InputError(
-            f"checkpoint {path} is damaged or lacks its architecture; use another one",
+            f"checkpoint {path} is damaged or has no architecture: use another checkpoint",
         ) from error
     return checked({**facts, "model": weights}, path)
 
 
 def export(path: Path, network: nn.Module) -> None:
-    """Write the weights of a network that began as a classifier.
+    """Write the trained weights of a classifier of the user, so that the user can load them.
 
     Args:
-        path: The file, for `torch.load`. Its weights have the names of the classifier's own file.
-        network: The network.
+        path: File to write, for `torch.load`. It has a state dict with the names that the weights
+            have in the user's own network.
+        network: Trained network. Wrappers of this library around it are removed.
     """
     state = unwrapped(network).state_dict()
     content = io.BytesIO()

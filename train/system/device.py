@@ -17,20 +17,21 @@ from renderer.visibility.rasterizers import Rasterizer, choose
 from train import console
 from train.system.user_errors import keyed
 
-# Linux writes a container's quota of cores into this file.
+# File in which Linux stores how much time of the cores a container may use: a quota and a
+# period. The quota divided by the period is the number of cores.
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
-# The threads that torch took at the start, before any run sets its own number.
+# Number of threads of torch when this module is imported. A training run may change it.
 THREADS = torch.get_num_threads()
-# The work of a batch is the number of weights times the number of pixels of the
-# batch. `choose_threads` chooses one thread for less work than this, which takes one
-# core some milliseconds.
+# Training uses one thread if the number of weights of the network times the number of
+# pixels of a batch is below this. Such a batch takes one core a few milliseconds.
 SMALL_WORK = 1e10
+# Number type in which a network computes, by the name of the precision.
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
-# The batch sizes for which `GraphedModel` records graphs. Validation has the largest. The batches
-# of an attack shrink, since examples leave on success.
+# Batch sizes for which `GraphedModel` records CUDA graphs. Validation has the largest batches.
+# The batches of an attack become smaller when examples leave after their success.
 SIZES = (16, 32, 64, 128, 512)
-# Number of times that torch may compile a function, instead of its default of 8.
-# Each size is compiled with and without gradients.
+# Number of times that torch may compile a function. Its default of 8 is too small, since each
+# batch size is compiled with and without gradients.
 RECOMPILE_LIMIT = 4 * len(SIZES)
 
 
@@ -38,8 +39,8 @@ def choose_device(name: str) -> torch.device:
     """Choose the device that computes.
 
     Args:
-        name: "auto" takes a GPU if there is one, or else the CPU. Otherwise any name that torch
-            knows. "cuda" is a GPU of its own for each process of torchrun.
+        name: "auto" for a GPU if there is one, or else the CPU. Otherwise the name of a device of
+            torch. With "cuda", each process that torchrun starts gets its own GPU.
 
     Returns:
         The device.
@@ -55,14 +56,11 @@ def choose_device(name: str) -> torch.device:
 
 
 def most_threads() -> int:
-    """Count the cores that this process may use.
+    """Return the largest useful number of threads of this process.
 
-    Three things limit them: the threads that torch took at the start (OMP_NUM_THREADS sets them),
-    the cores that the process is bound to (taskset, Slurm), and a container's quota of cores.
-    Above the quota, threads wait for each other.
-
-    Returns:
-        The number of cores.
+    It is the smallest of three numbers: the threads that torch chose at its start (the user can
+    set OMP_NUM_THREADS), the cores to which the process is bound (by taskset or Slurm), and the
+    cores that its container may use. More threads than cores would wait for each other.
     """
     bound = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
@@ -71,59 +69,66 @@ def most_threads() -> int:
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
     except (OSError, ValueError):
-        # If there is no quota, the file is missing or contains "max 100000".
+        # The file is missing or contains "max 100000" if there is no limit.
         permitted = bound
     return min(THREADS, bound, permitted)
 
 
 def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
-    """Choose the threads of a training by a rule.
+    """Choose the number of threads of a training run.
 
-    The same command then gives the same bits on a machine. Small batches take one thread, since
-    several would wait for each other most of the time. All others take `most_threads`. A trial
-    would choose better on a busy machine, but it would choose otherwise the next time.
+    Small batches get one thread, because several threads would mostly wait for each other. All
+    other batches get `most_threads()`. The number changes the last bits of the results, so it
+    follows from the settings, and is not measured: the same command gives the same results.
 
     Args:
-        network: The network that is trained.
-        batch_size: The images of a batch.
-        size: The pixels per side of an image.
+        network: Network to train.
+        batch_size: Number of images in a batch.
+        size: Pixels per side of an image.
 
     Returns:
-        The number of threads.
+        Number of threads.
     """
-    weights = sum(parameter.numel() for parameter in network.parameters())
-    return most_threads() if weights * batch_size * size**2 >= SMALL_WORK else 1
+    weight_count = sum(parameter.numel() for parameter in network.parameters())
+    pixel_count = batch_size * size**2
+    is_small = weight_count * pixel_count < SMALL_WORK
+    return 1 if is_small else most_threads()
 
 
 def set_deterministic(deterministic: bool) -> None:
-    """Choose whether a GPU computes the same bits every time. A CPU always does.
+    """Set whether a GPU gives exactly the same results in each run. A CPU always does.
 
     Args:
-        deterministic: Whether to compute the same bits, which is slower.
+        deterministic: Whether to use deterministic algorithms, which are slower.
     """
     if deterministic:
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS asks for it.
-    # Setting the choice imports torch's compiler, which takes seconds.
+        # The deterministic algorithms of cuBLAS need this variable.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    # The call below imports the compiler of torch, which takes seconds. It is left out
+    # if it would change nothing.
     if deterministic != torch.are_deterministic_algorithms_enabled():
         torch.use_deterministic_algorithms(deterministic)
     torch.backends.cudnn.benchmark = not deterministic
 
 
 def choose_precision(precision: str, device: torch.device, trained: nn.Module | None = None) -> str:
-    """Choose the precision that a network computes in.
+    """Choose the precision in which a network computes.
+
+    A warning is logged if `precision` is "bfloat16" and the CPU only emulates it.
 
     Args:
-        precision: One of PRECISIONS, or "auto". "auto" takes bfloat16 if the device computes in it
-            rather than emulating it. Otherwise it takes float16 on a GPU and float32 on a CPU.
-        device: The device that computes.
-        trained: The network, if it is trained. On a CPU, "auto" takes float32 for one with
-            depthwise convolutions, whose gradients in bfloat16 take 3 times as long.
+        precision: "bfloat16", "float16", "float32" or "auto". "auto" chooses bfloat16 if the
+            hardware computes in it. Otherwise it chooses float16 on a GPU and float32 on a CPU.
+        device: Device that computes.
+        trained: Network to train. None if the network is only evaluated. On a CPU, "auto"
+            chooses float32 to train a network with depthwise convolutions, whose gradients take 3
+            times as long in bfloat16.
 
     Returns:
-        One of PRECISIONS. bfloat16 on a CPU that emulates it is warned of.
+        "bfloat16", "float16" or "float32".
 
     Raises:
-        InputError: If there is no such precision.
+        InputError: If `precision` has another value.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     if device.type == "cuda":
@@ -145,7 +150,10 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
 def _has_depthwise_layer(network: nn.Module | None) -> bool:
     """Return whether a network has a depthwise convolution.
 
-    A depthwise convolution has several input channels and a group for each.
+    A depthwise convolution has as many groups as input channels, and more than one.
+
+    Args:
+        network: The network. None counts as a network without such a layer.
     """
     modules = network.modules() if network is not None else []
     convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
@@ -153,21 +161,24 @@ def _has_depthwise_layer(network: nn.Module | None) -> bool:
 
 
 def _computes_in_bfloat16() -> bool:
-    """Return whether this CPU has instructions for bfloat16."""
+    """Return whether this CPU has instructions for numbers of the type bfloat16."""
     if platform.machine() in ("x86_64", "AMD64"):
         return torch.cpu._is_avx512_bf16_supported()
     return torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
 class MixedPrecision(nn.Module):
-    """A network that computes in a chosen precision, from float32 images to float32 logits.
+    """Wrapper of a network that computes in a chosen precision.
+
+    Images and logits are float32. Between them, torch.autocast uses the chosen precision.
 
     Args:
-        network: The network, whose weights are put into the channels-last layout.
-        precision: One of PRECISIONS.
+        network: The network. Its weights are changed to the channels-last memory format.
+        precision: "bfloat16", "float16" or "float32".
     """
 
     def __init__(self, network: nn.Module, precision: str):
+        """Wrap a network. See the class."""
         super().__init__()
         self.network = network.to(memory_format=torch.channels_last)
         self.precision = precision
@@ -182,30 +193,29 @@ class MixedPrecision(nn.Module):
 
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Return whether to compile the passes of a network.
+    """Return whether to record the passes of a network as CUDA graphs with torch.compile.
 
     Args:
-        choice: "always", "never", or "auto". "auto" compiles on one GPU if torch.compile works
-            there, which needs a C compiler. It does not compile for several processes, which wait
-            for each other inside a pass.
-        device: The device that computes.
-
-    Returns:
-        Whether to compile.
+        choice: "always", "never", or "auto". "auto" means yes on a GPU if there is one process and
+            if torch.compile works, which needs a C compiler. With several processes, the
+            passes contain communication, and are not recorded.
+        device: Device that computes.
 
     Raises:
-        InputError: If the choice is "always" on a CPU, which has no graphs to replay.
+        InputError: If the choice is "always" and the device is a CPU.
     """
     if choice == "always" and device.type == "cpu":
         raise InputError(
-            "choice=always is for a GPU, whose graphs it replays: use auto or never",
+            "choice=always needs a GPU, since it records CUDA graphs, but the device is a CPU: "
+            "use auto or never",
             "choice",
         )
     if choice != "auto" or device.type != "cuda" or distributed.world_size() > 1:
         return choice == "always"
     try:
         torch.compile(torch.exp)(torch.zeros(2, device=device))
-    except Exception as error:  # torch, Triton and the compiler raise errors of their own.
+    except Exception as error:
+        # torch, Triton and the C compiler raise errors of many types.
         reason = " ".join(str(error).splitlines()[:2])
         console.warning("compile: torch.compile fails here, so training is slower: %s", reason)
         return False
@@ -213,14 +223,15 @@ def compiles(choice: str, device: torch.device) -> bool:
 
 
 class GraphedModel(nn.Module):
-    """A model in eval mode as CUDA graphs, one for each of a few batch sizes.
+    """Wrapper of a model that replays recorded CUDA graphs in evaluation mode.
 
-    Smaller batches are filled up with zeros, since rows do not influence each other in eval mode.
-    In training mode, and for larger batches, the model computes as it is.
+    There is a graph for each batch size in SIZES. A batch of another size is padded with images of
+    zeros, which do not change the logits of the other images in evaluation mode. In training mode,
+    and for batches larger than all SIZES, the model is called without a graph.
 
     Args:
-        model: The model.
-        compiler: The backend of torch.compile.
+        model: The model, from images to logits.
+        compiler: Backend of torch.compile.
     """
 
     def __init__(self, model: nn.Module, compiler: Any = "cudagraphs"):
@@ -232,16 +243,17 @@ class GraphedModel(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         if self.training or len(images) > SIZES[-1]:
             return self.model(images)
-        # The smallest recorded size that holds the batch.
+        # The smallest recorded batch size that is large enough.
         size = next(size for size in SIZES if len(images) <= size)
         padding = images.new_zeros(size - len(images), *images.shape[1:])
         logits = self._graphs(torch.cat([images, padding]))
-        # The next replay writes over the result of a graph, so the result is copied.
+        # The next replay of the graph writes its logits to the same memory, so the
+        # logits are copied.
         return logits[: len(images)].clone()
 
 
 def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
-    """Start the rasterizer.
+    """Start the rasterizer that the settings choose.
 
     Args:
         settings: Settings of the renderer.
@@ -250,8 +262,8 @@ def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
         The rasterizer.
 
     Raises:
-        InputError: If it does not start on this machine. The sentence begins with the
-            field `rasterizer`.
+        InputError: If the rasterizer does not start on this machine, because it lacks OpenGL, for
+            example.
     """
     with keyed("rasterizer"), progress_message("starting the rasterizer"):
         return choose(settings.rasterizer)

@@ -10,16 +10,19 @@ from renderer.validation import as_folder
 
 @contextmanager
 def folder_or_temporary(out: str | Path | None) -> Iterator[Path]:
-    """Give the folder that a caller named, or a temporary one until the block ends.
+    """Yield a folder for files: the folder of the caller, or a temporary folder.
+
+    A temporary folder is removed at the end of the block.
 
     Args:
-        out: The folder, which need not exist. None for a temporary one.
+        out: Folder of the caller. It need not exist. None for a temporary
+            folder.
 
     Yields:
         The folder.
 
     Raises:
-        InputError: If `out` is no path, or a file.
+        InputError: If `out` is not a path, or is the path of a file.
     """
     if out is not None:
         yield as_folder("out", out)

@@ -9,10 +9,12 @@ from torch import Tensor
 
 
 def content_hash(state: Any) -> str:
-    """Compute the SHA-256 of keys, types, shapes and values.
+    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint.
 
     Args:
-        state: A tensor, a plain value, or nested mappings and sequences of these.
+        state: Tensor, number or text, or nested mappings, lists and tuples of
+            these. The hash depends on all keys and values, and on the types and
+            shapes of tensors.
 
     Returns:
         The hash as 64 hexadecimal digits.
@@ -23,17 +25,19 @@ def content_hash(state: Any) -> str:
 
 
 def _update(digest: Any, value: Any) -> None:
-    """Add a value to a hash.
+    """Add a value, with all values inside it, to a hash.
 
     Args:
-        digest: Hash of hashlib, which is changed.
-        value: A tensor, a mapping, a list, a tuple, or a plain value.
+        digest: Hash object of hashlib, which is updated.
+        value: Tensor, number or text, or nested mappings, lists and tuples of
+            these.
     """
     match value:
         case Tensor():
-            plain = value.detach().cpu().contiguous()
-            digest.update(f"{plain.dtype}{tuple(plain.shape)}".encode())
-            digest.update(plain.flatten().view(torch.uint8).numpy().data)
+            on_cpu = value.detach().cpu().contiguous()
+            digest.update(f"{on_cpu.dtype}{tuple(on_cpu.shape)}".encode())
+            # The bytes of the tensor, without a copy.
+            digest.update(on_cpu.flatten().view(torch.uint8).numpy().data)
         case Mapping():
             for key, item in value.items():
                 digest.update(f"{key!r}:".encode())

@@ -15,16 +15,18 @@ from torch.nn.parallel import DistributedDataParallel
 
 from augment import distributed
 
-# submitit sends this signal before the time of a job is over. Windows does not have it.
+# Signal that submitit (a launcher of Slurm jobs) sends before the time of a job is over. None on
+# Windows, which lacks this signal.
 BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)
+# Signals at which a training run writes a checkpoint and stops.
 SIGNALS = tuple(filter(None, (signal.SIGTERM, signal.SIGINT, BATCH_SYSTEM)))
 
 
 @contextmanager
 def process_group() -> Iterator[None]:
-    """Join the processes that torchrun started while the block runs.
+    """Connect the processes that torchrun started for one run, until the block ends.
 
-    A run by itself has none to join.
+    If torchrun did not start this process, nothing happens.
     """
     if int(os.environ.get("WORLD_SIZE", 1)) == 1:
         yield
@@ -41,9 +43,9 @@ def process_group() -> Iterator[None]:
 
 @contextmanager
 def main_process_first() -> Iterator[None]:
-    """Let the first process run the block before the others.
+    """Run the block in the first process, and then in the other processes of a run.
 
-    The other processes then find a download or a cached file that is complete.
+    If the block downloads or caches a file, the other processes find the complete file.
     """
     if distributed.rank() > 0:
         dist.barrier()
@@ -53,13 +55,13 @@ def main_process_first() -> Iterator[None]:
 
 
 def broadcast(value: str) -> str:
-    """Return the value of the first process, for which the others wait.
+    """Send a text from the first process of a run to all other processes.
 
     Args:
-        value: The value of this process.
+        value: Text of this process. Only the text of the first process counts.
 
     Returns:
-        The value of the first process.
+        Text of the first process.
     """
     values = [value]
     if distributed.world_size() > 1:
@@ -68,13 +70,13 @@ def broadcast(value: str) -> str:
 
 
 def all_reduce_sum(values: Tensor) -> Tensor:
-    """Add up values over all processes, in place.
+    """Replace a tensor by its sum over all processes of a run, in place.
 
     Args:
-        values: The values of this process, of any shape.
+        values: Tensor of this process, of any shape.
 
     Returns:
-        The same tensor.
+        The same tensor, which now has the sum.
     """
     if distributed.world_size() > 1:
         dist.all_reduce(values)
@@ -82,16 +84,16 @@ def all_reduce_sum(values: Tensor) -> Tensor:
 
 
 def wrap_ddp(model: nn.Module) -> nn.Module:
-    """Wrap a model so that its gradients are averaged over all processes.
+    """Wrap a model so that its gradients are averaged over all processes of a run.
 
-    Batch normalization takes its statistics over the whole batch on GPUs, and over each process's
-    part of it on CPUs.
+    On GPUs, layers of batch normalization are replaced in `model` by layers that compute their
+    statistics over the batch of all processes. On CPUs, each process has its own statistics.
 
     Args:
-        model: The model, whose layers of batch normalization may be replaced.
+        model: The model.
 
     Returns:
-        The wrapped model, or the model itself if there is one process.
+        The wrapped model. The model itself if there is only one process.
     """
     if distributed.world_size() == 1:
         return model
@@ -101,12 +103,12 @@ def wrap_ddp(model: nn.Module) -> nn.Module:
 
 
 class Interrupted(SystemExit):
-    """A signal ended a run early, after its checkpoint was written.
+    """Exit of the program after a signal, when the run has written its checkpoint.
 
-    The exit status is the one that a shell gives: 128 plus the number of the signal.
+    The exit status is 128 plus the number of the signal, as in a shell.
 
     Args:
-        number: The number of the signal.
+        number: Number of the signal.
     """
 
     def __init__(self, number: int):
@@ -115,22 +117,26 @@ class Interrupted(SystemExit):
 
 
 class SignalHandler:
-    """Notes the first of `SIGNALS` while its block runs.
+    """Context manager in which the first signal does not end the process at once.
 
-    A second signal acts as it would without the block. So does the first one if nobody asks for
-    it before the block ends. Signals that the process ignored before stay ignored. Only the main
-    thread gets signals.
+    The signal is noted, and the block asks for it with `requested`, writes a checkpoint, and calls
+    `stop`. A second signal ends the process at once. If the block ends without `stop`, the noted
+    signal is raised then. Signals that the process ignores stay ignored. Only the main thread
+    can receive signals.
     """
 
     def __init__(self) -> None:
+        """Create the context manager. It handles signals when its block begins."""
+        # Number of the first signal. None if there was no signal yet.
         self._number: int | None = None
-        # Sum of the signals of all processes at the last call of `requested`, which
-        # may still be under way.
-        self._asked: tuple[dist.Work, Tensor] | None = None
-        # Handlers of the signals before the block.
+        # Number of processes with a signal at the last call of `requested`: a sum over the
+        # processes that may still be computed, and the tensor that receives it.
+        self._last_sum: tuple[dist.Work, Tensor] | None = None
+        # Handlers that the signals had before the block.
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> "SignalHandler":
+        """Replace the handlers of all signals in SIGNALS, except of those that are ignored."""
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:
@@ -138,47 +144,55 @@ class SignalHandler:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
+        """Restore the handlers. If no error ends the block, raise the noted signal again."""
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:
-        """Return whether to stop now because a process of the run got a signal.
+        """Return whether the run should stop, because one of its processes got a signal.
 
-        With several processes, a call starts a sum over the processes and
-        returns the result of the sum that the call before has started. Processes
-        therefore seldom wait for each other, and all stop after the same call.
+        With several processes, each call starts to count the processes with a
+        signal, and returns whether the count that the previous call started is
+        above 0. Processes then hardly wait for each other, and all of them stop
+        after the same number of calls.
         """
         has_signal = self._number is not None
         if distributed.world_size() == 1:
             return has_signal
-        before = self._asked
-        # The tensor is on the CPU, so that no GPU has to catch up.
-        noted = torch.tensor(float(has_signal))
-        self._asked = dist.all_reduce(noted, async_op=True), noted
-        if before is None:
+        previous_sum = self._last_sum
+        # A tensor on the CPU does not wait for computations on a GPU.
+        count = torch.tensor(float(has_signal))
+        self._last_sum = dist.all_reduce(count, async_op=True), count
+        if previous_sum is None:
             return False
-        work, noted_before = before
-        return work.wait() and bool(noted_before)
+        work, previous_count = previous_sum
+        return work.wait() and bool(previous_count)
 
     def stop(self) -> None:
-        """Raise `Interrupted`.
+        """Raise `Interrupted`, which ends the process with the status of the signal.
 
-        A batch system's own handler is called before. It may queue the job again and exit.
+        If a batch system sent the signal and has installed a handler for it, this handler is
+        called first. It may put the job into the queue again and end the process.
         """
-        # The signal may have reached only another process.
+        # If only another process got a signal, this process ends as if by SIGTERM.
         number = self._number or signal.SIGTERM
         if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
             signal.raise_signal(number)
         raise Interrupted(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        """Note a signal, and let the next one act as it would without the block."""
+        """Handle the first signal: note its number, so that the next signal ends the process.
+
+        Args:
+            number: Number of the signal.
+            frame: Not used. Python calls handlers of signals with it.
+        """
         self._number = number
         self._restore()
 
     def _restore(self) -> None:
-        """Put the handlers back that were there before the block."""
+        """Restore the handlers that the signals had before the block."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers = {}

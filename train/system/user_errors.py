@@ -1,4 +1,4 @@
-"""Messages that say what a user can do about an error, and a check that a folder is writable."""
+"""Error messages for users, and a check that a folder is writable."""
 
 import errno
 import tempfile
@@ -9,31 +9,34 @@ from pathlib import Path
 from renderer.errors import InputError, is_out_of_memory
 from renderer.settings import Settings
 
-# Errors of a full disk, a full quota and a file that is too large.
+# Numbers of the system errors of a full disk, of an exceeded quota and of a file that
+# is too large.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# Characters of a text that an error message shows at most.
+# Largest number of characters of a text that an error message quotes.
 MAX_NAME_LENGTH = 200
-# Bytes of the file that tests whether a folder can be written to.
+# Size in bytes of the temporary file that is written to test a folder.
 TEST_SIZE = 2**16
 
 
 @contextmanager
-def keyed(whole: str = "", /, **keys: str) -> Iterator[None]:
-    """Put keys of the command line into the error messages of the library.
+def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
+    """Replace the names of Python arguments in error messages by keys of settings.
 
-    The library does not know these keys. Its messages begin with the name of a
-    Python argument, and a caller that took the argument from a setting says
-    which setting it was.
+    A message of the library begins with the name of a Python argument, such as
+    "name". The user of a command knows only the setting from which the command
+    took the argument, such as "train.init_from".
 
     Args:
-        whole: Key that is put before messages about anything but `keys`, such
-            as "scene". If it is empty, these messages stay as they are.
-        **keys: Key that replaces the name of each argument, such as
-            `name="train.init_from"`. A part of an argument, such as
-            "lighting.radius", belongs to the key of "lighting".
+        group: Key of a group of settings, such as "scene". It is put before
+            messages about any other argument. If it is empty, these messages
+            stay as they are.
+        **keys: Key for each argument, as in `name="train.init_from"`. The key of
+            the argument "lighting" is also used for "lighting.radius" and
+            "lighting[0]".
 
     Raises:
-        InputError: If the block raises it. The message then begins with the key.
+        InputError: If the block raises InputError. The message begins with the
+            key.
 
     >>> with keyed(name="train.init_from"):
     ...     raise InputError("name=x is unknown", "name")
@@ -45,38 +48,40 @@ def keyed(whole: str = "", /, **keys: str) -> Iterator[None]:
     except InputError as error:
         argument = error.argument
         if argument not in keys:
-            # "light" for an argument such as "light.turbidity" or "light[0]".
+            # The key of "light" is used for "light.turbidity" and "light[0]".
             argument = argument.partition(".")[0].partition("[")[0]
         if argument in keys:
             key = keys[argument]
             message = key + str(error).removeprefix(argument)
             raise InputError(message, key + error.argument.removeprefix(argument)) from error
-        if whole and not str(error).startswith(whole):
-            raise InputError(f"{whole}: {error}", whole) from error
+        message = str(error)
+        if group and not message.startswith(group):
+            raise InputError(f"{group}: {message}", group) from error
         raise
 
 
 def keys_of(key: str, settings: Settings) -> dict[str, str]:
-    """Return the key of each field of settings, for `keyed`.
+    """List the dotted key of each field of a group of settings, as `keyed` takes them.
 
     Args:
-        key: Key of the settings, such as "train".
-        settings: The settings.
+        key: Key of the group, such as "train".
+        settings: Settings of the group.
 
     Returns:
-        The keys by field, such as "train.epochs" for "epochs".
+        Key by field, such as "train.epochs" for "epochs".
     """
     return {name: f"{key}.{name}" for name in vars(settings)}
 
 
 def user_message(error: BaseException) -> str | None:
-    """Say what the user can do about an error.
+    """Write a message for the user about an error that the user can fix.
 
     Args:
-        error: The error.
+        error: Any error.
 
     Returns:
-        One sentence. None if the error is a fault of the program.
+        One sentence. None if the error is a fault of the program, or if nothing
+        is known about it.
     """
     match error:
         case InputError():
@@ -90,31 +95,31 @@ def user_message(error: BaseException) -> str | None:
             return f"{fault}: make room and start again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
-        case RuntimeError() if _is_of_another_process(error):
+        case RuntimeError() if _is_lost_connection(error):
             fault = "another process of this run has ended"
-            return f"{fault}: fix what ended it, and go on with train.resume=true"
+            return f"{fault}: fix what ended it, and continue with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
             advice = "ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
             return f"memory ran out: {advice}"
     return None
 
 
-def _is_of_another_process(error: RuntimeError) -> bool:
-    """Return whether an error says that the connection to another process was lost.
+def _is_lost_connection(error: RuntimeError) -> bool:
+    """Return whether an error says that the connection to another process of a run was lost.
 
-    NCCL or gloo raises such errors.
+    The libraries NCCL and Gloo, which connect processes, raise such errors.
     """
     from torch.distributed import DistError
 
-    # Gloo has no error class. Its messages name its source file.
+    # Gloo has no class of errors. Its messages contain the path of a source file.
     return isinstance(error, DistError) or "/gloo/" in str(error)
 
 
 def writable_folder(folder: str | Path, key: str) -> Path:
-    """Check that files can be written to a folder.
+    """Check that files can be written to a folder, by writing a temporary file.
 
-    The check writes a temporary file. If the folder does not exist, the file
-    goes to the nearest parent folder that exists.
+    If the folder does not exist, the file is written to the nearest parent
+    folder that exists.
 
     Args:
         folder: The folder.
@@ -124,11 +129,12 @@ def writable_folder(folder: str | Path, key: str) -> Path:
         The folder as a path.
 
     Raises:
-        InputError: If the file cannot be written.
+        InputError: If the temporary file cannot be written.
     """
     path = Path(folder)
     try:
-        existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+        candidates = (path, *path.absolute().parents)
+        existing = next(candidate for candidate in candidates if candidate.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(bytes(TEST_SIZE))
     except OSError as error:

@@ -1,24 +1,25 @@
-"""Whether the commands of this process print details. Their child processes follow."""
+"""The option --verbose, which makes commands and their child processes print details."""
 
 import os
 from collections.abc import Sequence
 
-# Words of the command line that ask for details.
+# Options of the command line that ask for details.
 VERBOSE_FLAGS = frozenset({"--verbose", "-v"})
-# Environment variable that is set if details are printed.
+# Environment variable that is set if commands print details.
 VERBOSE = "PNB_VERBOSE"
-# Lines that a command prints without details, before those with paths.
+# Largest number of lines about its result that a command prints without --verbose. Lines
+# with the paths of written files may follow.
 MAX_LINES = 12
 
 
 def take_flag(words: list[str]) -> list[str]:
-    """Make this process verbose if a word of a command line asks for it.
+    """Remove --verbose and -v from a command line, and make this process verbose if one is there.
 
     Args:
-        words: Words of the command line.
+        words: Arguments of the command line.
 
     Returns:
-        The other words.
+        The other arguments.
     """
     others = [word for word in words if word not in VERBOSE_FLAGS]
     if len(others) < len(words):
@@ -27,20 +28,20 @@ def take_flag(words: list[str]) -> list[str]:
 
 
 def is_verbose() -> bool:
-    """Return whether a command prints more than its result."""
+    """Return whether commands of this process print details in addition to their result."""
     return VERBOSE in os.environ
 
 
 def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
-    """Cut a list of lines that is too long for a command without details.
+    """Shorten a list of lines that a command prints, unless the command is verbose.
 
     Args:
-        lines: Lines of a result. The first ones matter most.
-        limit: Largest number of lines that are returned.
+        lines: Lines of text, the most important ones first.
+        limit: Largest number of lines to return.
 
     Returns:
-        All lines if details are printed or the list is short. Otherwise the
-        first lines, and a line that says how many are left out.
+        All lines if the command is verbose or the list is short. Otherwise the
+        first lines, and a line that says how many more there are.
     """
     if is_verbose() or len(lines) <= limit:
         return list(lines)

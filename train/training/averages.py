@@ -1,4 +1,4 @@
-"""The networks that a training keeps: the one that learns, its averages, and the best so far."""
+"""Averages of the weights of a network over the training, and the choice of the best network."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -11,9 +11,10 @@ from train.system.device import MixedPrecision
 
 
 class MovingAverage(AveragedModel):
-    """The exponential moving average of a model's weights and statistics.
+    """Exponential moving average of the parameters and buffers of a model.
 
-    The first update copies the parameters and buffers of the model.
+    An update computes average = decay * average + (1 - decay) * model. The first
+    update copies the model.
 
     Args:
         model: The model.
@@ -25,16 +26,20 @@ class MovingAverage(AveragedModel):
         self._average = get_ema_multi_avg_fn(decay)
 
     def update_parameters(self, model: nn.Module) -> None:
-        """Move the average toward a model.
+        """Update the average with the present parameters and buffers of a model.
 
-        The method of torch copies its counter to the GPU at every step, and the
-        GPU waits for it. This method keeps the counter on the CPU.
+        The method of the base class copies a counter to the GPU in each step,
+        which the GPU waits for. This method keeps the counter on the CPU.
+
+        Args:
+            model: The model.
         """
         if self.n_averaged == 0:
             return super().update_parameters(model)
         averages = [*self.module.parameters(), *self.module.buffers()]
         latest = [*model.parameters(), *model.buffers()]
-        # `_average` takes either floating-point tensors or integer tensors.
+        # The function of torch that averages lists of tensors needs lists in which
+        # either all tensors or none have floating-point numbers.
         for is_floating in (True, False):
             old = []
             new = []
@@ -48,21 +53,23 @@ class MovingAverage(AveragedModel):
 
 
 class Averages:
-    """The averages of a network in training, and which network is kept.
+    """Averages of a network in training, and the choice of the network that the training keeps.
 
-    The soup is the mean of the networks at the ends of all epochs (Wortsman et al. 2022, "Model
-    soups"). With a moving average, it is the mean of the moving averages.
+    There are two averages, and both are optional: an exponential moving average of the weights
+    over the steps, and a model soup, the mean of the weights after each epoch (Wortsman et al.
+    2022, "Model soups"). With both, the soup is the mean of the moving averages.
 
     Args:
-        model: The network that learns.
-        ema_decay: The decay of the moving average; 0 for none.
-        soup: Whether to take the mean over all epochs.
-        keeps_latest: Whether the latest network is kept in place of the one that validates best.
-            A soup always keeps the latest, which has all epochs in it.
+        model: Network in training.
+        ema_decay: Decay of the moving average in a step, in [0, 1). 0 for no moving average.
+        soup: Whether to compute the soup.
+        keeps_latest: Whether the network after the last epoch is kept, instead of the network of
+            the epoch with the highest validation accuracy. With a soup, the last one is always
+            kept, because it contains all epochs.
 
     Attributes:
-        selected: The network that is validated and kept: the soup, the moving average, or else
-            the network that learns.
+        selected: Network that is validated after each epoch: the soup, the moving average, or
+            else the network in training.
     """
 
     def __init__(
@@ -72,6 +79,7 @@ class Averages:
         soup: bool,
         keeps_latest: bool = False,
     ):
+        """Create the averages. They are empty until the first step and the first epoch."""
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:
@@ -85,11 +93,13 @@ class Averages:
         self.selected = cast(MixedPrecision, average.module) if average else model
 
     def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:
-        """Reset the network to the initial one if the run makes a soup.
+        """Restart the training from the initial weights if the run makes a soup.
+
+        A soup averages networks that all begin with the same weights.
 
         Args:
-            initial: Network with which the run began. None for random weights.
-            optimizer: Optimizer of the network. Its momentum is reset.
+            initial: Network before the training. None if it had random weights.
+            optimizer: Optimizer of the network, whose momentum is reset.
         """
         if self._soup is None or initial is None:
             return
@@ -99,32 +109,32 @@ class Averages:
             self._ema.n_averaged.zero_()
 
     def end_step(self) -> None:
-        """Move the moving average towards the network after a step."""
+        """Update the moving average, if there is one, after a step of the optimizer."""
         if self._ema:
             self._ema.update_parameters(self._model)
 
     def end_epoch(self) -> None:
-        """Add the network at the end of an epoch to the soup."""
+        """Add the network after an epoch to the soup, if there is one."""
         if self._soup:
             self._soup.update_parameters(self._ema.module if self._ema else self._model)
 
     def is_kept(self, accuracy: float) -> bool:
-        """Return whether the selected network replaces the one that was kept before.
+        """Return whether to keep the network of this epoch instead of that of an earlier epoch.
 
         Args:
-            accuracy: Accuracy of the selected network on the validation images,
-                in [0, 1].
+            accuracy: Accuracy of the network on the validation images, in
+                [0, 1].
 
         Returns:
-            True if the accuracy is higher than in all epochs before, or if the
-            latest network is always kept.
+            True if the accuracy is higher than after all earlier epochs, or if
+            the last network is always kept.
         """
         is_best = accuracy > self._best_accuracy
         self._best_accuracy = max(accuracy, self._best_accuracy)
         return is_best or self._keeps_latest
 
     def weights(self) -> dict[str, torch.Tensor]:
-        """Return a copy of the selected network's weights on the CPU."""
+        """Return a copy of the weights of the selected network on the CPU, by name."""
         state = self.selected.network.state_dict()
         return {name: value.to("cpu", copy=True) for name, value in state.items()}
 
@@ -132,8 +142,8 @@ class Averages:
         """Return the states of the moving average and of the soup for a checkpoint.
 
         Returns:
-            States under the keys "ema" and "soup". None in place of an average
-            that the training does not have.
+            Mapping with the keys "ema" and "soup". The value is None if the run
+            does not compute this average.
         """
         return {
             "ema": self._ema.state_dict() if self._ema else None,
@@ -141,12 +151,11 @@ class Averages:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], accuracies: list[float]) -> None:
-        """Restore the averages.
+        """Restore the averages from a checkpoint.
 
         Args:
-            state: Mapping with the entries that `state_dict` returned.
-            accuracies: Validation accuracies of the finished epochs. The
-                highest one is the accuracy to exceed.
+            state: Mapping that `state_dict` returned.
+            accuracies: Validation accuracy of each finished epoch, in [0, 1].
         """
         if self._ema:
             self._ema.load_state_dict(state["ema"])

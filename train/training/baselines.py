@@ -1,4 +1,7 @@
-"""The augmentations that renders are compared with: image transforms, and attacks on pixels."""
+"""Usual augmentations of training images, with which training on renders is compared.
+
+They are image transforms of torchvision, and adversarial attacks on pixels (PGD).
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,25 +19,27 @@ from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
 from renderer.light.ball import nearest_in_box
 
-# Norm-ball and steps of `pgd`. Madry et al. 2018 have a radius of 8/255 on CIFAR-10.
+# Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
+# 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
 
 
 class Baseline:
-    """An augmentation of training images.
+    """Augmentation of training images, chosen by its name.
 
     Args:
-        name: "none"; "pgd", an attack on pixels; or one of torchvision's transforms:
-            "color_jitter" (at half the strengths of Chen et al. 2020, as is usual for small
+        name: "none", "pgd" (an adversarial attack on pixels), or a transform of torchvision:
+            "color_jitter" (with half the strength of Chen et al. 2020, as is usual for small
             images), "trivial_augment", "augmix" or "color_jitter+augmix".
-        model: The network that PGD attacks.
-        seed: The seed of the run.
-        absent: Other classes that no image with a complementary label shows. See
-            `label_loss`.
+        model: Network in training, which "pgd" attacks.
+        seed: Seed of the run.
+        absent: Indices of classes for "pgd". An image with a complementary label ("not of class
+            k") shows none of these classes either.
     """
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
+        """Create the augmentation. For a transform of torchvision, this imports torchvision."""
         self._name = name
         self._model = model
         self._seed = seed
@@ -44,27 +49,29 @@ class Baseline:
             self._transform = _transform(name)
 
     def apply(self, images: Tensor, labels: Tensor, step: int) -> Tensor:
-        """Change the images of a batch.
+        """Augment the images of a batch.
 
-        The draws for an image depend on the seed, the step and the image's index in the batch.
+        The random numbers for an image depend on the seed, the step and the index of the image in
+        the batch.
 
         Args:
-            images: The images, uint8, shape (B, 3, H, W).
-            labels: Their classes, shape (B,).
-            step: The number of the step in the run.
+            images: Images, uint8, shape (B, 3, H, W).
+            labels: Classes of the images, shape (B,).
+            step: Number of the training step in the run.
 
         Returns:
-            The changed images, uint8, shape (B, 3, H, W).
+            Augmented images, uint8, shape (B, 3, H, W).
         """
         if self._name == "none":
             return images
         if self._transform is None:
             draws = generator(self._seed, step, "pgd", distributed.rank())
             return pgd(self._model, images, labels, draws, self._absent)
-        # torchvision's transforms draw once for a whole batch, and from the global generator.
+        # A transform of torchvision draws the same random numbers for all images of a batch, from
+        # the global generator. So it is called for each image, with a seed of its own.
         transformed = []
         with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-            # Index of the first image of this process in the batch of all processes.
+            # Each process has a part of the batch. This is the index of its first image.
             first = distributed.rank() * len(images)
             for index, image in enumerate(images, first):
                 torch.manual_seed(stream_seed(self._seed, step, index, "distortion"))
@@ -73,8 +80,13 @@ class Baseline:
 
 
 def _transform(name: str) -> Any:
-    """Return the transform of torchvision that a name of `Baseline` stands for."""
-    from torchvision.transforms import v2  # torchvision takes a second to import
+    """Create a transform of torchvision by its name in the setting `augmentation`.
+
+    Args:
+        name: "color_jitter", "trivial_augment", "augmix" or "color_jitter+augmix".
+    """
+    # This import takes a second, and most runs need no transform.
+    from torchvision.transforms import v2
 
     jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
     if name == "color_jitter":
@@ -96,28 +108,29 @@ def pgd(
 ) -> Tensor:
     """Attack images by projected gradient descent from a random start (Madry et al. 2018).
 
-    The steps are those of an attack on the pixels of a scene
-    (`norm_ball.take_step`), without a criterion to stop at.
+    All PGD_STEPS steps are taken, also if an image is misclassified earlier.
 
     Args:
-        model: Classifier of images in [0, 1], which is in eval mode meanwhile.
-        images: Images, shape (B, 3, H, W), uint8.
-        labels: Labels, shape (B,); see `augment.losses.label_loss`.
-        draws: CPU generator of the random start.
-        absent: Classes that an image with a complementary label certainly does
-            not show, besides the class of this label.
+        model: Classifier of images in [0, 1]. It is in evaluation mode during
+            the attack.
+        images: Images, uint8, shape (B, 3, H, W).
+        labels: Classes of the images, shape (B,). A negative number is a
+            complementary label: it says of which class the image is not.
+        draws: Random generator on the CPU, for the start.
+        absent: Indices of classes that an image with a complementary label does
+            not show either.
 
     Returns:
-        Images within the norm-balls of `PGD`, rounded to 8 bits,
-        shape (B, 3, H, W), uint8.
+        Images whose pixels differ by at most the radius of `PGD`, rounded to 8
+        bits, uint8, shape (B, 3, H, W).
     """
     clean = to_unit(images)
-    possible = partial(nearest_in_box, low=0, high=1)
-    adversarial = project(PGD, sample(PGD, clean, draws), clean, possible)
+    clip_to_unit = partial(nearest_in_box, low=0, high=1)
+    adversarial = project(PGD, sample(PGD, clean, draws), clean, clip_to_unit)
     with frozen_eval_mode(model):
         for _ in range(PGD_STEPS):
             adversarial.requires_grad_(True)
             cost = -label_loss(model(adversarial), labels, absent=absent).sum()
             (gradient,) = torch.autograd.grad(cost, adversarial)
-            adversarial = take_step(PGD, adversarial.detach(), gradient, clean, possible)
+            adversarial = take_step(PGD, adversarial.detach(), gradient, clean, clip_to_unit)
     return to_bytes(adversarial)

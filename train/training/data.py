@@ -11,10 +11,10 @@ from train.system.processes import main_process_first
 from train.system.user_errors import keyed, keys_of
 from train.training.initial import Initial
 
-# Pixels per side of images whose size is given neither by data.size nor by the
-# initial network.
+# Pixels per side of the images if neither the setting data.size nor the network with
+# whose weights a run begins gives a size.
 SIZE = 32
-# Values of data.name.
+# Values of the setting data.name.
 SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 
 
@@ -23,15 +23,15 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
 
     Args:
         settings: Settings of the run.
-        initial: Network that the run begins with. If data.size is null, the
-            images of a folder and rendered solids have the size of its images.
+        initial: Network with whose weights the run begins. If the setting
+            data.size is null, the images get the size that this network takes.
             None for random weights.
 
     Returns:
-        Data set with images of the run's size.
+        Data set with training and test images.
 
     Raises:
-        InputError: If the data cannot be read. The message names the key.
+        InputError: If the data cannot be read.
     """
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
@@ -44,13 +44,14 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
 
 
 def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
-    """Load the data set that `name` stands for.
+    """Load a data set by its name.
 
     Args:
-        name: A name in `SOURCES`.
+        name: Name in `SOURCES`.
         settings: Settings of the run, with the path and the size of the data.
-        initial: Network that the run begins with. If the settings give no size,
-            the images get the size of its images. None for random weights.
+        initial: Network with whose weights the run begins. If the settings give
+            no size, the images get the size that this network takes. None for
+            random weights.
     """
     data = settings.data
     if name == "cifar100":
@@ -60,8 +61,18 @@ def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> D
     size = data.size or (initial.size if initial else SIZE)
     if name == "shapes":
         cache = TensorCache(cache_folder(settings.train.cache))
-        return load_shapes(data.train_per_class, data.test_per_class, size, data.seed, cache)
-    skip = settings.evaluate.skip_unreadable
-    if name == "folder":
-        return load_folder(data.path, size, data.test_fraction, skip, data.workers)
-    return load_unlabeled(data.path, size, data.test_fraction, skip, data.workers)
+        return load_shapes(
+            train=data.train_per_class,
+            test=data.test_per_class,
+            size=size,
+            seed=data.seed,
+            cache=cache,
+        )
+    load_images = load_folder if name == "folder" else load_unlabeled
+    return load_images(
+        data.path,
+        size=size,
+        test_fraction=data.test_fraction,
+        skip_unreadable=settings.evaluate.skip_unreadable,
+        workers=data.workers,
+    )

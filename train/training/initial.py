@@ -1,4 +1,4 @@
-"""The network that a run begins with, and the images that neither it nor the run learns from."""
+"""The initial network, with whose weights a run begins, and the choice of validation images."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,10 +21,10 @@ from train.networks import CLASSIFIER, describe
 from train.runs.saved_networks import (
     NORMALIZE_LIGHT,
     RUN,
+    checks_architecture,
     is_classifier,
     is_state_dict,
     load_selected,
-    of_one_architecture,
     plain_weights,
 )
 from train.settings import WIDERESNET, ExperimentSettings, label_names
@@ -32,24 +32,28 @@ from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
 from train.system.user_errors import keyed
 
-# Entries of its description that a network shares with a network that begins with
-# its weights.
+# Entries in the description of a network. They must be equal in two networks if the
+# weights of one are copied to the other.
 SHARED = ("classes", "size", "name", "depth", "width")
-# Default fraction of the training images that validate.
+# Default fraction of the training images that validate the network.
 VALIDATION = 0.1
 
 
 @dataclass(frozen=True)
 class Initial:
-    """Network with whose weights a run begins. `train.init_from` names it.
+    """Initial network: the network with whose weights a run begins.
+
+    The setting `train.init_from` names it. It may contain a wrapper that
+    normalizes the light of images. `weights` and `network` are those without the
+    wrapper.
 
     Attributes:
         source: File of the network of another run, or name of a classifier.
-        architecture: Arguments that build the network (see
-            `train.networks.describe`).
-        weights: State dict of the network, without normalized light.
-        network: The network itself, without normalized light. The run trains a
-            copy. None if the name in the architecture builds it.
+        architecture: Description of the network, with the arguments of
+            `build_network`.
+        weights: State dict of the network.
+        network: The network itself, of which the run trains a copy. None if
+            `build_network` can build it from the description.
     """
 
     source: Path
@@ -59,63 +63,71 @@ class Initial:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Return the names of the classes, in the order of the outputs of the network."""
+        """Names of the classes, in the order of the outputs of the network."""
         return tuple(self.architecture["classes"])
 
     @property
     def size(self) -> int:
-        """Return the pixels per side of the images that the network takes."""
+        """Pixels per side of the images that the network takes."""
         return self.architecture["size"]
 
     @property
     def is_classifier(self) -> bool:
-        """Return whether the network has the architecture of a classifier of another library."""
+        """Whether the network is a classifier that the library did not train from random weights.
+
+        It can come from torchvision, timm or a file of the user, and may have
+        been trained by an earlier run.
+        """
         return CLASSIFIER in self.architecture
 
     @property
     def name(self) -> str:
-        """Return the name of the architecture."""
+        """Name of the architecture, such as "torchvision:resnet18"."""
         return self.architecture["name"]
 
     @property
     def normalize_light(self) -> dict[str, float] | None:
-        """Return how the network normalizes the light of images. None if it does not."""
+        """Settings with which the network normalizes the light of images. None if it does not."""
         return self.architecture.get(NORMALIZE_LIGHT)
 
     @property
     def validation(self) -> dict[str, Any] | None:
-        """Return the record of the images that it did not learn from. None if it is unknown."""
+        """Record of the images that the network did not learn from. None if this is unknown.
+
+        Its entry "fraction" is the fraction of the training images of each
+        class, and "images" is a hash of all training images.
+        """
         stored = self.architecture.get("validation")
         return stored if isinstance(stored, dict) else None
 
     def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
-        """Copy the weights and the normalization to another network.
+        """Copy the weights of the initial network to the network of the run.
 
         Args:
-            network: Network whose weights are replaced.
-            description: Arguments that build this network.
+            network: Network of the run, whose weights are replaced.
+            description: Arguments of `build_network` that build it.
 
         Raises:
             InputError: If the two networks differ in classes, image size or
                 architecture.
         """
-        stored = {"name": WIDERESNET, **self.architecture}
-        wanted = {"name": WIDERESNET, **description}
+        own = {"name": WIDERESNET, **self.architecture}
+        other = {"name": WIDERESNET, **description}
         for key in SHARED:
-            if key in stored and stored[key] != wanted.get(key):
-                difference = f"{key} {stored[key]}, not {wanted.get(key)}"
+            if key in own and own[key] != other.get(key):
+                difference = f"{key} {own[key]}, not {other.get(key)}"
                 if key == "classes":
                     difference = "other classes"
                 raise InputError(
                     f"train.init_from={self.source} was trained with {difference}: "
-                    "give this run the same",
+                    f"give this run the same {key}",
                 )
-        with of_one_architecture(self.source):
+        with checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
-    """Load the network with whose weights a run begins.
+    """Load the initial network, with whose weights a run begins.
 
     Args:
         settings: Settings of the run. `train.init_from` names the network.
@@ -124,26 +136,26 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         The network. None if the run begins with random weights.
 
     Raises:
-        InputError: If there is no such network, or if `weights` is set although
-            `train.init_from` names a run. A run has its own weights.
+        InputError: If there is no such network, or if the settings give weights
+            or classes to the network of a run, which has its own.
     """
     name = settings.train.init_from
     if not name:
         return None
     if is_classifier(name):
-        return _classifier(settings, name)
+        return _load_classifier(settings, name)
     source = Path(name.removeprefix(RUN))
     if is_state_dict(source):
         raise InputError(
-            f"train.init_from={name} contains weights without their network: "
-            "give its architecture and the weights, as in "
+            f"train.init_from={name} contains weights, but not their architecture: "
+            "give the architecture and the weights, as in "
             f"train.init_from=torchvision:resnet50 weights={source}",
             "train.init_from",
         )
     if settings.weights is not None:
         raise InputError(
-            f"weights={settings.weights} is not for train.init_from={name}, "
-            "which has its own: leave it out",
+            f"weights={settings.weights} cannot replace the weights of "
+            f"train.init_from={name}: leave weights out",
             "weights",
         )
     require_no_facts(
@@ -155,20 +167,21 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
 
 
 def with_label(settings: ExperimentSettings) -> ExperimentSettings:
-    """Return settings with a label, in which each class has its name.
+    """Replace a missing label, or a label that is an index, by the names of the classes.
 
-    Without a label, it is the classes of the meshes. An index is replaced by
-    the name of the class, which tables and folders of photographs show.
+    The label lists the positive classes. If it is missing, these are the classes
+    of the meshes. The names of the classes are known from the initial network.
 
     Args:
         settings: Settings of a run.
 
     Returns:
-        The settings. If they had no label, the meshes name their classes, too.
+        Settings with names in the label. If there was no label, each mesh has
+        its class as a label, too.
 
     Raises:
-        InputError: If an initial network is needed, because there is no label,
-            or if it lacks a class.
+        InputError: If the label is missing and the run begins with random
+            weights, or if the initial network lacks a class.
     """
     names = [] if settings.label is None else label_names(settings.label)
     if names and not any(name.isdecimal() for name in names):
@@ -180,21 +193,21 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
         return with_class_names(settings, initial.classes)
     if initial is None:
         raise InputError(
-            "label is not set, and there is no train.init_from whose classes are known: "
+            "label is not set, and without train.init_from the names of the classes are unknown: "
             "set label=CLASS",
             "label",
         )
     return with_classes_of_meshes(settings, initial.classes)
 
 
-def _classifier(settings: ExperimentSettings, name: str) -> Initial:
-    """Load a classifier of another library or a file as the initial network.
+def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
+    """Load a classifier, from another library or from a file, as the initial network.
 
     Args:
         settings: Settings of the run, with the weights, the classes and the
             size of the images. Without a size, the images have the size that
             the classifier takes.
-        name: Value of `train.init_from`.
+        name: Value of `train.init_from`, such as "torchvision:resnet50".
 
     Raises:
         InputError: If there is no such classifier, or if it has no weights that
@@ -203,7 +216,7 @@ def _classifier(settings: ExperimentSettings, name: str) -> Initial:
     size = settings.data.size
     is_file = is_network_file(name)
     with keyed(name="train.init_from", size="data.size"):
-        # A file does not always record the size of its images.
+        # The size is given only for a file, which may not record the size of its images.
         known_size = size if is_file else None
         classifier = load_classifier(
             name, settings.weights, settings.classes, known_size, settings.normalization
@@ -215,21 +228,23 @@ def _classifier(settings: ExperimentSettings, name: str) -> Initial:
             "give its file of TorchScript or of torch.export",
             "train.init_from",
         )
-    # The network is built again from its file, also from another folder.
+    # The absolute path of a file is recorded, so that it is found from any folder.
     shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     return Initial(Path(name), architecture, network.state_dict())
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:
-    """Create the initial network of a run from a classifier in memory.
+    """Use a classifier in memory as the initial network of a run.
 
     Args:
-        classifier: The classifier.
-        size: The pixels per side of the images. None for those of the classifier.
+        classifier: The classifier. If it normalizes the light of images, the
+            trained network will do the same.
+        size: Pixels per side of the images of the run. None for the size that
+            the classifier takes.
 
     Returns:
-        The network.
+        The initial network.
     """
     network = without_normalized_light(classifier.function)
     shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
@@ -241,12 +256,13 @@ def initial_of(classifier: Classifier, size: int | None) -> Initial:
 
 @dataclass(frozen=True)
 class ValidationPart:
-    """The part of the training images that validates a network.
+    """Choice of the validation images: training images from which the network does not learn.
 
     Attributes:
-        fraction: The fraction of every class's images.
-        record: What is stored beside the weights: the part that neither this network nor any
-            network before it learned from. None if that is unknown.
+        fraction: Fraction of the training images of each class.
+        record: Record of the training images from which neither this network nor the networks
+            with whose weights it began have learned. It is stored with the weights. None if these
+            images are unknown.
     """
 
     fraction: float
@@ -258,68 +274,113 @@ def choose_validation(
     data: DataSet,
     initial: Initial | None,
 ) -> ValidationPart:
-    """Choose the part of the training images that validates a network.
+    """Choose which fraction of the training images validates the network of a run.
 
-    The parts of one seed are nested. The smallest part among a network and those that it began
-    with is therefore the part that none of them learned from.
+    Networks of one data set leave out nested sets of images: a smaller fraction is a subset of a
+    larger one. The smallest fraction of a network and of the networks with whose weights it began
+    is therefore the fraction from which none of them has learned.
 
     Args:
-        settings: The settings of the run.
-        data: The data of the run.
-        initial: The network that the run begins with, if any.
+        settings: Settings of the run. `data.validation` is the fraction. If it is None, the
+            fraction that the initial network left out is used, or else VALIDATION.
+        data: Data of the run.
+        initial: Network with whose weights the run begins. None for random weights.
 
     Returns:
-        The part.
+        Choice of the validation images.
     """
     asked = settings.data.validation
-    fraction = asked
-    if fraction is None:
-        most = 1.0 if data.labeled else HELD_OUT / len(data.train)
-        fraction = min(VALIDATION, most)
-    # The record of the part that this run leaves out.
-    own = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
+    fraction = _default_fraction(data) if asked is None else asked
+    # Record of the images that this run leaves out.
+    record = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
     if data.rendered:
-        own["data"] = "shapes"
-    if initial is None:
-        return ValidationPart(fraction, own)
-
-    # The part that the initial network did not learn from, and its fraction.
-    stored = initial.validation
-    known = stored.get("fraction") if stored else None
-    if data.rendered and stored and known is not None and "data" not in stored:
-        # The initial network learned from other images than rendered ones.
-        return ValidationPart(fraction, own)
-    begun = settings.train.init_from
-    if not isinstance(known, float) or own | {"fraction": known} != stored:
-        console.debug(
-            "validation: %s does not say whether it learned from these images, too", begun
-        )
+        record["data"] = "shapes"
+    if initial is None or _learned_from_other_kind(initial, data):
+        return ValidationPart(fraction, record)
+    name = settings.train.init_from
+    left_out = _fraction_left_out(initial, record)
+    if left_out is None:
+        console.debug("validation: %s does not say whether it learned from these images, too", name)
         return ValidationPart(fraction, None)
     if asked is None:
-        fraction = known
-    if fraction > known:
-        left_out = f"it left out only data.validation={known}"
-        console.debug("validation: %s learned from part of it: %s", begun, left_out)
-    return ValidationPart(fraction, own | {"fraction": min(fraction, known)})
+        fraction = left_out
+    if fraction > left_out:
+        fault = f"it left out only data.validation={left_out}"
+        console.debug("validation: %s learned from part of it: %s", name, fault)
+    return ValidationPart(fraction, record | {"fraction": min(fraction, left_out)})
+
+
+def _default_fraction(data: DataSet) -> float:
+    """Return the default fraction of the training images that validate the network.
+
+    It is VALIDATION, or less for data without labels, of which at most HELD_OUT
+    images validate.
+
+    Args:
+        data: Data set of the run.
+    """
+    largest = 1.0 if data.labeled else HELD_OUT / len(data.train)
+    return min(VALIDATION, largest)
+
+
+def _learned_from_other_kind(initial: Initial, data: DataSet) -> bool:
+    """Return whether a run trains on rendered images, and its initial network did not.
+
+    Args:
+        initial: Network with whose weights the run begins.
+        data: Data set of the run.
+    """
+    record = initial.validation or {}
+    has_fraction = record.get("fraction") is not None
+    return data.rendered and has_fraction and "data" not in record
+
+
+def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | None:
+    """Return the fraction of the training images from which the initial network did not learn.
+
+    Args:
+        initial: Network with whose weights the run begins.
+        record: Record of the validation images of the run, with a hash of its
+            training images.
+
+    Returns:
+        The fraction. None if the initial network was trained on another data
+        set, or if its data set is unknown.
+    """
+    initial_record = initial.validation or {}
+    fraction = initial_record.get("fraction")
+    if not isinstance(fraction, float):
+        return None
+    # The two records may differ only in the fraction.
+    is_same_data = {**record, "fraction": fraction} == initial_record
+    return fraction if is_same_data else None
 
 
 class CachedModel:
-    """A model whose logits are stored on disk, so that later runs need not compute them again.
+    """Wrapper of a network that stores logits on disk, so that later runs need not compute them.
 
     Args:
-        model: The model.
-        device: The device that computes.
-        cache: Where the logits are stored, under a hash of weights and images.
+        model: The network.
+        device: Device that computes.
+        cache: Cache on disk. The key of logits is a hash of the weights and the images.
     """
 
     def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
+        """Compute the hash of all that decides the logits of an image."""
         self._model = model
         self._cache = cache
         facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]
         self._key = content_hash(facts)
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the logits (B, classes) of images (B, 3, size, size) in [0, 1]."""
+        """Read the logits of images from the cache, or compute and store them.
+
+        Args:
+            images: Images in [0, 1], shape (B, 3, size, size).
+
+        Returns:
+            Logits, shape (B, classes).
+        """
         key = content_hash([self._key, images])
         stored = self._cache.read(key)
         if stored is None:

@@ -1,9 +1,8 @@
-"""Interpolation between the initial and the trained weights of a network.
+"""Interpolation between the weights of a network before and after the training.
 
 See Wortsman et al. 2022, "Robust fine-tuning of zero-shot models" (WiSE-FT). The
-factor is chosen on images that are kept aside. They need no labels, because
-predictions are compared with those of the initial network for the unchanged
-images.
+factor is chosen on validation images. They need no labels, because predictions
+are compared with those of the network before the training.
 """
 
 from collections.abc import Mapping
@@ -21,11 +20,12 @@ from train import console
 from train.data.sets import Split
 from train.system.device import MixedPrecision
 
-# Factors to choose from. At 0, the network is the initial one.
+# Factors of the interpolation that are tried: 0 gives the weights before the training, and
+# 1 the weights after it.
 FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0)
-# Entry of a checkpoint with the factor of its weights.
+# Entry of a checkpoint with interpolated weights. Its value is the factor.
 INTERPOLATION = "interpolation"
-# Images per pass.
+# Number of images in a pass through a network.
 BATCH = 32
 
 
@@ -37,49 +37,52 @@ def interpolate(
     seed: int,
     weights: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[dict[str, Tensor], float]:
-    """Interpolate by the factor with the lowest loss on validation images.
+    """Interpolate between two sets of weights, by the factor with the lowest loss.
 
-    The loss is the weighted sum of two divergences. The first compares the
-    predictions for unchanged images, and the second the predictions for images
-    in the light of a projector. Both are divergences from the predictions of
-    the initial network for the unchanged images, as in the training.
+    The loss is measured on validation images. It is a weighted sum of two
+    divergences from the predictions of the initial network for these images:
+    that of the predictions of the interpolated network for the same images, and
+    that of its predictions for the images in the light of a projector.
 
     Args:
         initial: Network before the training.
-        selected: Network of the same architecture. It gets other weights.
+        selected: Network of the same architecture, whose weights are replaced
+            while factors are tried.
         trained: Weights after the training.
-        validation: Images that neither network learned from.
-        seed: Seed of the light.
-        weights: Weights of both parts of the loss: unchanged and relit.
+        validation: Images from which no network has learned.
+        seed: Seed of the light of the projector.
+        weights: Weights of the two divergences, for unchanged and for relit
+            images.
 
     Returns:
-        The weights, on the CPU, and the factor. Among equally good factors,
-        the smallest one is chosen.
+        Pair of the interpolated weights, on the CPU, and the factor. Among
+        equally good factors, the smallest one is chosen.
     """
-    begin = {name: value.cpu() for name, value in initial.network.state_dict().items()}
-    wanted = predict(initial, validation)
-    # Key of the random stream of the light, which is the same for all factors.
-    key = (seed, "validation")
-    lowest = float("inf")
+    initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
+    targets = predict(initial, validation)
+    # Key of the random stream of the light. All factors are tried in the same light.
+    light_key = (seed, "validation")
+    lowest_loss = float("inf")
     best_factor = FACTORS[0]
     for factor in FACTORS:
-        selected.network.load_state_dict(mix(begin, trained, factor))
+        selected.network.load_state_dict(mix(initial_weights, trained, factor))
         unchanged = predict(selected, validation)
-        relit = predict(selected, validation, *key)
-        loss = weights[0] * divergence(unchanged, wanted) + weights[1] * divergence(relit, wanted)
+        relit = predict(selected, validation, *light_key)
+        loss_unchanged = weights[0] * divergence(unchanged, targets)
+        loss = loss_unchanged + weights[1] * divergence(relit, targets)
         console.debug(
             "weights %.2f: loss %.4f, agreement %.4f, relit %.4f",
             factor,
             loss,
-            agreement(unchanged, wanted),
-            agreement(relit, wanted),
+            agreement(unchanged, targets),
+            agreement(relit, targets),
         )
-        if loss < lowest:
-            lowest = loss
+        if loss < lowest_loss:
+            lowest_loss = loss
             best_factor = factor
-    trained_share = 100 * best_factor
-    console.info("weights: %.0f%% trained, %.0f%% original", trained_share, 100 - trained_share)
-    return mix(begin, trained, best_factor), best_factor
+    percentage = 100 * best_factor
+    console.info("weights: %.0f%% trained, %.0f%% original", percentage, 100 - percentage)
+    return mix(initial_weights, trained, best_factor), best_factor
 
 
 def mix(
@@ -88,12 +91,13 @@ def mix(
     """Interpolate linearly between the weights of two networks.
 
     Args:
-        initial: Weights at the factor 0.
-        trained: Weights at the factor 1.
-        factor: Factor, from 0 to 1.
+        initial: Weights by name that the factor 0 gives.
+        trained: Weights by name that the factor 1 gives.
+        factor: Factor, in [0, 1].
 
     Returns:
-        The weights. Whole numbers, such as counters, are the trained ones.
+        Interpolated weights by name. Integer tensors, such as counters, are
+        those of `trained`.
     """
     mixed = {}
     for name, value in trained.items():
@@ -103,41 +107,41 @@ def mix(
     return mixed
 
 
-def agreement(logits: Tensor, wanted: Tensor) -> float:
+def agreement(logits: Tensor, targets: Tensor) -> float:
     """Return the fraction of images for which two networks predict the same class.
 
     Args:
         logits: Logits of a network, shape (N, classes).
-        wanted: Logits of the other network, shape (N, classes).
+        targets: Logits of another network, shape (N, classes).
 
     Returns:
         The fraction, in [0, 1].
     """
-    return float((logits.argmax(1) == wanted.argmax(1)).double().mean())
+    return float((logits.argmax(1) == targets.argmax(1)).double().mean())
 
 
-def divergence(logits: Tensor, wanted: Tensor) -> float:
-    """Return the mean divergence of predictions from those of another network.
+def divergence(logits: Tensor, targets: Tensor) -> float:
+    """Return the mean Kullback-Leibler divergence of predictions from those of another network.
 
     Args:
         logits: Logits of a network, shape (N, classes).
-        wanted: Logits of the other network, shape (N, classes).
+        targets: Logits of the other network, shape (N, classes).
 
     Returns:
-        Kullback–Leibler divergence, at least 0.
+        Mean over the N images, at least 0.
     """
-    return float(kl_divergence(logits, wanted).mean())
+    return float(kl_divergence(logits, targets).mean())
 
 
 @torch.no_grad()
 def predict(model: MixedPrecision, split: Split, *light_key: int | str) -> Tensor:
-    """Compute the logits of a network for images.
+    """Compute the logits of a network for images, as they are or in the light of a projector.
 
     Args:
-        model: Network.
-        split: Images.
-        light_key: Key of the random stream of the light of a projector. The
-            images are unchanged if there is none.
+        model: The network.
+        split: N images.
+        *light_key: Key of the random stream from which the light of the
+            projector is drawn. Without a key, there is no projector.
 
     Returns:
         Logits, on the CPU, shape (N, classes).

@@ -1,12 +1,13 @@
 """The training loop.
 
-An epoch has one or more rounds. Each round begins with fresh renders. Validation ends an epoch,
-and so does a checkpoint. Checkpoints are also written within an epoch that takes long.
+An epoch consists of one or more rounds. At the start of a round, the training renders are rendered
+anew. At the end of an epoch, the network is validated and a checkpoint is written. In a long epoch,
+checkpoints are also written in between.
 """
 
 import math
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import dataclass
@@ -42,14 +43,15 @@ from train.training.recipe import build_optimizer, learning_rate
 from train.training.relit_batches import RelitBatches
 from train.training.shared_teacher import share_layers
 
-# Images that are evaluated at a time.
+# Number of images in a pass of the validation.
 EVALUATION_BATCH = 512
-# `Trainer` waits at least this many seconds between two checkpoints within an epoch.
+# Smallest number of seconds between two checkpoints within an epoch.
 SAVING_EVERY = 60.0
-# The largest share of an epoch's time that its checkpoints take.
+# Largest fraction of the time of an epoch in which checkpoints are written.
 SAVING_SHARE = 0.02
 
-# Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
+# Batch of training images: images, uint8, shape (B, 3, H, W), their labels, shape (B,), and
+# whether each image is a render, bool, shape (B,).
 Batch = tuple[Tensor, Tensor, Tensor]
 
 
@@ -58,11 +60,12 @@ class EpochState:
     """State of an epoch that has begun.
 
     Attributes:
-        renders: The renders of the current round.
-        sums: Two sums over the images that this process has trained on in this
-            epoch, shape (2,): of the loss, and of the correct predictions.
-        diagnostics: For each round so far, values of the attack by name.
-        step: Number of steps that were taken in this epoch.
+        renders: Renders of the current round.
+        sums: Sum of the losses, and number of correct predictions, over all
+            images on which this process has trained in this epoch, shape (2,).
+        diagnostics: Measurements of the attack on the renders by name, for each
+            round that has begun.
+        step: Number of training steps that were taken in this epoch.
     """
 
     renders: Renders
@@ -71,9 +74,11 @@ class EpochState:
     step: int = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return plain values and tensors, summed over all processes.
+        """Return the state for a checkpoint, with sums over all processes.
 
-        The renders are bytes, as they are when the network is trained on them.
+        Returns:
+            Mapping of tensors and plain values. The renders are rounded to 8
+            bits, as for the training.
         """
         return {
             "images": to_bytes(self.renders.images),
@@ -86,14 +91,14 @@ class EpochState:
 
 @dataclass(frozen=True)
 class EpochPlan:
-    """Images and rounds of an epoch.
+    """Training images and rounds of an epoch.
 
     Attributes:
-        split: The images.
-        rows: Indices of the images in the split that the network learns from,
-            shape (N,). The rounds draw some of them.
-        rounds: The rounds.
-        steps: The number of steps of each round.
+        split: Images and labels of the data.
+        rows: Indices in `split` of the training images, shape (N,). The other
+            images validate.
+        rounds: Rounds of the epoch. A round has its own order of images.
+        steps: Number of training steps in each round.
     """
 
     split: Split
@@ -103,31 +108,30 @@ class EpochPlan:
 
     @property
     def total(self) -> int:
-        """Count the steps of all rounds."""
+        """Number of training steps in the whole epoch."""
         return sum(self.steps)
 
 
 class Trainer:
-    """Trainer of one network. It writes checkpoints to the folder of the run.
+    """Trainer of one network, which writes checkpoints to the folder of the run.
 
-    `fit` trains the network. `resume` restores the newest checkpoint before.
+    `fit` trains the network. To continue a run, call `resume` before `fit`.
 
     Args:
         settings: Settings of the training.
         model: Network to train.
-        architecture: Arguments that build the network, with its classes. They
-            are stored in checkpoints.
-        service: Service that renders the training examples anew for each round.
+        architecture: Description of the network, which is stored in checkpoints.
+        service: Service that renders the training renders anew in each round.
         folder: Folder of the run.
         labeled: Whether the labels of the data are known.
 
     Attributes:
         initial: Copy of the network before the training. None if the run begins
             with random weights. The copy is the teacher of a distillation loss,
-            and each epoch of a model soup begins with it.
-        averages: Moving average and soup of the network.
+            and each epoch of a model soup begins with its weights.
+        averages: Moving average and model soup of the network.
         epoch: Number of finished epochs.
-        history: Metrics of each finished epoch.
+        history: Metrics of each finished epoch by name.
 
     Raises:
         InputError: If a batch cannot be divided equally among the processes, or
@@ -143,6 +147,7 @@ class Trainer:
         folder: Path,
         labeled: bool = True,
     ):
+        """Check the settings, copy the initial network, and build the optimizer and the loss."""
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(
@@ -159,15 +164,15 @@ class Trainer:
         self.epoch = 0
         self.history: list[dict[str, float]] = []
 
-        # The epoch that has begun.
+        # State of the epoch that has begun. None between two epochs.
         self._under_way: EpochState | None = None
-        # The random state at a checkpoint within an epoch.
+        # States of the random generators at the checkpoint from which a run is resumed.
         self._random_state: dict[str, Any] = {}
-        # The network that is selected, but not yet written.
+        # Content of best.pt, until it is written.
         self._best: dict[str, Any] | None = None
-        # Time of the last checkpoint or, before the first one, of the start.
+        # Time at which the last checkpoint was written or, before that, of the start.
         self._saved_at = time.perf_counter()
-        # Seconds that writing the last checkpoint took.
+        # Seconds that it took to write the last checkpoint.
         self._saving_took = 0.0
 
         self.model = model
@@ -179,8 +184,8 @@ class Trainer:
             model,
             settings.ema_decay,
             settings.soup,
-            # Validation without labels measures the agreement with the initial
-            # network, which is best before any training.
+            # The validation accuracy of data without labels is the agreement with the initial
+            # network. It is highest before any training, and cannot choose an epoch.
             keeps_latest=not labeled,
         )
         self._build_step(labeled)
@@ -196,7 +201,8 @@ class Trainer:
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
         replica = wrap_ddp(self.model)
-        with progress_message("loading the optimizer"):  # torch imports its compiler here: seconds.
+        # The first optimizer of a process imports the compiler of torch, which takes seconds.
+        with progress_message("loading the optimizer"):
             self.optimizer = build_optimizer(self.model, settings)
         is_scaled = self.model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
@@ -204,50 +210,58 @@ class Trainer:
         teacher = self.initial if has_teacher else None
         with keyed(choice="compile"):
             is_compiled = compiles(settings.compile, self.device)
-        # The module that computes the logits of the teacher. It may reuse frozen
-        # layers of the network in training.
-        answering: nn.Module | None = teacher
+        # Module that computes the logits of the teacher. It may take the features from
+        # the network in training.
+        teacher_module: nn.Module | None = teacher
         if teacher is not None and not is_compiled:
-            answering = share_layers(settings, self.model, teacher, self.architecture["size"])
-        self._loss = TrainingLoss(replica, settings, positive_classes, answering, labeled).compute
-        self._baseline: Baseline | RelitBatches = Baseline(
+            size = self.architecture["size"]
+            teacher_module = share_layers(settings, self.model, teacher, size)
+        loss = TrainingLoss(replica, settings, positive_classes, teacher_module, labeled)
+        self._loss = loss.compute
+        self._augmentation: Baseline | RelitBatches = Baseline(
             settings.augmentation,
             self.model,
             self.seed,
             positive_classes[1:],
         )
         if settings.augmentation == RELIGHT:
-            self._baseline = RelitBatches(settings, self.model, teacher, self.seed)
+            self._augmentation = RelitBatches(settings, self.model, teacher, self.seed)
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
         if is_compiled:
-            torch.compiler.reset()  # torch limits the graphs of all runs of a process.
-            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-            self._attacked = GraphedModel(self.model)
-            self._validated = GraphedModel(self.averages.selected)
+            self._compile()
+
+    def _compile(self) -> None:
+        """Record the loss, the attacked network and the validated network as CUDA graphs."""
+        # torch limits the number of compiled functions in a process. Those of an
+        # earlier run are removed.
+        torch.compiler.reset()
+        self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
+        self._attacked = GraphedModel(self.model)
+        self._validated = GraphedModel(self.averages.selected)
 
     @property
     def selected(self) -> MixedPrecision:
-        """Network that is validated and kept."""
+        """Network that is validated after each epoch: an average, or the network in training."""
         return self.averages.selected
 
     def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
-        """Train to the last epoch.
+        """Train to the last epoch, and write checkpoints.
 
-        Afterwards, best.pt holds the network with the highest validation
-        accuracy. For a soup, and for data without labels, it holds the last
-        network.
+        Afterwards, best.pt contains the network of the epoch with the highest
+        validation accuracy. For a model soup, and for data without labels, it
+        contains the network after the last epoch.
 
         Args:
-            split: Images and labels, on the device of the network.
-            held_out: Mask of the images that validate, bool on the CPU, shape
-                (N,).
+            split: N images and their labels, on the device of the network.
+            held_out: Whether each image is a validation image, bool, on the CPU,
+                shape (N,). The network learns from the others.
             log: Log of the run. None in all processes but the first one.
 
         Raises:
-            InputError: If the training diverges.
-            Interrupted: If a signal ended the training. A checkpoint was
-                written before.
+            InputError: If the loss or a weight becomes NaN or infinite.
+            Interrupted: If a signal ends the training, after a checkpoint was
+                written.
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
@@ -270,17 +284,19 @@ class Trainer:
         signals: SignalHandler,
         log: RunLog | None,
     ) -> bool:
-        """Take the remaining steps of an epoch.
+        """Take the training steps of an epoch that remain.
+
+        If the run was resumed within the epoch, some steps were taken before.
 
         Args:
             split: Images and labels.
-            rows: Indices of the images to learn from, shape (N,).
-            signals: Signals that ask the run to stop.
+            rows: Indices of the training images in `split`, shape (N,).
+            signals: Handler of signals that ask the run to stop.
             log: Log of the run. None in all processes but the first one.
 
         Returns:
-            Whether all steps were taken. False if a signal came before the last
-            step.
+            True if the epoch is complete. False if a signal stopped it before
+            its last step.
         """
         plan = self._plan(split, rows)
         if self._under_way is None:
@@ -290,9 +306,8 @@ class Trainer:
         state = self._under_way
         with closing(self._remaining_batches(plan, state, log)) as batches:
             for batch in batches:
-                # The number of the step in the whole run.
-                number = self.epoch * plan.total + state.step
-                state.sums += self._step(*batch, state.step / plan.total, number)
+                step_in_run = self.epoch * plan.total + state.step
+                state.sums += self._step(*batch, state.step / plan.total, step_in_run)
                 state.step += 1
                 if signals.requested():
                     return state.step == plan.total
@@ -301,26 +316,34 @@ class Trainer:
         return True
 
     def _plan(self, split: Split, rows: Tensor) -> EpochPlan:
-        """Divide the current epoch into rounds, and count the steps of each.
+        """Divide the current epoch into rounds, and count the training steps of each round.
 
         Args:
             split: Images and labels.
-            rows: Indices of the images to learn from, shape (N,).
+            rows: Indices of the training images in `split`, shape (N,).
         """
         settings = self.settings
         rounds = rounds_of_epoch(
-            len(rows),
-            len(self.service),
-            self.seed,
-            self.epoch,
-            settings.images_per_epoch,
-            self.service.settings.regenerate_every,
+            image_count=len(rows),
+            render_count=len(self.service),
+            seed=self.seed,
+            epoch=self.epoch,
+            images_per_epoch=settings.images_per_epoch,
+            images_per_round=self.service.settings.regenerate_every,
         )
-        steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
+        steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         return EpochPlan(split, rows, rounds, steps)
 
     def _begin_epoch(self, plan: EpochPlan, log: RunLog | None) -> EpochState:
-        """Render the images of the first round of an epoch, and return the new state."""
+        """Begin an epoch: render the images of its first round.
+
+        Args:
+            plan: Images and rounds of the epoch.
+            log: Log of the run. None in all processes but the first one.
+
+        Returns:
+            State of the epoch before its first step.
+        """
         self.averages.begin_epoch(self.initial, self.optimizer)
         renders = self._regenerate(plan.rounds[0], log)
         return EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
@@ -328,33 +351,36 @@ class Trainer:
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
     ) -> Generator[Batch, None, None]:
-        """Yield the remaining batches of an epoch.
-
-        Before each round but the first one of the epoch, new images are rendered.
+        """Yield the batches of an epoch that remain, and render new images before each new round.
 
         Args:
             plan: Images and rounds of the epoch.
-            state: State of the epoch. The renders and diagnostics of each new
-                round are stored in it.
+            state: State of the epoch, which is updated when a round begins.
             log: Log of the run. None in all processes but the first one.
+
+        Yields:
+            Batches of the rest of the current round, and of all later rounds.
         """
-        # Each round that has begun has diagnostics.
+        # `state.diagnostics` has an item for each round that has begun. The last of them
+        # is the current round.
         current = len(state.diagnostics) - 1
         for index in range(current, len(plan.rounds)):
-            if index == len(state.diagnostics):
+            is_new = index > current
+            if is_new:
                 state.renders = self._regenerate(plan.rounds[index], log)
                 state.diagnostics.append(state.renders.diagnostics)
             with self.phases("training"):
                 renders = Split(to_bytes(state.renders.images), state.renders.labels)
                 self.model.train(not self.settings.eval_mode)
+                # Number of the steps of this round that were taken before.
                 first = state.step - sum(plan.steps[:index])
                 batches = training_batches(
                     TrainingImages(plan.split, plan.rows, renders),
-                    self.settings.batch_size,
-                    self.seed,
-                    plan.rounds[index],
-                    self.settings.flips,
-                    first,
+                    batch_size=self.settings.batch_size,
+                    seed=self.seed,
+                    this_round=plan.rounds[index],
+                    flips=self.settings.flips,
+                    first=first,
                 )
                 title = f"epoch {self.epoch + 1}"
                 if len(plan.rounds) > 1:
@@ -362,13 +388,18 @@ class Trainer:
                 yield from progress(batches, title, plan.steps[index], first)
 
     def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
-        """Render the images of a round, and log a few of the attacked ones."""
+        """Render the training renders of a round anew, and log images of a few attacks on them.
+
+        Args:
+            now: The round.
+            log: Log of the run. None in all processes but the first one.
+        """
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
         if log and renders.attack_examples:
-            # A run that is resumed within the epoch does not attack these renders
-            # again, so their images are written now.
+            # The images are written now, because a run that is resumed within this round
+            # does not attack the renders again.
             with self.phases("input_output"):
                 classes = self.architecture["classes"]
                 log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
@@ -379,42 +410,37 @@ class Trainer:
         images: Tensor,
         labels: Tensor,
         rendered: Tensor,
-        progress: float,
-        number: int,
+        epoch_fraction: float,
+        step_in_run: int,
     ) -> Tensor:
-        """Change the weights by the gradient of the loss of a batch.
+        """Take a training step: change the weights by the gradient of the loss of a batch.
 
         Args:
-            images: The images, uint8, shape (B, 3, H, W).
-            labels: Their classes, shape (B,).
-            rendered: Which of them are renders, bool, shape (B,).
-            progress: The fraction of the epoch that is done.
-            number: The number of the step in the run, from 0.
+            images: Images, uint8, shape (B, 3, H, W).
+            labels: Labels of the images, shape (B,).
+            rendered: Whether each image is a render, bool, shape (B,).
+            epoch_fraction: Fraction of the epoch that is done, in [0, 1).
+            step_in_run: Number of the step in the run, from 0.
 
         Returns:
-            The sum of the losses and the number of correct predictions, shape (2,).
+            Sum of the losses of the images, and number of correct predictions,
+            shape (2,).
         """
         settings = self.settings
-        # Each epoch of a soup runs through the whole schedule.
-        done = progress if settings.soup else (self.epoch + progress) / settings.epochs
+        done = (self.epoch + epoch_fraction) / settings.epochs
+        if settings.soup:
+            # Each epoch of a model soup runs through the whole schedule of the
+            # learning rate.
+            done = epoch_fraction
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(settings, done)
-        augmented = self._baseline.apply(images, labels, number)
-        # The consistency term compares both versions. Otherwise only one is shown.
+        augmented = self._augmentation.apply(images, labels, step_in_run)
         tensors = [augmented, labels, rendered]
         if settings.consistency_weight:
+            # The consistency term compares the images before and after the augmentation.
             tensors = [images, labels, rendered, augmented]
         self.optimizer.zero_grad(set_to_none=True)
-        sums = torch.zeros(2, device=self.device)
-        # Each tensor is divided along the batch. A part has one chunk of each tensor.
-        # The gradients of all parts are added.
-        chunks = [tensor.chunk(settings.accumulation_steps) for tensor in tensors]
-        parts = zip(*chunks, strict=True)
-        for part in parts:
-            loss, hits = self._loss(*part)
-            self.scaler.scale(loss / settings.accumulation_steps).backward()
-            count = len(part[0])
-            sums += torch.stack([loss.detach() * count, hits])
+        sums = self._add_gradients(tensors)
         if settings.clip_gradient:
             self.scaler.unscale_(self.optimizer)
             nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
@@ -423,12 +449,37 @@ class Trainer:
         self.averages.end_step()
         return sums
 
+    def _add_gradients(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Compute the gradient of the loss of a batch.
+
+        The batch is divided into smaller batches to save memory. Their gradients
+        are added.
+
+        Args:
+            tensors: Arguments of the loss. Each has a row for each image of the
+                batch.
+
+        Returns:
+            Sum of the losses of the images, and number of correct predictions,
+            shape (2,).
+        """
+        count = self.settings.accumulation_steps
+        sums = torch.zeros(2, device=self.device)
+        # A list of chunks for each tensor. A smaller batch has one chunk of each tensor.
+        chunks = [tensor.chunk(count) for tensor in tensors]
+        for small_batch in zip(*chunks, strict=True):
+            loss, hits = self._loss(*small_batch)
+            self.scaler.scale(loss / count).backward()
+            image_count = len(small_batch[0])
+            sums += torch.stack([loss.detach() * image_count, hits])
+        return sums
+
     def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
-        """Validate the network, remember it if it is the best, and log the metrics.
+        """Finish an epoch: validate the network, keep it if it is the best, and log the metrics.
 
         Args:
             split: Images and labels.
-            rows: Indices of the images that validate, shape (N,).
+            rows: Indices of the validation images in `split`, shape (N,).
             log: Log of the run. None in all processes but the first one.
         """
         state = cast(EpochState, self._under_way)
@@ -449,14 +500,14 @@ class Trainer:
             with self.phases("input_output"):
                 log.renders(state.renders.images, self.epoch)
 
-        images = state.step * self.settings.batch_size
+        image_count = state.step * self.settings.batch_size
         trained = {
-            "loss": loss_sum / images,
-            "accuracy": hits / images,
+            "loss": loss_sum / image_count,
+            "accuracy": hits / image_count,
             "learning_rate": self.optimizer.param_groups[0]["lr"],
         }
-        # If a run was resumed after the last attack of the epoch, no time of the phase
-        # "attack" was measured. It then counts as 0 seconds.
+        # A phase that this process did not run counts as 0 seconds. The attack is such a
+        # phase if the run was resumed after it.
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
         metrics = epoch_metrics(trained, validated, state.diagnostics, seconds)
         self.history.append({"epoch": self.epoch, **metrics})
@@ -465,11 +516,11 @@ class Trainer:
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
-        """Raise InputError if the loss or a weight is NaN or infinite.
+        """Raise InputError if the loss or a weight of the network is NaN or infinite.
 
         Args:
-            loss: Sum of losses.
-            epoch: Number of the epoch, from 1, for the error.
+            loss: Loss, or a sum of losses.
+            epoch: Number of the epoch, from 1, for the error message.
         """
         weights = self.model.network.state_dict().values()
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
@@ -483,14 +534,12 @@ class Trainer:
             )
 
     def _save(self) -> None:
-        """Write the checkpoint last.pt, and best.pt if a network was selected since the last time.
+        """Write the checkpoint last.pt, and best.pt if there is a new best network.
 
-        The former last.pt is kept as previous.pt. Only the first process writes.
+        The former last.pt is renamed to previous.pt. Only the first process writes.
         """
         if self._under_way:
             self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
-        # The line of the epoch in metrics.jsonl is written before the checkpoint, so
-        # that a resumed run never lacks this line.
         with self.phases("input_output"):
             state = self.state_dict()
             best = self._best
@@ -506,17 +555,19 @@ class Trainer:
             self._saving_took = self._saved_at - start
 
     def _saving_is_due(self) -> bool:
-        """Return whether to write a checkpoint within the epoch.
+        """Return whether it is time to write a checkpoint within an epoch.
 
-        If the run is killed, it then loses about a minute. Several processes
-        would have to agree on the moment, so they write only at the end of an
-        epoch or after a signal.
+        Without such checkpoints, a run that is killed would lose a whole epoch.
+        A run with several processes writes none, because the processes would
+        have to agree on the time.
         """
+        if distributed.world_size() > 1:
+            return False
         wait = max(SAVING_EVERY, self._saving_took / SAVING_SHARE)
-        return distributed.world_size() == 1 and time.perf_counter() - self._saved_at > wait
+        return time.perf_counter() - self._saved_at > wait
 
     def _description(self) -> dict[str, Any]:
-        """Return the facts that are stored with the weights of a network."""
+        """Return the entries of a checkpoint that say which run and epoch its weights are from."""
         return {
             "architecture": self.architecture,
             "epoch": self.epoch,
@@ -525,7 +576,12 @@ class Trainer:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state from which a run continues as if it had not stopped."""
+        """Return the content of a checkpoint, from which a run continues as if it had not stopped.
+
+        Returns:
+            Mapping of tensors and plain values. "under_way" is the state of the
+            epoch that has begun, or None between two epochs.
+        """
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
@@ -540,11 +596,11 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the state that `state_dict` returned.
+        """Restore the state of a run from the content of a checkpoint.
 
         Args:
-            state: State of the same network. Any other value raises errors of
-                many types.
+            state: Mapping that `state_dict` of the same run returned. Any other
+                value raises errors of many types.
         """
         self.epoch = state["epoch"]
         self.history = state["history"]
@@ -556,32 +612,34 @@ class Trainer:
         for network in (self.model, self.initial, self.selected):
             if network:
                 network.precision = state["precision"]
-        # If there are no values, the next attack begins at those of the scene.
+        # The next attack begins with the values of the scene if no values are stored.
         if "values" in state["service"]:
             self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
         if state["under_way"]:
-            self._under_way = self._restored_epoch(state["under_way"])
+            self._under_way = self._restore_epoch(state["under_way"])
 
-    def _restored_epoch(self, state: Mapping[str, Any]) -> EpochState:
-        """Restore the state within an epoch from a checkpoint.
+    def _restore_epoch(self, state: Mapping[str, Any]) -> EpochState:
+        """Restore the state of an epoch that had begun when a checkpoint was written.
 
         Args:
-            state: Values that `EpochState.state_dict` returned.
+            state: Mapping that `EpochState.state_dict` returned.
         """
         images = to_unit(state["images"]).to(self.device)
         labels = state["labels"].to(self.device)
         renders = Renders(images, labels, state["diagnostics"][-1])
-        # The stored sums are over all processes. The first process takes them, and
-        # the others begin at 0, so that a later sum over processes counts them once.
-        sums = state["sums"].to(self.device) * (distributed.rank() == 0)
+        sums = state["sums"].to(self.device)
+        if distributed.rank() > 0:
+            # The stored sums are those of all processes together. Only the first process
+            # continues with them, so that they are counted once.
+            sums = torch.zeros_like(sums)
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 
     def resume(self) -> None:
-        """Continue from the newest undamaged checkpoint in the folder.
+        """Restore the newest undamaged checkpoint in the folder of the run.
 
         Raises:
-            InputError: If the checkpoint does not belong to this run.
+            InputError: If there is no checkpoint, or if it is of another run.
         """
         state, problem = checkpoint.load_newest(self.folder)
         try:
@@ -590,15 +648,14 @@ class Trainer:
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = single_line(error)
             raise InputError(
-                f"the checkpoint in {self.folder} is not one that this run can go on from "
-                f"({reason}): "
+                f"this run cannot continue from the checkpoint in {self.folder} ({reason}): "
                 f"restore {checkpoint.LAST}, or start in another folder",
             ) from error
         self._require_own_best()
         if problem:
-            console.warning("%s: going on from the one before", problem)
-            # The next checkpoint keeps this file as previous.pt. A damaged file
-            # must not replace the whole one there.
+            console.warning("%s: continuing from the checkpoint before it", problem)
+            # last.pt is damaged. It is removed, since it would otherwise replace the
+            # undamaged previous.pt when the next checkpoint is written.
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)
         steps = self._under_way.step if self._under_way else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
@@ -606,65 +663,87 @@ class Trainer:
     def _require_own_best(self) -> None:
         """Raise InputError if best.pt is missing, damaged or of another run.
 
-        At the end, the network in this file is scored. The check comes before
-        the training. The file exists from the end of the first epoch.
+        The network in this file is scored after the training. A resumed run
+        checks it before the training, so that no time is lost.
         """
         if not self.epoch:
+            # best.pt is written at the end of the first epoch.
             return
         path = self.folder / checkpoint.BEST
         try:
             best = checkpoint.load(path)
             self._require_own_architecture(best)
             own = self._description()
-            if (best["seed"], best.get("mode", best.get("arm"))) != (own["seed"], own["mode"]):
+            # Earlier versions stored "mode" as "arm".
+            mode = best.get("mode", best.get("arm"))
+            if best["seed"] != own["seed"] or mode != own["mode"]:
                 raise ValueError("it is of another run")
-            # The file may be newer than the checkpoint. A later network is then found again.
+            # best.pt can be from an epoch after the checkpoint. This epoch is then trained
+            # again, and its accuracy is not known yet.
             if best["epoch"] <= len(self.history):
                 line = self.history[best["epoch"] - 1]
                 if line["validation/accuracy"] != best["validation_accuracy"]:
                     raise ValueError("its accuracy is not the one that this run had")
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(
-                f"{path} is not the network that this run kept ({single_line(error)}): "
+                f"{path} is not the best network of this run ({single_line(error)}): "
                 f"restore {checkpoint.BEST}, or start in another folder",
             ) from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
-        """Raise ValueError if the network of a checkpoint is not the network of this run."""
+        """Raise ValueError if a checkpoint has another architecture or other classes than this run.
+
+        Args:
+            state: Content of the checkpoint. Its description of the network may
+                lack entries that are newer than the checkpoint.
+        """
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
 
 
 def _require_equal_shares(settings: TrainSettings) -> None:
-    """Raise InputError if a batch cannot be divided equally among processes and parts."""
-    processes = distributed.world_size()
-    if settings.batch_size % (processes * settings.accumulation_steps):
-        divisor = f"{processes} processes × accumulation_steps={settings.accumulation_steps}"
-        message = f"batch_size={settings.batch_size} is no multiple of {divisor}"
-        raise InputError(message, "batch_size")
+    """Raise InputError if a batch cannot be divided equally.
+
+    Each process gets an equal part of the batch, and divides it into
+    `accumulation_steps` equal parts.
+    """
+    process_count = distributed.world_size()
+    steps = settings.accumulation_steps
+    if settings.batch_size % (process_count * steps):
+        raise InputError(
+            f"batch_size={settings.batch_size} is no multiple of {process_count} processes × "
+            f"accumulation_steps={steps}: set it to a multiple of {process_count * steps}",
+            "batch_size",
+        )
 
 
 @torch.no_grad()
 def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
-    """Score a network in eval mode. Each process scores a part of the images.
+    """Measure the loss and the accuracy of a network in evaluation mode.
+
+    If a run has several processes, each of them scores a part of the images, and
+    all of them return the result for all images.
 
     Args:
-        model: The network, from images in [0, 1] to logits.
-        split: The images and labels.
-        rows: The rows of the split to score, shape (N,). None for all.
+        model: Network, from images in [0, 1] to logits.
+        split: Images and labels.
+        rows: Indices of the images in `split` to score, shape (N,). None for all
+            images.
 
     Returns:
         Mapping with two keys: "loss", the mean cross entropy, and "accuracy",
-        the fraction of images whose class is right.
+        the fraction of images that are classified correctly.
     """
     device = split.labels.device
     if rows is None:
         rows = torch.arange(len(split))
     rows = rows.to(device)
     totals = torch.zeros(2, device=device)
-    # Both are views of `totals`, so adding to them changes `totals`.
+    # Both numbers are views of `totals`: adding to them in place changes `totals`.
     loss_sum, hits = totals
-    batches = rows[distributed.rank() :: distributed.world_size()].split(EVALUATION_BATCH)
+    # Each of n processes scores every n-th image.
+    own_rows = rows[distributed.rank() :: distributed.world_size()]
+    batches = own_rows.split(EVALUATION_BATCH)
     shown = progress(batches, f"{len(rows)} images")
     with eval_mode(model):
         for batch, images in zip(shown, split.squares(batches), strict=True):

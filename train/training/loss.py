@@ -1,4 +1,4 @@
-"""The loss that a network is trained with."""
+"""The training loss of a network."""
 
 from collections.abc import Sequence
 
@@ -11,24 +11,23 @@ from train.settings import TrainSettings
 
 
 class TrainingLoss:
-    """The loss of a batch of images, some of which are renders.
+    """Loss of a network on a batch of training images, some of which are renders.
 
-    The loss is the mean of the label loss plus three terms, each with a weight
-    in the settings:
+    It is the mean cross entropy of the labels, plus three terms whose weights are in the settings:
 
-    - the ranking loss of the positive classes;
-    - distillation: the divergence of the predictions from those of a teacher;
-    - consistency: the divergence of the predictions for augmented images from
-      the predictions of the teacher for the same images without augmentation.
+    - ranking: images of a positive class should have a higher score of this class than others;
+    - distillation: divergence of the predictions from those of a teacher, the network before the
+      training;
+    - consistency: divergence of the predictions for augmented images from the predictions of the
+      teacher for the same images without augmentation.
 
     Args:
-        model: The network, from images in [0, 1] to logits.
-        settings: The settings, with the weights of the terms.
-        positive_classes: Indices of the positive classes, which the ranking
-            loss ranks against the others. Empty without a ranking loss.
-        teacher: The network whose predictions are kept. None without distillation and consistency.
-        labeled: Whether the labels of the data are known. Otherwise only renders have a label
-            loss, and the teacher's predictions are the labels of all other images.
+        model: Network in training, from images in [0, 1] to logits.
+        settings: Settings of the training.
+        positive_classes: Indices of the positive classes, for the ranking term. Empty without it.
+        teacher: Network before the training. None without distillation and consistency.
+        labeled: Whether the labels of the data are known. If not, only renders count in the cross
+            entropy, and correct predictions for other images are those of the teacher.
     """
 
     def __init__(
@@ -39,6 +38,7 @@ class TrainingLoss:
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
+        """Store the networks and the settings. `compute` computes the loss of a batch."""
         self._model = model
         self._settings = settings
         self._positive_classes = positive_classes
@@ -55,14 +55,15 @@ class TrainingLoss:
         """Compute the loss of a batch.
 
         Args:
-            images: The images, uint8, shape (B, 3, H, W).
-            labels: Their classes, shape (B,).
-            rendered: Which of them are renders, bool, shape (B,).
+            images: Images, uint8, shape (B, 3, H, W).
+            labels: Classes of the images, shape (B,). A negative number is a
+                complementary label: it says of which class the image is not.
+            rendered: Whether each image is a render, bool, shape (B,).
             augmented: The images after an augmentation, for the consistency
-                term. None without this term.
+                term, uint8, shape (B, 3, H, W). None without this term.
 
         Returns:
-            The loss, a scalar, and the number of correct predictions.
+            Pair of scalars: the loss, and the number of correct predictions.
         """
         settings = self._settings
         logits = self._model(to_unit(images))
@@ -73,43 +74,45 @@ class TrainingLoss:
             if not self._labeled:
                 labels = torch.where(rendered, labels, targets.argmax(1))
 
-        # The first class is the one that a complementary label leaves out.
-        others = self._positive_classes[1:]
-        losses = label_loss(logits, labels, settings.label_smoothing, others)
+        # A complementary label names the first positive class. An image with such a
+        # label is not of the other positive classes either.
+        other_positives = self._positive_classes[1:]
+        losses = label_loss(logits, labels, settings.label_smoothing, other_positives)
         if not self._labeled:
             losses = losses * rendered
         loss = losses.mean()
         if targets is not None:
-            changes = self._changes(logits, targets, rendered)
-            loss = loss + settings.distillation_weight * changes.mean()
+            divergences = self._divergences(logits, targets, rendered)
+            loss = loss + settings.distillation_weight * divergences.mean()
         if targets is not None and augmented is not None:
-            answers = self._model(to_unit(augmented))
-            changes = kl_divergence(answers, targets) * ~rendered
-            loss = loss + settings.consistency_weight * changes.mean()
+            augmented_logits = self._model(to_unit(augmented))
+            divergences = kl_divergence(augmented_logits, targets) * ~rendered
+            loss = loss + settings.consistency_weight * divergences.mean()
         if self._positive_classes and settings.ranking_weight:
-            ranked = sum(ranking_loss(logits, labels, label) for label in self._positive_classes)
-            loss = loss + settings.ranking_weight * ranked / len(self._positive_classes)
-        hits = is_correct(logits.detach().argmax(1), labels, others).sum()
+            loss_sum = sum(ranking_loss(logits, labels, label) for label in self._positive_classes)
+            loss = loss + settings.ranking_weight * loss_sum / len(self._positive_classes)
+        hits = is_correct(logits.detach().argmax(1), labels, other_positives).sum()
         return loss, hits
 
-    def _changes(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
-        """Compute how far the predictions are from those of the teacher.
+    def _divergences(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
+        """Compute the divergence of the predictions from those of the teacher.
 
-        The predictions for renders may change in the positive classes, so only
-        the other classes of renders are compared. Without positive classes,
-        renders have the divergence 0.
+        For renders, only the classes that are not positive are compared, because
+        the training should change the scores of the positive classes. Without
+        positive classes, the divergence of renders is 0.
 
         Args:
             logits: Logits of the network, shape (B, classes).
             targets: Logits of the teacher, shape (B, classes).
-            rendered: Which of the images are renders, bool, shape (B,).
+            rendered: Whether each image is a render, bool, shape (B,).
 
         Returns:
-            Kullback-Leibler divergence of each image, shape (B,).
+            Kullback-Leibler divergence for each image, shape (B,).
         """
-        changes = kl_divergence(logits, targets) * ~rendered
+        divergences = kl_divergence(logits, targets) * ~rendered
         if self._positive_classes:
             classes = torch.arange(logits.shape[1], device=logits.device)
-            is_kept = torch.stack([classes != label for label in self._positive_classes]).all(0)
-            changes = changes + kl_divergence(logits[:, is_kept], targets[:, is_kept]) * rendered
-        return changes
+            is_other = torch.stack([classes != label for label in self._positive_classes]).all(0)
+            of_renders = kl_divergence(logits[:, is_other], targets[:, is_other]) * rendered
+            divergences = divergences + of_renders
+        return divergences

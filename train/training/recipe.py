@@ -10,19 +10,20 @@ from augment.classifiers.adapter import nearest
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 
-# "step" multiplies the learning rate by STEP_FACTOR at each of these fractions of
-# the training. Zagoruyko and Komodakis (2016) do so at epochs 60, 120 and 160 of
-# 200.
+# The schedule "step" multiplies the learning rate by STEP_FACTOR after each of these
+# fractions of the training, like Zagoruyko and Komodakis (2016).
 MILESTONES = (0.3, 0.6, 0.8)
 STEP_FACTOR = 0.2
-# "one_cycle" begins with a tenth of the learning rate, and reaches all of it after
-# a fifth of the training.
+# The schedule "one_cycle" begins with this fraction of the highest learning rate, and
+# reaches the highest learning rate after the fraction WARMUP of the training.
 START_FACTOR = 0.1
 WARMUP = 0.2
 
 
 def _step(done: float) -> float:
     """Return the factor of the learning rate in the schedule "step".
+
+    The factor is 0.2 to the power of the number of milestones that are reached.
 
     Args:
         done: Fraction of the training that is done, in [0, 1].
@@ -33,7 +34,7 @@ def _step(done: float) -> float:
 def _cosine(done: float) -> float:
     """Return the factor of the learning rate in the schedule "cosine".
 
-    The factor falls from 1 to 0 along half a period of a cosine.
+    The factor falls from 1 to 0: (1 + cos(pi * done)) / 2.
 
     Args:
         done: Fraction of the training that is done, in [0, 1].
@@ -44,8 +45,8 @@ def _cosine(done: float) -> float:
 def _one_cycle(done: float) -> float:
     """Return the factor of the learning rate in the schedule "one_cycle".
 
-    The factor rises linearly to 1, and then falls linearly to 0. The schedule
-    suits trainings of few epochs.
+    The factor rises linearly from START_FACTOR to 1, and then falls linearly to
+    0. The schedule suits short trainings.
 
     Args:
         done: Fraction of the training that is done, in [0, 1].
@@ -55,7 +56,8 @@ def _one_cycle(done: float) -> float:
     return (1 - done) / (1 - WARMUP)
 
 
-# Factor of the learning rate after a fraction of the training, by schedule.
+# Function of each schedule. It computes the factor of the learning rate from the fraction
+# of the training that is done.
 SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
     "step": _step,
     "cosine": _cosine,
@@ -64,10 +66,10 @@ SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
 
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
-    """Compute the learning rate.
+    """Compute the learning rate at a time of the training.
 
     Args:
-        settings: Settings of the training.
+        settings: Settings with the schedule and the highest learning rate.
         done: Fraction of the training that is done, in [0, 1].
 
     Returns:
@@ -77,11 +79,11 @@ def learning_rate(settings: TrainSettings, done: float) -> float:
 
 
 def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Build the optimizer.
+    """Build the optimizer of a network.
 
-    "sgd" has Nesterov momentum and decays all weights, as in the paper. "adamw"
-    (Loshchilov and Hutter 2019) decays neither biases nor the weights of
-    normalizations, as is usual, and ignores `settings.momentum`.
+    "sgd" has Nesterov momentum, and weight decay for all parameters, as in the
+    paper. "adamw" (Loshchilov and Hutter 2019) ignores `settings.momentum`, and
+    has no weight decay for biases and normalization layers, as is usual.
 
     Args:
         model: Network to train.
@@ -99,7 +101,7 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
             nesterov=settings.momentum > 0,
             fused=True,
         )
-    # Biases and the weights of normalizations are vectors.
+    # Biases and the weights of normalization layers are vectors.
     vectors = [parameter for parameter in model.parameters() if parameter.ndim <= 1]
     matrices = [parameter for parameter in model.parameters() if parameter.ndim > 1]
     groups = [
@@ -110,49 +112,50 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
 
 
 def last_layer(network: nn.Module) -> str:
-    """Return the name of the module that has the last parameter of a network.
+    """Return the name of the last layer of a network: the module that has the last parameter.
 
     Args:
         network: Network with parameters.
 
     Returns:
-        Name, such as "head.fc". Empty for the network itself.
+        Name, such as "head.fc". Empty if the network itself is the layer.
     """
-    *_, (name, _) = network.named_parameters()
-    # The name of a parameter is that of its module, followed by ".weight" or such.
-    return name.rpartition(".")[0]
+    names = [name for name, _ in network.named_parameters()]
+    return _module_of(names[-1])
+
+
+def _module_of(parameter: str) -> str:
+    """Return the name of the module of a parameter: "head.fc" for "head.fc.weight"."""
+    return parameter.rpartition(".")[0]
 
 
 def freeze(network: nn.Module, stage: str) -> None:
-    """Freeze the parameters of a network from the first one to the end of a module.
+    """Freeze the parameters of a network from its first parameter to the last one of a module.
 
     Args:
         network: Network, which is changed.
-        stage: Name of the last frozen module, such as "blocks.5". With
-            ALL_BUT_LAST, everything before the last layer is frozen, which is
-            nothing if there is no other layer.
+        stage: Name of the module, such as "blocks.5". "all_but_last" freezes all
+            parameters before the last layer.
 
     Raises:
         InputError: If there is no module of this name, or if it has no
             parameters.
     """
     names = [name for name, _ in network.named_parameters()]
-    # The module that has each parameter.
-    modules = [name.rpartition(".")[0] for name in names]
-    # `frozen` holds the indices of parameters of the frozen modules. The last of
-    # these indices is where freezing ends.
     if stage == ALL_BUT_LAST:
         last = last_layer(network)
-        frozen = [index for index, module in enumerate(modules) if module != last]
-        if not frozen:
+        chosen = [name for name in names if _module_of(name) != last]
+        if not chosen:
+            # The network has only one layer, so nothing is frozen.
             return
     else:
-        frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
-    if not frozen:
-        parts = nearest(stage, sorted(set(modules)))
+        chosen = [name for name in names if name.startswith(f"{stage}.")]
+    if not chosen:
+        examples = nearest(stage, sorted({_module_of(name) for name in names}))
         raise InputError(
-            f"stage={stage} is no module of the network: choose a module, such as {parts}",
+            f"stage={stage} is no module of the network: choose a module, such as {examples}",
             "stage",
         )
-    for parameter in list(network.parameters())[: frozen[-1] + 1]:
+    frozen_count = names.index(chosen[-1]) + 1
+    for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)

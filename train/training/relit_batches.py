@@ -1,4 +1,4 @@
-"""The augmentation `relight`: training images in the light of a projector."""
+"""The augmentation "relight": training images appear in the light of a projector."""
 
 import math
 
@@ -14,20 +14,24 @@ from augment.random_streams import generator
 from renderer.image import decode, to_bytes, to_unit
 from train.settings import TrainSettings
 
-# Cells per side of the grid of factors of a slide, as in the attack on photographs.
+# The brightness of a projected slide is multiplied by smooth random factors, which are
+# interpolated from a grid with this number of cells per side.
 CELLS = RelightingSettings().cells
 
 
 class RelitBatches:
-    """Shows the images of a batch in the light of a projector with random slides.
+    """Augmentation that shows the images of a batch in the light of a projector.
 
-    The slides also show other images of the batch. Each channel of a slide has
-    smooth factors, which are random or found by gradient.
+    A slide is the picture that the projector shows. It is a random pattern or
+    another image of the batch, and each of its color channels is multiplied by
+    smooth factors. The factors are random, or are changed by gradient descent
+    until the network predicts another class.
 
     Args:
         settings: Settings of the training.
-        model: Network that the gradient attacks.
-        teacher: Network whose predictions the attack leads away from. None if
+        model: Network in training, which the gradient descent attacks.
+        teacher: Network before the training. The attack leads away from the
+            class that it predicts for the image without the projector. None if
             the factors are random.
         seed: Seed of the run.
     """
@@ -39,6 +43,7 @@ class RelitBatches:
         teacher: nn.Module | None,
         seed: int,
     ):
+        """Read the range of the factors and the number of steps from the settings."""
         self._radius = math.log(settings.relight_gain)
         self._steps = settings.relight_steps
         self._model = model
@@ -46,29 +51,37 @@ class RelitBatches:
         self._seed = seed
 
     def apply(self, images: Tensor, labels: Tensor, step: int) -> Tensor:
-        """Relight the images of a batch.
+        """Show the images of a batch in the light of a projector, each in a light of its own.
 
         Args:
-            images: The images, uint8, shape (B, 3, size, size).
+            images: Images, uint8, shape (B, 3, size, size).
             labels: Not used. All augmentations are called with labels.
-            step: The number of the step in the run.
+            step: Number of the training step in the run.
 
         Returns:
-            The relit images, uint8, shape (B, 3, size, size).
+            Relit images, uint8, shape (B, 3, size, size).
         """
-        # Each step and each process has random draws of its own.
+        # The random numbers differ between steps, and between the processes of a run.
         draws = generator(self._seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape
         light = draw_projected_light(count, size, draws, images).to(images.device)
+        # Logarithms of the factors of the slides.
         log_gain = draw_log_gain(count, CELLS, self._radius, draws).to(images.device)
         unit = to_unit(images)
         if self._steps and self._teacher is not None:
             with torch.no_grad():
-                source = self._teacher(unit).argmax(1)
+                original_classes = self._teacher(unit).argmax(1)
+            # The linear colors of an image stand for the albedo of what it shows.
             albedo = decode(unit, "srgb")
             with frozen_eval_mode(self._model):
                 log_gain = descend_gain(
-                    self._model, albedo, light, source, log_gain, self._radius, self._steps
+                    self._model,
+                    albedo,
+                    light,
+                    source=original_classes,
+                    start=log_gain,
+                    radius=self._radius,
+                    steps=self._steps,
                 )
         with torch.no_grad():
             return to_bytes(light.apply(unit, log_gain))

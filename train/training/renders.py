@@ -1,4 +1,4 @@
-"""The renders that a run trains on: the scene, its labels, and the service that makes them anew."""
+"""The renders of a training run: their scene, their labels, and the service that renders them."""
 
 from pathlib import Path
 
@@ -28,25 +28,26 @@ def build_service(
     data: DataSet,
     device: torch.device,
 ) -> AugmentationService:
-    """Build the service that regenerates a run's renders, and log the rasterizer.
+    """Build the service that renders the training images of a run anew in each round.
 
     Args:
-        settings: The settings of the run.
-        data: The data of the run, whose classes the renders share.
-        device: The device that renders.
+        settings: Settings of the run.
+        data: Data of the run. The renders are labeled with its classes.
+        device: Device that renders.
 
     Returns:
-        The service. Without renders it has no examples.
+        The service. It has no images if the run trains without renders.
 
     Raises:
-        InputError: If a mesh, a background, a light or a class does not exist, or if no class is
-            left for the negatives.
+        InputError: If a mesh, a background, a light or a class does not exist, or if the network
+            has only positive classes although some renders are of no class.
     """
     scene: Scene | None = None
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64, device=device)
     phases = Phases(device)
     names = label_names(settings.label)
+    # The ranking loss needs images of a positive class and others.
     is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1
     positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
@@ -60,17 +61,18 @@ def build_service(
     elif settings.augment.renders:
         positive_names = [data.classes[index] for index in positive_classes]
         require_others(settings.hard_negatives, positive_names, data.classes)
-        numbers = _class_numbers(settings, data)
-        # Objects without a class have a complementary label: they belong to none
-        # of the positive_classes classes.
-        numbers[OTHER] = complementary_label(positive_classes[0])
+        label_of_class = _class_indices(settings, data)
+        # An object of no class of the network has a complementary label: the negative
+        # number says only that it is not of a positive class.
+        label_of_class[OTHER] = complementary_label(positive_classes[0])
         scene = _build_scene(settings, data.size, device, phases)
-        labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
+        labels = torch.tensor([label_of_class[name] for name in scene.labels], device=device)
 
-    if len(positive_classes) == len(data.classes) and (labels < 0).any():
+    has_complementary_labels = (labels < 0).any()
+    if len(positive_classes) == len(data.classes) and has_complementary_labels:
         raise InputError(
-            f"label={settings.label} has all classes of the network, so that none is left "
-            "for negatives without a class: remove them, or label them",
+            f"label={settings.label} has all classes of the network, but some renders show none "
+            "of them: remove the objects without a class, or give them a label",
         )
     return AugmentationService(
         settings.augment,
@@ -78,10 +80,10 @@ def build_service(
         labels,
         settings.seed,
         phases,
-        positive_classes if is_ranked else (),
-        distributed.rank(),
-        distributed.world_size(),
-        images,
+        positive_classes=positive_classes if is_ranked else (),
+        rank=distributed.rank(),
+        world_size=distributed.world_size(),
+        images=images,
     )
 
 
@@ -91,15 +93,16 @@ def _build_scene(
     device: torch.device,
     phases: Phases,
 ) -> Scene:
-    """Build the scene with the meshes and hard negatives of a run.
+    """Build the scene with the meshes and hard negatives of a run, and log the rasterizer.
 
-    The first process builds the scene before the others.
+    If the run has several processes, the first one builds the scene before the
+    others, which then find its files.
 
     Args:
         settings: Settings of the run.
         size: Pixels per side of the renders.
         device: Device that renders.
-        phases: Clock that adds the time to the phase "operators".
+        phases: Clock that measures the time of the phase "operators".
     """
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
@@ -122,47 +125,52 @@ def _build_scene(
         )
 
 
-def _class_numbers(settings: ExperimentSettings, data: DataSet) -> dict[str, int]:
-    """Return the index of each class that a mesh or a hard negative of the run has.
+def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str, int]:
+    """Return the index of each class that a mesh or a hard negative of a run has.
 
     Args:
-        settings: Settings of the run, with its objects.
-        data: Data of the run. The index counts its classes.
+        settings: Settings of the run, with its meshes and hard negatives.
+        data: Data of the run, with the list of all classes.
 
     Returns:
-        Index by the name of the class. Objects of the class OTHER are left out.
+        Index in the list of classes by the name of the class. The class "other",
+        which no network has, is left out.
     """
-    return {
-        item.label: class_index(data.classes, item.label, f"label of {key}")
-        for key, item in settings.objects.items()
-        if item.label != OTHER
-    }
+    indices = {}
+    for key, item in settings.objects.items():
+        if item.label != OTHER:
+            indices[item.label] = class_index(data.classes, item.label, f"label of {key}")
+    return indices
 
 
 def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, Tensor]:
-    """Load the images of `augment.folder`, which take the place of renders.
+    """Load images that are used as renders from the folder in the setting `augment.folder`.
 
     Args:
-        settings: The settings of the run.
-        data: The data of the run, whose classes the folders are named by.
+        settings: Settings of the run.
+        data: Data of the run. The sub-folders have the names of its classes. Sub-folders of other
+            names hold negatives.
 
     Returns:
-        The images, uint8, shape (N, 3, size, size), and their class numbers, shape (N,).
+        Pair of the images, uint8, shape (N, 3, size, size), and their labels, shape (N,). A label
+        is the index of a class, or the complementary label of a negative.
 
     Raises:
-        InputError: If the folder cannot be read, or it has no image of a positive class.
+        InputError: If the folder cannot be read, or if it has no image of a positive class.
     """
     folder = Path(str(settings.augment.folder))
     positive_classes = label_names(settings.label)
-    numbers = {name: index for index, name in enumerate(data.classes)}
-    other = complementary_label(numbers[positive_classes[0]])
+    label_of_class = {name: index for index, name in enumerate(data.classes)}
+    label_of_negative = complementary_label(label_of_class[positive_classes[0]])
     with keyed("augment.folder"):
         found = find_photographs(folder, data.classes, positive_classes)
         found, images, _ = load_photographs(folder, found, data.size, advice="")
         missing = set(positive_classes) - {item.label for item in found}
         if missing:
+            name = min(missing)
             raise InputError(
-                f"{folder} holds no image of label={min(missing)}: add a folder of them",
+                f"{folder} has no image of label={name}: "
+                f"add a sub-folder {name} with images of this class",
             )
-    labels = torch.tensor([numbers.get(item.label, other) for item in found])
-    return images, labels
+    labels = [label_of_class.get(item.label, label_of_negative) for item in found]
+    return images, torch.tensor(labels)

@@ -67,25 +67,25 @@ from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
 from train.training.renders import build_service
 
-# If the images are on disk, `build_trainer` measures the mean and the standard
-# deviation of the channels on this many images.
+# If the training images are on disk, the mean and the standard deviation of their color
+# channels are estimated from this number of images.
 SAMPLED = 1000
 
 
 class Run:
-    """One training run: its data, its network, its folder and its scores.
+    """One training run, which trains a network and scores it.
 
-    The steps are called in this order: `load`, `fit`, `score`, `export`. Wrong
+    The methods are called in this order: `load`, `fit`, `score`, `export`. Wrong
     input raises an error in `load`, so that several runs can be checked before
-    the first of them trains.
+    the first one trains.
 
     Args:
         settings: Settings of the run.
         data: Data set of the run.
-        folder: Folder that the run writes to.
+        folder: Folder to which the run writes its files.
         initial: Network with whose weights the run begins. None for random
             weights.
-        command: Command that was given. The run records it.
+        command: Command line that started the run, which config.yaml records.
     """
 
     trainer: Trainer
@@ -100,59 +100,62 @@ class Run:
         initial: Initial | None = None,
         command: str = "",
     ):
+        """Store the arguments. `load` checks them."""
         self.settings = settings
         self.data = data
         self.folder = folder
         self.initial = initial
         self.command = command
         self._scores: dict[str, float] = {}
-        # The folders of photographs and renders on which the networks are scored.
+        # Folders of photographs or renders on which the networks are scored, by name.
         self.scored_folders = settings.evaluate.folders
-        # The threads that the run trains with.
+        # Number of CPU threads with which the run trains.
         self._threads = 1
-        # The classes that the initial network gives the test images, shape (N,).
+        # Class that the initial network predicts for each test image, shape (N,). None
+        # if it was not computed.
         self._initial_predictions: Tensor | None = None
 
     def load(self) -> None:
-        """Check the inputs, build the network and its renders, and restore a checkpoint if asked.
+        """Check all inputs and build the network. If the run is resumed, restore its checkpoint.
 
         Raises:
             InputError: If the settings, the data, the folder or its checkpoint
                 are wrong.
         """
         settings = self.settings
-        # The labels of the data become indices into the classes of the network.
-        self.data = _data_for(settings, self.data, self.initial)
+        # Labels of the data become indices into the classes of the network.
+        self.data = _relabel(settings, self.data, self.initial)
         for name, photographs in settings.evaluate.folders.items():
             require_outside(self.folder / name, photographs)
             _require_names(settings, self.data)
             find_photographs(photographs, self.data.classes, settings.label)
         set_deterministic(settings.train.deterministic)
-        # The settings of the run that is resumed. None for a new run.
-        before = self._require_folder()
-        part = choose_validation(settings, self.data, self.initial)
+        # Settings of the run that is resumed. None for a new run.
+        earlier = self._require_folder()
+        validation = choose_validation(settings, self.data, self.initial)
         with keyed(fraction="data.validation"):
-            self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
+            self.held_out = held_out_rows(self.data.train, validation.fraction, seed=0)
         self.trainer = build_trainer(
             settings,
             self.data,
             self.folder,
-            self.initial,
-            part,
-            self._asked_threads(before),
+            initial=self.initial,
+            validation=validation,
+            threads=self._choose_threads(earlier),
         )
         self._threads = torch.get_num_threads()
-        if before is not None:
+        if earlier is not None:
             self.trainer.resume()
-            self._warn_of_stretched_schedule(before.train.epochs)
+            self._warn_of_stretched_schedule(earlier.train.epochs)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", self.folder)
         if distributed.rank() == 0:
             self._write_config()
 
     def fit(self) -> None:
-        """Score the initial network, if there is one, and train to the last epoch."""
-        torch.set_num_threads(self._threads)  # Other runs may have been loaded since.
+        """Score the initial network, if the run has one, and train to the last epoch."""
+        # Each run that is loaded sets the number of threads. It is set to that of this run.
+        torch.set_num_threads(self._threads)
         console.debug(
             "%d images, %d classes; %s, %s, threads: %d, processes: %d",
             (~self.held_out).sum(),
@@ -173,10 +176,11 @@ class Run:
             self.trainer.fit(split, self.held_out, self.log)
 
     def score(self) -> dict[str, float]:
-        """Score the selected network on the test images and the photographs, once.
+        """Score the network that the training selected, on the test images and on photographs.
 
         Returns:
-            The scores by name, which are also the last line of metrics.jsonl.
+            The final scores by name. They are also written to the last line of
+            metrics.jsonl.
         """
         trainer = self.trainer
         self._scores |= self._test_scores()
@@ -193,87 +197,96 @@ class Run:
         return self._scores
 
     def export(self) -> None:
-        """Write the weights of a pretrained classifier in the format in which they were loaded."""
-        if self.log and CLASSIFIER in self.trainer.architecture:
-            path = self.folder / WEIGHTS
-            export(path, self.trainer.selected.network)
-            network = "network"
-            name = self.trainer.architecture["name"]
-            if name.startswith(PYTHON):
-                # The weights have their names in the network that the function returns.
-                function = name.removeprefix(PYTHON).replace(":", ".")
-                network = f"{function}()[0]"
-            console.info("%s.load_state_dict(torch.load(%r)) loads the result", network, str(path))
-            light = light_settings(self.trainer.selected.network)
-            if light is not None:
-                given = json.dumps(asdict(light))
-                console.info("it needs normalized light before it: normalize_light=%s", given)
+        """Write the trained weights of a classifier of the user to weights.pt.
+
+        The user can load this file into the classifier. A line on the console
+        says how. Nothing is written if the run trains a network of this library.
+        """
+        if not self.log or CLASSIFIER not in self.trainer.architecture:
+            return
+        path = self.folder / WEIGHTS
+        export(path, self.trainer.selected.network)
+        # Python expression for the network that loads the weights.
+        network = "network"
+        name = self.trainer.architecture["name"]
+        if name.startswith(PYTHON):
+            # The first value that the function of the user returns is the network.
+            function = name.removeprefix(PYTHON).replace(":", ".")
+            network = f"{function}()[0]"
+        console.info("%s.load_state_dict(torch.load(%r)) loads the result", network, str(path))
+        light = light_settings(self.trainer.selected.network)
+        if light is not None:
+            given = json.dumps(asdict(light))
+            console.info("it needs images with normalized light: normalize_light=%s", given)
 
     def _require_folder(self) -> DictConfig | None:
         """Check that the run may write to its folder.
 
         Returns:
-            Settings of the run in the folder that is resumed. None for a new
-            run.
+            Settings of the earlier run in the folder if it is resumed. None for
+            a new run.
 
         Raises:
-            InputError: If the folder holds a run, and the settings neither
-                resume it nor allow to overwrite it.
+            InputError: If the folder has a checkpoint of an earlier run, and the
+                settings neither resume this run nor permit to overwrite it.
         """
         resumes = self.settings.train.resume
-        begins_anew = self.settings.overwrite and not resumes
-        if begins_anew or not checkpoint.exists(self.folder):
+        overwrites = self.settings.overwrite and not resumes
+        if overwrites or not checkpoint.exists(self.folder):
             return None
         if not resumes:
             raise InputError(
                 f"run={self.folder} holds a run already: "
-                "set train.resume=true to go on or overwrite=true to begin anew, "
-                "or choose another run",
+                "set train.resume=true to continue it, overwrite=true to replace it, "
+                "or run to another folder",
             )
         return require_same_run(self.folder, self.settings)
 
-    def _asked_threads(self, before: DictConfig | None) -> int | None:
-        """Return the number of threads that the run should train with.
+    def _choose_threads(self, earlier: DictConfig | None) -> int | None:
+        """Return the number of CPU threads that the settings or an earlier run give.
 
-        A resumed run keeps its number of threads unless the settings give one,
-        because the number changes the last bits of sums.
+        The number changes the last bits of the results, so a resumed run keeps
+        its number of threads.
 
         Args:
-            before: Settings of the run that is resumed. None for a new run.
+            earlier: Settings of the run that is resumed. None for a new run.
 
         Returns:
-            The number. None if it is still to be chosen.
+            The number. None if neither gives one.
         """
-        asked = self.settings.train.threads
-        if asked or before is None:
-            return asked
-        recorded = OmegaConf.select(before, "hardware.threads")
-        return recorded if isinstance(recorded, int) and recorded > 0 else None
+        given = self.settings.train.threads
+        if given or earlier is None:
+            return given
+        recorded = OmegaConf.select(earlier, "hardware.threads")
+        is_valid = isinstance(recorded, int) and recorded > 0
+        return recorded if is_valid else None
 
     def _warn_of_stretched_schedule(self, planned: int) -> None:
-        """Warn if a new number of epochs changes the learning rate of a resumed run.
+        """Warn if a resumed run has another number of epochs, and so another learning rate.
+
+        The schedule of the learning rate extends over all epochs.
 
         Args:
-            planned: Number of epochs that the run had before it was stopped.
+            planned: Number of epochs in the settings of the earlier run.
         """
-        recipe = self.settings.train
-        # Each epoch of a soup runs through the whole schedule, so that the number of
-        # epochs does not change it.
-        if recipe.epochs == planned or recipe.soup:
+        settings = self.settings.train
+        # Each epoch of a model soup has the whole schedule. Then the number of epochs does
+        # not change the learning rate.
+        if settings.epochs == planned or settings.soup:
             return
-        rate = learning_rate(recipe, self.trainer.epoch / recipe.epochs)
-        rate_before = learning_rate(recipe, self.trainer.epoch / planned)
-        change = f"train.epochs={recipe.epochs}, not {planned}"
+        rate = learning_rate(settings, self.trainer.epoch / settings.epochs)
+        rate_before = learning_rate(settings, self.trainer.epoch / planned)
+        change = f"train.epochs={settings.epochs}, not {planned}"
         console.warning(
             "%s, stretches train.schedule=%s: the learning rate goes on at %.3g, not %.3g",
             change,
-            recipe.schedule,
+            settings.schedule,
             rate,
             rate_before,
         )
 
     def _write_config(self) -> None:
-        """Write the settings and the facts of the run into its folder."""
+        """Write config.yaml with the settings and the hardware of the run to its folder."""
         if self.settings.overwrite and not self.settings.train.resume:
             remove_run(self.folder)
         hardware = {
@@ -290,46 +303,58 @@ class Run:
         )
 
     def _score_initial(self, model: MixedPrecision) -> None:
-        """Score the initial network on the test images and the photographs.
+        """Score the initial network on the test images and on photographs.
 
         If the data have no labels, the predictions of the initial network become
-        the labels of the test images and of the images that validate.
+        their labels.
 
         Args:
             model: The initial network.
         """
         settings = self.settings
-        # The code of a foreign function may change unseen, so its logits are not stored.
-        is_foreign = settings.model.name.startswith(PYTHON)
-        cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
-        predict = CachedModel(model, self.trainer.device, cache)
-        test = self.data.test
-        self._initial_predictions = self._predicted_classes(predict, test)
+        # The logits of a network that a function of the user builds are not cached,
+        # because its code may have changed.
+        is_function = settings.model.name.startswith(PYTHON)
+        cache = TensorCache(None if is_function else cache_folder(settings.train.cache))
+        cached_model = CachedModel(model, self.trainer.device, cache)
+        predictions = self._predict_classes(cached_model, self.data.test)
+        self._initial_predictions = predictions
         if not self.data.labeled:
-            # The images that the network learns from need no labels here. The
-            # loss computes the predictions of the initial network for them.
-            labels = self.data.train.labels.clone()
-            held_out = self.data.train[self.held_out]
-            labels[self.held_out] = self._predicted_classes(predict, held_out)
-            train = Split(self.data.train.images, labels)
-            test = Split(test.images, self._initial_predictions)
-            self.data = replace(self.data, train=train, test=test)
+            self._label_with(cached_model, predictions)
         if distributed.rank() > 0:
             return
-        accuracy = (self._initial_predictions == test.labels).float().mean().item()
+        accuracy = (predictions == self.data.test.labels).float().mean().item()
         if self.data.labeled:
             images = describe_test_images(settings, self.data)
-            begun = settings.train.init_from
-            console.debug("before: %s has accuracy %.4f on %s", begun, accuracy, images)
+            name = settings.train.init_from
+            console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
         for name in self.scored_folders:
-            self._score_photographs(predict, name, self.folder / BEFORE)
+            self._score_photographs(cached_model, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
 
-    def _render_kept_aside(self) -> None:
-        """Render test images of other instances and patterns than those of the training.
+    def _label_with(self, model: Model, test_predictions: Tensor) -> None:
+        """Label the validation and test images with the predictions of the initial network.
 
-        Nothing is rendered if the settings name photographs, if they ask for no
-        renders, or if a resumed run has rendered them already.
+        The training images need no labels, because the loss computes these
+        predictions itself.
+
+        Args:
+            model: The initial network.
+            test_predictions: Class that it predicts for each test image, shape
+                (N,).
+        """
+        labels = self.data.train.labels.clone()
+        validation = self.data.train[self.held_out]
+        labels[self.held_out] = self._predict_classes(model, validation)
+        train = Split(self.data.train.images, labels)
+        test = Split(self.data.test.images, test_predictions)
+        self.data = replace(self.data, train=train, test=test)
+
+    def _render_kept_aside(self) -> None:
+        """Render test images of other objects and projected patterns than those of the training.
+
+        Nothing is rendered if the settings name photographs to score, if they
+        ask for no test renders, or if a resumed run has already rendered them.
         """
         if self.scored_folders or not self.settings.evaluate.laboratory_setups:
             return
@@ -345,7 +370,7 @@ class Run:
                 return
         self.scored_folders = {LABORATORY: folder}
 
-    def _predicted_classes(self, model: Model, split: Split) -> Tensor:
+    def _predict_classes(self, model: Model, split: Split) -> Tensor:
         """Predict the class of each image of a split.
 
         Args:
@@ -356,23 +381,26 @@ class Run:
             Index of the class with the largest logit, int64, shape (N,).
         """
         batches = torch.arange(len(split)).split(BATCH)
-        count = len(self.trainer.architecture["classes"])
-        classes = [
-            compute_logits(model, images, count, self.trainer.device).argmax(1)
-            for images in progress(split.squares(batches), "predictions", len(batches))
-        ]
+        class_count = len(self.trainer.architecture["classes"])
+        classes = []
+        for images in progress(split.squares(batches), "predictions", len(batches)):
+            logits = compute_logits(model, images, class_count, self.trainer.device)
+            classes.append(logits.argmax(1))
         return torch.cat(classes)
 
     def _test_scores(self) -> dict[str, float]:
-        """Compute the test accuracy of the last network and of the selected network.
+        """Measure the test accuracy of the network in best.pt, and of the one after the last epoch.
 
-        The selected network is the one in best.pt. Afterwards,
-        `self.trainer.selected` has its weights.
+        Afterwards, `self.trainer.selected` has the weights in best.pt.
 
         Returns:
-            "test/accuracy" of the selected network, "test/accuracy_last" of the
-            last network, "test/epoch" with the epoch of the selected network
-            and, if it was interpolated, "test/interpolation" with the factor.
+            Mapping with these keys:
+
+            - "test/accuracy": accuracy of the network in best.pt;
+            - "test/epoch": epoch of this network;
+            - "test/accuracy_last": accuracy of the network after the last epoch;
+            - "test/interpolation": factor of the interpolation between the
+              initial and the trained weights, if they were interpolated.
         """
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
@@ -380,7 +408,7 @@ class Run:
         selected = last
         best = checkpoint.load(self.folder / checkpoint.BEST)
         if self.settings.train.interpolate:
-            best = self._interpolated(best)
+            best = self._interpolate(best)
         if best["epoch"] != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
@@ -400,18 +428,16 @@ class Run:
             scores["test/interpolation"] = best[INTERPOLATION]
         return scores
 
-    def _interpolated(self, best: dict[str, Any]) -> dict[str, Any]:
-        """Interpolate between the initial and the trained weights, and write best.pt.
-
-        Nothing changes if best.pt holds interpolated weights already, because
-        the run was stopped after this step.
+    def _interpolate(self, best: dict[str, Any]) -> dict[str, Any]:
+        """Interpolate between the weights before and after the training, and write best.pt.
 
         Args:
-            best: Checkpoint in best.pt.
+            best: Content of best.pt.
 
         Returns:
-            Copy of the checkpoint with the interpolated weights and their
-            factor.
+            New content of best.pt, with interpolated weights and their factor.
+            `best` itself if it has interpolated weights already, because an
+            earlier process of the run was stopped after this step.
         """
         trainer = self.trainer
         if INTERPOLATION in best or trainer.initial is None:
@@ -419,12 +445,12 @@ class Run:
         validation = self.data.train[self.held_out]
         recipe = self.settings.train
         weights, factor = interpolate(
-            trainer.initial,
-            trainer.selected,
-            best["model"],
-            validation,
-            self.settings.seed,
-            (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0),
+            initial=trainer.initial,
+            selected=trainer.selected,
+            trained=best["model"],
+            validation=validation,
+            seed=self.settings.seed,
+            weights=(recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0),
         )
         interpolated = best | {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
@@ -432,21 +458,23 @@ class Run:
         return interpolated
 
     def _agreement(self, initial_predictions: Tensor) -> float:
-        """Compute how often the selected network predicts the class of the initial network.
+        """Measure for which fraction of the test images training did not change the prediction.
 
         Args:
-            initial_predictions: Class that the initial network predicts for each
-                test image, shape (N,).
+            initial_predictions: Class that the network before the training
+                predicts for each test image, shape (N,).
 
         Returns:
-            Fraction of the test images, in [0, 1].
+            Fraction of the test images for which the selected network predicts
+            the same class, in [0, 1].
         """
-        # The labels of unlabeled data are the predictions of the initial network,
-        # so the accuracy is the agreement.
+        # The predictions of the initial network serve as labels of data without labels. The
+        # test accuracy then is this fraction.
         agreement = self._scores["test/accuracy"]
         if self.data.labeled:
-            answered = Split(self.data.test.images, initial_predictions).to(self.trainer.device)
-            agreement = evaluate(self.trainer.selected, answered)["accuracy"]
+            relabeled_test = Split(self.data.test.images, initial_predictions)
+            relabeled_test = relabeled_test.to(self.trainer.device)
+            agreement = evaluate(self.trainer.selected, relabeled_test)["accuracy"]
         console.debug(
             "agreement with %s on %d held-out images: %.4f",
             self.settings.train.init_from,
@@ -456,28 +484,30 @@ class Run:
         return agreement
 
     def _relit_scores(self, initial: MixedPrecision) -> dict[str, float]:
-        """Compare predictions for relit test images with those for unchanged images.
+        """Measure how the light of a projector changes predictions for the test images.
 
-        The reference is always the class that the initial network predicts for
-        the unchanged image.
+        All predictions are compared with those of the initial network for the
+        images without a projector.
 
         Args:
             initial: Network before the training.
 
         Returns:
-            Three fractions of the test images whose predicted class is that of
-            the reference:
+            Fractions of the test images for which the same class is predicted:
 
-            - "test/agreement": selected network, unchanged images;
-            - "test/relit_agreement_before": initial network, relit images;
-            - "test/relit_agreement_after": selected network, relit images.
+            - "test/agreement": by the selected network, for the images without a
+              projector;
+            - "test/relit_agreement_before": by the initial network, for the
+              images in the light of a projector;
+            - "test/relit_agreement_after": by the selected network, for the
+              images in the light of a projector.
         """
         test = self.data.test
-        wanted = predict(initial, test)
-        scores = {"test/agreement": agreement(predict(self.trainer.selected, test), wanted)}
+        targets = predict(initial, test)
+        scores = {"test/agreement": agreement(predict(self.trainer.selected, test), targets)}
         for name, model in (("before", initial), ("after", self.trainer.selected)):
-            predicted = predict(model, test, self.settings.seed, "test")
-            scores[f"test/relit_agreement_{name}"] = agreement(predicted, wanted)
+            logits = predict(model, test, self.settings.seed, "test")
+            scores[f"test/relit_agreement_{name}"] = agreement(logits, targets)
         console.info(
             "agreement with the original on %d photographs kept aside: unchanged %.3f; "
             "in the light of a projector %.3f before, %.3f after",
@@ -487,40 +517,36 @@ class Run:
         return scores
 
     def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
-        """Score a model on one of the folders of photographs of this run.
+        """Score a network on a folder of photographs, and write the scores.
 
         Args:
             model: Network, from images in [0, 1] to logits.
-            name: Key of the folder of photographs in `self.scored_folders`.
+            name: Name of the folder of photographs in `self.scored_folders`.
             folder: The scores are written to the sub-folder `name` of this
                 folder.
 
         Returns:
-            The scores, as they are written.
+            The scores.
         """
-        asked = self.settings.evaluate
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),
-            self.scored_folders[name],
-            self.settings.label,
-            folder / name,
-            asked.skip_unreadable,
+            folder=self.scored_folders[name],
+            label=self.settings.label,
+            out=folder / name,
+            skip_unreadable=self.settings.evaluate.skip_unreadable,
         )
 
 
 def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
-    """Load runs with the same data set and the same initial network.
-
-    All runs are loaded before the first one is trained, so that a mistake in
-    any of them is reported at once.
+    """Load several runs before the first one is trained, so that mistakes are reported at once.
 
     Args:
-        methods: Settings of each run by its folder. They agree in the data set
-            and in the initial network.
-        command: Command that was given, which each run records.
+        methods: Settings of each run by its folder. All runs have the same data
+            set and the same initial network.
+        command: Command line that started the runs, which each run records.
 
     Returns:
-        Runs that are ready for `Run.fit`.
+        The runs. `Run.fit` is the next call.
 
     Raises:
         InputError: If the data set, the initial network, the settings or a
@@ -536,27 +562,33 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
 
 
 def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
-    """Raise InputError if the label is the index of a class instead of its name.
+    """Raise InputError if the setting `label` is the index of a class instead of its name.
 
-    Scores on photographs know classes only by name.
+    The sub-folders of photographs have names of classes, and no indices.
+
+    Args:
+        settings: Settings of the run.
+        data: Data set with the names of the classes.
     """
-    for name in label_names(settings.label):
-        known = class_name(data.classes, name, "label")
-        if known != name:
-            raise InputError(f"label={name} is an index: give the name, label={known}", "label")
+    for label in label_names(settings.label):
+        name = class_name(data.classes, label, "label")
+        if name != label:
+            raise InputError(f"label={label} is an index: give the name, label={name}", "label")
 
 
-def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
-    """Return a copy of the data whose labels are indices into the classes of the network.
+def _relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
+    """Convert the labels of the data to indices into the classes of the network.
+
+    A data set and the initial network can have different lists of classes.
 
     Args:
         settings: Settings of the run.
         data: Data set as it was loaded.
-        initial: Network that the run begins with. None for random weights.
+        initial: Network with whose weights the run begins. None for random
+            weights. The network then has the classes of the data.
 
     Returns:
-        The data set. If the data have no labels, only its classes change. With
-        random weights, the data set stays the same.
+        Copy of the data set with the classes of the network.
 
     Raises:
         InputError: If the data have no labels and the run has no network to
@@ -564,11 +596,10 @@ def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | No
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
-            missing = "set train.init_from and train.distillation_weight"
-            problem = (
-                f"data.name={settings.data.name} has no labels, and requires a network to imitate"
+            raise InputError(
+                f"data.name={settings.data.name} has no labels, and requires a network to imitate: "
+                "set train.init_from and train.distillation_weight"
             )
-            raise InputError(f"{problem}: {missing}")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
         return relabeled(data, initial.classes, f"data.name={settings.data.name}")
@@ -583,18 +614,18 @@ def build_trainer(
     validation: ValidationPart,
     threads: int | None,
 ) -> Trainer:
-    """Build a run's network, optimizer and scene. Nothing is written.
+    """Build the network, the optimizer and the scene of a run. No file is written.
 
     Args:
-        settings: The settings of the run.
-        data: The data, in the classes of the network.
-        folder: The folder of the run.
-        initial: The network that the run begins with, if any.
-        validation: The images that validate the network, whose record is stored with it.
-        threads: The number of threads; None for `choose_threads`.
+        settings: Settings of the run.
+        data: Data set, labeled with the classes of the network.
+        folder: Folder of the run.
+        initial: Network with whose weights the run begins. None for random weights.
+        validation: Choice of the validation images. Its record is stored with the network.
+        threads: Number of CPU threads. None to choose it by `choose_threads`.
 
     Returns:
-        The trainer, ready for `Trainer.fit`.
+        The trainer. `Trainer.fit` is the next call.
 
     Raises:
         InputError: If the network, the renders or the initial weights do not fit together.
@@ -642,44 +673,46 @@ def build_trainer(
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
-    """Return the arguments of `build_network` by name.
+    """Return the arguments of `build_network` that choose the architecture of a run.
 
     Args:
-        settings: Settings of the run. Without an initial classifier, they
-            decide.
-        initial: Network that the run begins with. None for random weights.
+        settings: Settings of the run. They choose the architecture unless the
+            run begins with a classifier of the user.
+        initial: Network with whose weights the run begins. None for random
+            weights.
 
     Raises:
-        InputError: If the settings name another network than the initial
+        InputError: If the settings choose another architecture than that of the
             classifier.
     """
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:
         return shape
-    if shape.get("name", initial.name) != initial.name:
+    name = shape.get("name", initial.name)
+    if name != initial.name:
         raise InputError(
-            f"model.name={shape['name']}: "
-            f"train.init_from={initial.source} has its own network: "
-            "leave it out",
+            f"model.name={name} is not the architecture of train.init_from={initial.source}: "
+            "leave model.name out",
         )
     return {"name": initial.name, CLASSIFIER: True}
 
 
 def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """Name the images on which the test accuracy is measured.
+    """Describe in words what the test accuracy of a run is measured on.
 
     Args:
-        settings: Settings of a run.
-        data: Data set of the run, with the classes of its network.
+        settings: Settings of the run.
+        data: Data set of the run. It may have fewer classes than the network.
 
     Returns:
-        Text such as "the test images of cifar100".
+        Text such as "the test images of cifar100", or "rendered solids of 5 of
+        the network's 1000 classes".
     """
     if not data.labeled:
         return f"the predictions of {settings.train.init_from} for held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
-    # The test images are read only at the end of the run, so the classes are
-    # counted in the training images.
+    # Classes are counted in the training images, because the test images are not read
+    # before the end of the run.
     class_count = len(data.train.labels.unique())
     if class_count == len(data.classes):
         return kind
@@ -687,23 +720,24 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
 
 
 def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
-    """Name the metrics of a folder of photographs as metrics.jsonl has them.
+    """List the metrics on a folder of photographs under their names in metrics.jsonl.
 
     Args:
         name: Name of the folder of photographs, such as "photographs".
         scores: Scores on these photographs.
 
     Returns:
-        Values of the known metrics by names such as "photographs/auc" and, with
-        several labels, "photographs/orange/auc".
+        Values of the known metrics by names such as "photographs/auc". If there
+        are several positive classes, there are also names such as
+        "photographs/orange/auc".
     """
-    parts = {name: scores.overall}
+    metrics_by_prefix = {name: scores.overall}
     for label, metrics in scores.by_label.items():
-        parts[f"{name}/{label}"] = metrics
+        metrics_by_prefix[f"{name}/{label}"] = metrics
     values = {}
-    for part, metrics in parts.items():
+    for prefix, metrics in metrics_by_prefix.items():
         for metric in ("top5", *METRICS):
             estimate = metrics.find(metric)
             if estimate is not None and estimate.value is not None:
-                values[f"{part}/{metric}"] = estimate.value
+                values[f"{prefix}/{metric}"] = estimate.value
     return values

@@ -1,4 +1,8 @@
-"""A teacher that takes the frozen layers of its pupil, which saves one of two forward passes."""
+"""A teacher network that shares layers with the network in training.
+
+If only the last layer is trained, the features before it are the same in both networks. To compute
+them once saves one of two forward passes.
+"""
 
 from typing import Any
 
@@ -12,11 +16,10 @@ from train.training.recipe import last_layer
 
 
 class SharedTeacher(nn.Module):
-    """The last layer of a teacher behind all other layers of its pupil.
+    """Teacher that applies its last layer to the features of another network, its pupil.
 
-    The two networks are copies of each other, and only the last layer of the
-    pupil learns. The logits of the teacher are therefore those of its last
-    layer for the features that the pupil has computed.
+    The teacher is a copy of the pupil before the training, in which only the last
+    layer changes. Both networks therefore compute the same features before it.
 
     Args:
         pupil: Network in training. It must be called before each call of the
@@ -25,25 +28,26 @@ class SharedTeacher(nn.Module):
     """
 
     def __init__(self, pupil: MixedPrecision, teacher: MixedPrecision):
+        """Register a hook on the last layer of the pupil, which stores the input of this layer."""
         super().__init__()
         name = last_layer(pupil.network)
         self.layer = teacher.network.get_submodule(name)
         self._dtype = PRECISIONS[teacher.precision]
         self._features: Tensor | None = None
         layer = pupil.network.get_submodule(name)
-        self._hook = layer.register_forward_pre_hook(self._keep)
+        self._hook = layer.register_forward_pre_hook(self._store_features)
 
     @property
     def has_features(self) -> bool:
-        """Whether the pupil has called its last layer."""
+        """Whether the hook has stored features of the pupil."""
         return self._features is not None
 
     def release(self) -> None:
-        """Stop keeping the features of the pupil."""
+        """Remove the hook that stores the features of the pupil."""
         self._hook.remove()
 
-    def _keep(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        """Keep the input of the last layer of the pupil. torch calls this hook before the layer.
+    def _store_features(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
+        """Store the input of the last layer of the pupil. torch calls this hook before the layer.
 
         Args:
             inputs: Arguments of the layer. The first one has the features.
@@ -51,13 +55,13 @@ class SharedTeacher(nn.Module):
         self._features = inputs[0].detach()
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of the teacher for the images that the pupil saw last.
+        """Return the logits of the teacher for the images with which the pupil was called last.
 
         Args:
-            images: These images, shape (B, 3, H, W).
+            images: The same images, shape (B, 3, H, W).
 
         Returns:
-            Logits, shape (B, C).
+            Logits, shape (B, classes).
         """
         is_mixed = self._dtype != torch.float32
         with torch.autocast(images.device.type, self._dtype, enabled=is_mixed):
@@ -67,7 +71,7 @@ class SharedTeacher(nn.Module):
 def share_layers(
     settings: TrainSettings, pupil: MixedPrecision, teacher: MixedPrecision, size: int
 ) -> nn.Module:
-    """Return a teacher that shares the frozen layers of its pupil, if it answers the same.
+    """Return a teacher that shares layers with its pupil, if that does not change its logits.
 
     Args:
         settings: Settings of the training.
@@ -76,20 +80,24 @@ def share_layers(
         size: Pixels per side of the images.
 
     Returns:
-        The shared teacher. Otherwise the given teacher: if more than the last
-        layer learns, if the statistics of a batch count, or if the logits are
-        not those of the last layer.
+        A `SharedTeacher` if only the last layer of the pupil changes in the
+        training, and if the logits of both teachers are equal for two test
+        images. Otherwise `teacher`.
     """
+    # The features would depend on the statistics of the batch in training mode.
     is_frozen = settings.freeze == ALL_BUT_LAST and settings.eval_mode
-    is_compiled = any(isinstance(module, torch.jit.ScriptModule) for module in pupil.modules())
-    if not is_frozen or is_compiled:
+    # `SharedTeacher` registers a hook, which modules of TorchScript do not support.
+    has_script = any(isinstance(module, torch.jit.ScriptModule) for module in pupil.modules())
+    if not is_frozen or has_script:
         return teacher
     shared = SharedTeacher(pupil, teacher)
     device = next(teacher.parameters()).device
+    # Two test images with a color gradient.
     images = torch.linspace(0, 1, 6 * size**2, device=device).view(2, 3, size, size)
     with eval_mode(pupil), torch.no_grad():
-        features_are_kept = pupil(images).equal(teacher(images)) and shared.has_features
-        if features_are_kept and shared(images).equal(teacher(images)):
+        expected = teacher(images)
+        is_equal = pupil(images).equal(expected) and shared.has_features
+        if is_equal and shared(images).equal(expected):
             return shared
     shared.release()
     return teacher

@@ -335,7 +335,7 @@ class Axis:
 # Values after each step. From 1, a step leads to -1/2. From there 1.5 is too far, but 3/4 is not.
 # The length is halved at every other step.
 FROM_1 = [1, -1 / 2, -1 / 2, 1 / 4, 1 / 4, -1 / 8, -1 / 8, 1 / 16]
-# Only the fourth length, 3/16, is short enough.
+# The first three step lengths are too long. The fourth, 3/16, lowers the cost.
 FROM_EIGHTH = [1 / 8, 1 / 8, 1 / 8, 1 / 8, -1 / 16, -1 / 16, 1 / 32, 1 / 32]
 # The first step leads to the same cost, which is no fall, and the second to the bottom.
 FROM_THREE_QUARTERS = [3 / 4, 3 / 4, 0, 0, 0, 0, 0, 0]

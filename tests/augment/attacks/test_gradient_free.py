@@ -69,7 +69,7 @@ def search(optimizer: str, norm: str, start: Tensor, queries: int, seed: int = 0
 def test_search_finds_the_lowest_point_of_an_l2_ball(optimizer):
     result = search(optimizer, "l2", CENTERS, queries=400)
     lowest = CENTERS - RADIUS * SLOPE / SLOPE.norm()
-    # On the sphere, the cost is quadratic in this distance.
+    # The cost is quadratic in the distance from the lowest point of the sphere.
     torch.testing.assert_close(result.values, lowest, rtol=0, atol=0.05 * RADIUS)
     found = (result.values - CENTERS) @ SLOPE
     assert (found < -0.999 * RADIUS * SLOPE.norm()).all()

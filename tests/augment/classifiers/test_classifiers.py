@@ -228,11 +228,12 @@ def test_the_last_convolution_of_squeezenet_is_padded_by_one(squeezenet, squeeze
     plain.load_state_dict(torch.load(squeezenet_file, weights_only=True))
     images = random_images(227, 1)
     with torch.no_grad():
-        mean_of_inner = plain.eval()(first_input(squeezenet, images))  # of 13 × 13
+        # Mean of the inner 13 × 13 features.
+        mean_of_inner = plain.eval()(first_input(squeezenet, images))
         border = plain.classifier[1].bias.relu()
         logits = squeezenet(images)
     expected = (13**2 * mean_of_inner + (15**2 - 13**2) * border) / 15**2
-    # Up to 512 · 9 products are summed in another order.
+    # The sum of up to 512 · 9 products has another order in the two networks.
     rounding = 100 * EPS32 * float(expected.abs().max())
     torch.testing.assert_close(logits, expected, rtol=0, atol=rounding)
 
@@ -480,9 +481,11 @@ def fraction_of_oranges(classifier: Classifier, images: torch.Tensor) -> float:
 @pytest.mark.parametrize(
     ("name", "weights", "least", "most_in_bgr"),
     [
-        # Of all 255 photographs, it is right about 72 %, and 18 % with red and blue exchanged.
+        # The network is right about 72 % of all 255 photographs, and about 18 % with red and
+        # blue exchanged.
         ("efficientnet_lite0", None, 0.6, 0.35),
-        # Of all 255 photographs, it is right about 53 %, and 0.4 % likewise.
+        # The network is right about 53 % of all 255 photographs, and about 0.4 % with red and
+        # blue exchanged.
         ("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth", 0.4, 0.05),
     ],
 )

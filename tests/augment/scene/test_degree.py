@@ -28,7 +28,7 @@ from renderer.shading.gloss import Gloss, smallest_roughness
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}
-# Without a radius, an attack reaches a roughness of 0.2.
+# An attack without a radius reaches a roughness of 0.2.
 UNLIMITED = MaterialSettings()
 ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED)
 

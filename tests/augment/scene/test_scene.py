@@ -353,7 +353,8 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
             coefficient_counts.add(len(operator.nonzero))
             for gray in GRAYS:
                 expected.append(operator.image(lights[len(expected)], gray))
-    if names == ["cup", "ball"]:  # Only the cup throws shadows on itself.
+    if names == ["cup", "ball"]:
+        # The cup casts shadows on itself, the ball does not.
         assert coefficient_counts == {49, 31}
 
     face_count = max(len(item.mesh.faces) for item in scene.objects)

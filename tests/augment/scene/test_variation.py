@@ -688,5 +688,5 @@ def test_a_photograph_is_turned_scaled_and_mirrored_beyond_its_border():
     # A triangle wave with period 4.
     mirrored = 1 - ((shown + 1) % 4 - 2).abs()
     expected = (0.5 + 0.4 * mirrored)[:, None].expand_as(patterns)
-    # At a border, half a pixel has the value of the outermost pixel.
+    # Half a pixel at each border has the value of the outermost pixel.
     torch.testing.assert_close(patterns, expected, rtol=0, atol=0.4 / size + 1e-5)

@@ -241,7 +241,7 @@ def test_derivatives_of_images_are_central_differences(scene):
     directions = [draw(*tensor.shape, seed=3 + index) for index, tensor in enumerate(inputs)]
     for moved in MOVED:
         steps = [direction * (index in moved) for index, direction in enumerate(directions)]
-        # No value may reach the clamp on the way.
+        # The finite difference must not cross the value at which `is_clamped` changes.
         for distance in (2e-5, -2e-5):
             clamped_after = image.is_clamped(*move(inputs, steps, distance))
             assert torch.equal(clamped_after, image.is_clamped(*inputs))

@@ -30,7 +30,7 @@ from scripts.attack import main as attack_command
 DATA = Path(__file__).parents[4] / "shared" / "data"
 MARGIN = 1.6  # Side of the square around the object, in widths of the object.
 SIZE = 192  # Photographs have so many pixels per side.
-WHOLE = 0.98  # From this coverage on, a pixel shows the object alone.
+WHOLE = 0.98  # Coverage from which a pixel shows the object alone.
 ROUNDING = 0.0005  # Rounding error of a printed percentage with one decimal.
 
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from renderer.settings import facts_of, field_types
 from train.command import Command
-from train.runs.run_config import given_command
+from train.runs.run_config import format_command
 from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]
@@ -122,4 +122,4 @@ def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(
 def test_the_command_of_a_run_starts_as_the_run_did(monkeypatch, started, processes, words):
     monkeypatch.setattr(sys, "argv", [started])
     monkeypatch.setenv("WORLD_SIZE", str(processes))
-    assert given_command(["seed=1", "run=a", "train.resume=true"]) == words
+    assert format_command(["seed=1", "run=a", "train.resume=true"]) == words

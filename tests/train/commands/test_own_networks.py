@@ -81,7 +81,7 @@ def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
         lambda state: {
             "model": state,
             "args": argparse.Namespace(batch_size=32),
-        },  # as torchvision's scripts save
+        },  # The training scripts of torchvision save such a file.
         lambda state: {f"module.{key}": value for key, value in state.items()},
         lambda state: {
             "model_state_dict": {f"module._orig_mod.{key}": value for key, value in state.items()}

@@ -76,7 +76,7 @@ def test_the_result_loads_where_the_network_was_loaded(network, photographs):
     fresh = build()
     fresh.load_state_dict(hardened.state_dict(), strict=True)
     assert not torch.equal(fresh[4].weight, network[4].weight)
-    # Only the last layer learns.
+    # The layers before the last one do not learn.
     assert torch.equal(fresh[2].weight, network[2].weight)
 
 

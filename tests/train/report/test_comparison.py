@@ -63,7 +63,7 @@ def predictions_of(scores: Scores) -> list[Prediction]:
 @pytest.fixture
 def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
     """Return a function that makes the folder of a finished run with scores."""
-    # No test looks at a figure.
+    # Tests do not look at figures, and saving them is slow.
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
 
     def make(method: str, scores: Scores, *overrides: str, name: str = "photographs") -> Path:
@@ -349,7 +349,7 @@ def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(meth
     for cell, value, interval in zip((web[1], web[3]), values, intervals, strict=True):
         difference, low, high = read_interval(cell)
         assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.
-        # With 1,000 replicates, the ends vary by chance by up to 0.02.
+        # The ends vary by chance by up to 0.02, with 1,000 replicates.
         assert (low, high) == pytest.approx(tuple(interval), abs=0.02)
 
 

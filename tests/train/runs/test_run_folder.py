@@ -218,7 +218,7 @@ def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes
     write_config(tmp_path, Settings(meshes=[str(mesh)]))
     settings = Settings("photos", [str(mesh)])
     require_same(tmp_path, settings, "out=", lambda *change: change == ("photos", None, "photos"))
-    with pytest.raises(InputError, match="was made with photos=None, not photos: give its setting"):
+    with pytest.raises(InputError, match="was made with photos=None, not photos: set photos to"):
         require_same(tmp_path, settings, "out=", lambda *change: False)
     mesh.write_text("v 0 0 1")
     with pytest.raises(

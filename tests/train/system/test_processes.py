@@ -100,9 +100,10 @@ def run_until_a_signal(config: Path, folder: Path) -> None:
     """
     training_batches = loop.training_batches
 
-    def signalled(split, batch_size, seed, now, *rest):
-        for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
-            if (now.epoch, count, distributed.rank()) == (1, 2, 1):
+    def signalled(images, **options):
+        epoch = options["this_round"].epoch
+        for count, batch in enumerate(training_batches(images, **options), 1):
+            if (epoch, count, distributed.rank()) == (1, 2, 1):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 

@@ -38,7 +38,7 @@ SETTINGS = [
     "train.learning_rate=0.001",
     "train.distillation_weight=1",
 ]
-# With this learning rate, the weights hardly move.
+# Learning rate with which the weights hardly move.
 ALMOST_FIXED = "train.learning_rate=1e-12"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

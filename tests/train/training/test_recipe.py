@@ -71,7 +71,7 @@ PROGRESS = np.linspace(0, 1, 1001)
 @pytest.mark.parametrize(
     "schedule, expected",
     [
-        # By the half-angle formula, this is half a period of a cosine.
+        # The half-angle formula makes this half a period of a cosine.
         ("cosine", np.cos(math.pi / 2 * PROGRESS) ** 2),
         ("one_cycle", np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
     ],

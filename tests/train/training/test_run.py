@@ -73,10 +73,10 @@ class ActingBatches:
         self.round_number = round_number
         self.step = step
 
-    def __call__(self, images, batch_size, seed, now, *rest):
-        given = batches.training_batches(images, batch_size, seed, now, *rest)
-        for step, batch in enumerate(given, 1):
-            if now.number == self.round_number and step == self.step:
+    def __call__(self, images, **options):
+        number = options["this_round"].number
+        for step, batch in enumerate(batches.training_batches(images, **options), 1):
+            if number == self.round_number and step == self.step:
                 self.act()
             yield batch
 
@@ -842,7 +842,7 @@ class TestAResumedRun:
         """Check that the run is refused before it writes anything."""
         before = modification_times(run)
         settings = tiny("augment=none", "train.epochs=2", "train.resume=true")
-        with pytest.raises(InputError, match=r"best\.pt is not the network that this run kept"):
+        with pytest.raises(InputError, match=r"best\.pt is not the best network of this run"):
             loaded_run(settings, run)
         assert modification_times(run) == before
 

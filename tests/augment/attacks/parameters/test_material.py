@@ -27,7 +27,7 @@ from renderer.surface.albedo import changed_albedo
 
 FIRST = torch.zeros(1, dtype=torch.int64)  # index of the only example
 TABLE = [0.5, 0.4, 0.3]
-# What a value of 1 changes.
+# Change of each parameter by an attacked value of 1.
 UNITS = {"roughness": 0.3, "metallic": 0.2, "specular_factor": 0.5, "hue": 40.0}
 
 # The scenes keep to light of degree 6, which takes less time.

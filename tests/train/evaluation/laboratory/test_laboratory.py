@@ -353,7 +353,7 @@ def test_slides_project_a_picture_in_its_own_colors():
         assert not pattern[..., 1:].any()
 
 
-# In the following tests, light comes from the projectors and the surroundings
+# The light of the following tests comes from the projectors and the surroundings
 # without bounces.
 
 

@@ -458,7 +458,7 @@ def approx_closely(value: float):
 
 @pytest.mark.parametrize("place", [0, 4, 5])
 def test_a_tie_of_all_classes_goes_to_the_first_class(known_model, tmp_path, place):
-    # With so many classes, a sort that is not stable changes their order.
+    # A sort that is not stable changes the order of so many classes.
     classes = [f"class {index}" for index in range(300)]
     undecided = known_model(["a.png"], np.zeros((1, 300)), classes)
     summary = evaluate(*undecided, classes[place], tmp_path)
