@@ -310,7 +310,7 @@ class _MovingView:
     ) -> None:
         """Replace the differences between samples of two neighboring pixels, in place.
 
-        The two pixels have different upstream gradients. The right difference is
+        The two pixels have different upstream gradients. The correct difference is
         the difference of the two radiances times the mean of the two upstream
         gradients.
 
@@ -565,14 +565,12 @@ class _Silhouettes:
         place = start[:, edge] + cuts.fraction * (end - start)[:, edge]
         surface_nearness = self._surface_nearness(samples, place)
         is_visible = self._is_visible(cuts, samples, surface_nearness)
-        # Number that is larger for cuts that are farther from the sample with the farther
-        # surface.
-        from_farther = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
-        kept = np.flatnonzero(is_visible)
-        # Sort the cuts by the pair of samples around them, and then by `from_farther`.
-        kept = kept[np.lexsort([from_farther[kept], after[kept]])]
-        # Keep only the first cut between each pair of samples.
-        kept = kept[np.diff(after[kept], prepend=-1) != 0]
+        # Distance of each cut from the sample with the farther surface, plus a number that is
+        # the same for all cuts between the same two samples.
+        distance = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
+        visible = np.flatnonzero(is_visible)
+        # Of all cuts between the same two samples, only the nearest one is kept.
+        kept = visible[_smallest_in_groups(distance[visible], after[visible])]
         return (
             self.ends[:, edge[kept]],
             cuts.fraction[kept],
@@ -641,6 +639,22 @@ class _Silhouettes:
         difference_c = nearness_of_corners[..., 2] - nearness_a
         plane = nearness_a + weight_b * difference_b + weight_c * difference_c
         return np.where(samples >= 0, plane, -np.inf)
+
+
+def _smallest_in_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Find the smallest value of each group of values.
+
+    Args:
+        values: N values, shape (N,).
+        groups: Number of the group of each value, at least 0, shape (N,).
+
+    Returns:
+        Index of the smallest value of each group, in ascending order of the groups.
+    """
+    # Sort by the group, and then by the value.
+    order = np.lexsort([values, groups])
+    is_first_of_group = np.diff(groups[order], prepend=-1) != 0
+    return order[is_first_of_group]
 
 
 class _Cuts(NamedTuple):
