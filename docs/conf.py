@@ -95,7 +95,7 @@ PAGES = {
 }
 
 # Sections of the README that are on the page of the quick start.
-QUICK_START = ("#try-it", "#attack-a-network", "#audit-a-network")
+QUICK_START = ("#try-it", "#attack-a-network", "#audit-a-network", "#harden-a-network")
 
 
 def link_to_pages(folder: Path, text: str) -> str:
