@@ -537,6 +537,7 @@ def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
     Raises:
         InputError: If the folder has other results that may not be replaced.
     """
+    # Files with these names are results of this audit, which continues with them.
     own_results: Collection[str] = ()
     # A folder without config.yaml raises an InputError.
     with suppress(InputError):

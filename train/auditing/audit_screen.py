@@ -110,10 +110,10 @@ def screen_of_one(
     """
     numbers = [
         ShownMetric(
-            "Views recognized in plain light",
-            "higher is better",
-            None,
-            fraction(plain.recognized, plain.n),
+            title="Views recognized in plain light",
+            note="higher is better",
+            before=None,
+            after=fraction(plain.recognized, plain.n),
         )
     ]
     kind = strongest_kind(counts)
@@ -123,7 +123,7 @@ def screen_of_one(
         remaining_count = correct_count - counts[kind]["adversarial"][-1]
         title = f"Of these, under attack by {KINDS[kind].title}"
         remaining = fraction(remaining_count, correct_count)
-        numbers.append(ShownMetric(title, "higher is better", None, remaining))
+        numbers.append(ShownMetric(title, "higher is better", before=None, after=remaining))
         sentences.append(
             f"If an attacker controls {KINDS[kind].title}, it still recognizes {remaining_count} "
             f"of the {correct_count} views that it recognizes before the attack."
@@ -131,10 +131,19 @@ def screen_of_one(
     false_positive_rate = read_metric(scores, "false_positive_rate") if scores else None
     if false_positive_rate is not None and false_positive_rate.value is not None:
         title = f"Other objects called {in_words(label)}"
-        numbers.append(ShownMetric(title, "lower is better", None, false_positive_rate))
+        numbers.append(
+            ShownMetric(title, "lower is better", before=None, after=false_positive_rate)
+        )
     if scores:
         sentences += _score_sentence(label, scores)
-    return FirstScreen(answer, sentences, numbers, {}, [name], "")
+    return FirstScreen(
+        answer=answer,
+        sentences=sentences,
+        numbers=numbers,
+        rows={},
+        names=[name],
+        images="",
+    )
 
 
 def _score_sentence(label: str, scores: Mapping[str, Any]) -> list[str]:

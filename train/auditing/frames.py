@@ -18,7 +18,7 @@ FRAME_COUNT = 21
 CLASS_COUNT = 5
 # Width and height of the image of the object, in pixels.
 SIDE = 200
-# Width and height of the image of a white ball in the same light, in pixels.
+# Width and height of the image of a white ball, which shows the light, in pixels.
 BALL_SIDE = 120
 # Number of images that the classifier classifies in one pass.
 BATCH = 16

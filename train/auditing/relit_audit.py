@@ -134,7 +134,14 @@ def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
             numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
     sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
     place = f"{len(first.photographs)} photographs of {first.folder}"
-    return FirstScreen(_answer(last), [*sentences, MODELED], numbers, {}, [*results], place)
+    return FirstScreen(
+        answer=_answer(last),
+        sentences=[*sentences, MODELED],
+        numbers=numbers,
+        rows={},
+        names=[*results],
+        images=place,
+    )
 
 
 def write_photographs_page(

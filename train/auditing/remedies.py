@@ -73,9 +73,9 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
         networks: Networks under the keys CLASSIFIER and HARDENED.
 
     Returns:
-        For the name of the original network, and then of each remedy from the
-        cheapest to the most expensive, the name of the subfolder with the
-        results.
+        Names of the subfolders with the results of the compared networks. The
+        keys are "the original network", and then the names of the remedies,
+        from the cheapest to the most expensive.
     """
     subfolders = {ORIGINAL: CLASSIFIER}
     for key, network in {**normalizing(networks), **networks}.items():

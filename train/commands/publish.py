@@ -30,8 +30,8 @@ def publish_network(settings: PublishSettings) -> None:
     out = writable_folder(settings.out, "out")
     folder = Path(settings.run)
     path, state = load_selected(folder)
-    # `run` may be the folder of a published network, which is then replaced. This adds
-    # an operating point to the network.
+    # `run` may be the folder of a published network, which is then replaced, for example
+    # to add a detection threshold to it.
     is_replaced = path.resolve() == (out / PUBLISHED).resolve()
     own_files = [PUBLISHED] if is_replaced else []
     require_replaceable(out, "out", settings.overwrite, own_files)

@@ -54,8 +54,9 @@ class Round(NamedTuple):
     Attributes:
         number: Number of rounds of the training run before this round.
         epoch: Number of epochs before the epoch of this round.
-        rows: Numbers of the images of the round, as `TrainingImages` numbers
-            them, in ascending order, int64, shape (M,).
+        rows: Numbers of the images of the round in ascending order, int64,
+            shape (M,). The N images of the data set have the numbers 0 to
+            N - 1. The renders have the numbers from N on.
     """
 
     number: int
@@ -354,20 +355,20 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
     """
     height, width = images.shape[2:]
     device = images.device
-    # Row i of the result is copied from row `rows[:, i]` of the image. `rows` has the
-    # shape (B, H). `columns` has the same for columns, shape (B, W).
-    rows = torch.arange(height, device=device) + shifts[0, :, None]
-    rows = _reflect(rows, height)
-    columns = torch.arange(width, device=device).expand(len(chosen), -1)
-    columns = torch.where(flips[:, None], columns.flip(1), columns)
-    columns = _reflect(columns + shifts[1, :, None], width)
+    # Row i of result b is copied from row `source_rows[b, i]` of its image, and column j
+    # from column `source_columns[b, j]`. The arrays have the shapes (B, H) and (B, W).
+    source_rows = torch.arange(height, device=device) + shifts[0, :, None]
+    source_rows = _reflect(source_rows, height)
+    source_columns = torch.arange(width, device=device).expand(len(chosen), -1)
+    source_columns = torch.where(flips[:, None], source_columns.flip(1), source_columns)
+    source_columns = _reflect(source_columns + shifts[1, :, None], width)
     channels = torch.arange(3, device=device)
     # The four index arrays broadcast to the shape (B, 3, H, W) of the result.
     return images[
         chosen[:, None, None, None],
         channels[:, None, None],
-        rows[:, None, :, None],
-        columns[:, None, None, :],
+        source_rows[:, None, :, None],
+        source_columns[:, None, None, :],
     ]
 
 

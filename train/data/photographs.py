@@ -197,11 +197,13 @@ def _require_files_of_rows(
     missing = sorted(rows.keys() - set(files))
     if not missing:
         return
-    counts = f"{len(missing)} of {len(rows)} rows"
-    problem = f"{table} names a missing file in {counts}, such as {missing[0]}"
     if len(missing) == len(rows):
-        raise InputError(f"{problem}: give paths relative to the folder, such as {example}")
-    _warn_once(problem)
+        raise InputError(
+            f"{table} names a missing file in each of its {len(rows)} rows, such as "
+            f"{missing[0]}: give paths relative to the folder, such as {example}"
+        )
+    counts = f"{len(missing)} of {len(rows)} rows"
+    _warn_once(f"{table} names a missing file in {counts}, such as {missing[0]}")
 
 
 def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
@@ -477,10 +479,10 @@ def load_photographs(
             unreadable.append((photograph.path, error))
     if unreadable and not (readable and skip_unreadable):
         path, error = unreadable[0]
+        skip_advice = advice if readable else ""
         raise InputError(
             f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
-            f"the first being {folder / path} ({error}): "
-            f"replace them{advice if readable else ''}",
+            f"the first being {folder / path} ({error}): replace them{skip_advice}",
         )
     if unreadable:
         images = images[readable]

@@ -175,7 +175,7 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
         ),
         (
             b"path,source_tag\nb/a.jpg,web\n",
-            "a missing file in 1 of 1 rows, .*: give paths relative to the folder, such as a.jpg$",
+            "a missing file in each of its 1 rows, .*: give paths relative to .* such as a.jpg$",
         ),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
         (

@@ -530,9 +530,9 @@ class Pooled:
     def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
         """Collect the predictions for the images of each mesh, or of each class.
 
-        The ROC curve of a positive mesh or class compares its images with all
-        negatives. The ROC curve of a negative mesh or class compares all
-        positives with its images.
+        The ROC curve of a mesh of a positive class compares the images of this
+        mesh with all negatives. The ROC curve of another mesh compares all
+        positives with the images of this mesh. The same holds for classes.
 
         Args:
             name_of: Function that returns the name of the mesh or class in the
