@@ -109,7 +109,7 @@ class Command:
 
     @property
     def has_file(self) -> bool:
-        """Whether Hydra composes the settings of this command as a file conf/NAME.yaml says."""
+        """Whether a file conf/NAME.yaml says how Hydra composes the settings of this command."""
         return (CONF / f"{self.name}.yaml").exists()
 
     @property
@@ -131,8 +131,13 @@ class Command:
                 skip_last_collection()
                 return
             sys.argv[1:] = self.to_overrides(sys.argv[1:])
-            start = hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)
-            start(self.run)()
+            # Hydra reads the overrides from sys.argv, composes the configuration, and calls
+            # `self.run` with it.
+            decorate = hydra.main(
+                version_base="1.3", config_path="pkg://conf", config_name=self.name
+            )
+            start = decorate(self.run)
+            start()
 
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
         """Convert the arguments of the command line to overrides that Hydra reads.

@@ -187,10 +187,10 @@ def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Eval
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Check that photographs have the sources that a user excludes.
+    """Check that there are photographs of each source that a user excludes.
 
     Args:
-        names: Names of the sources.
+        names: Names of the excluded sources.
         predictions: Predictions for all photographs, with their sources.
 
     Raises:
@@ -237,7 +237,7 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
     """Make a table of the metrics of each method on each subset of the images.
 
     Args:
-        methods: Evaluations of each method.
+        methods: Evaluations of each method, a way to train a network.
         overall: Title of the rows of all images.
         by: Title of the first column: "source", "mesh" or "class".
 
@@ -414,7 +414,7 @@ def difference_tables(
     """Make a table of the differences of the metrics for each pair of methods.
 
     Args:
-        methods: Evaluations of each method.
+        methods: Evaluations of each method, a way to train a network.
         overall: Title of the row of all images.
         by: Title of the first column: "source", "mesh" or "class".
         overall_only: Whether to leave out the rows of single sources, meshes or classes.
@@ -446,7 +446,7 @@ def overall_differences(methods: Evaluations) -> Table:
     """Make one table of the differences between methods on the images of all sources.
 
     Args:
-        methods: Evaluations of each method.
+        methods: Evaluations of each method, a way to train a network.
 
     Returns:
         Table with a row for each pair of methods from `choose_pairs`. With
@@ -627,7 +627,7 @@ def _format_gain(methods: Evaluations, method: str) -> str:
     """Write the gain in AUC: the AUC of a method minus the AUC of the first method.
 
     Args:
-        methods: Evaluations of each method.
+        methods: Evaluations of each method, a way to train a network.
         method: Name of the method.
 
     Returns:

@@ -203,6 +203,7 @@ def describe_place(folder: Path | None, name: str) -> str:
         "Under unusual lighting" for images that were rendered to test this.
         Otherwise, a text with the name.
     """
+    # The command that renders test images writes a description of them to their folder.
     is_laboratory = folder is not None and (folder / DESCRIPTION).is_file()
     return "Under unusual lighting" if is_laboratory else f"In the images of “{name}”"
 

@@ -167,6 +167,7 @@ def _title(found: summary.Findings, methods: Methods) -> str:
     """
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
+    # Positive classes of all runs.
     labels: set[str] = set()
     for runs in methods.values():
         for scores in runs[0].photographs.values():
@@ -369,7 +370,7 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
     """Compare each method with the network that it began with, on the test images.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         A sentence for each method. A method that began with random weights has
@@ -426,7 +427,7 @@ def _relit_sentences(methods: Methods) -> list[str]:
     """Say how training on photographs in the light of a projector changed predictions.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         A sentence for each method that was trained on such photographs, with
@@ -640,7 +641,7 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     """Make tables of the metrics of methods on the same images.
 
     Args:
-        methods: Evaluations of each method.
+        methods: Evaluations of each method, a way to train a network.
 
     Returns:
         A table of the differences between methods. If the images have several

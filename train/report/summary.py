@@ -437,7 +437,7 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
     """Group runs by the images on which they were scored.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         For each set of images, by its title, the runs of each method with their
@@ -492,7 +492,7 @@ def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
     """Make tables of the accuracy, the scores and the settings of runs.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
         groups: For each set of images, by its title, the runs of each method
             with their scores on these images.
 
@@ -514,7 +514,7 @@ def _settings_table(methods: Methods) -> Table:
     """Make a table of the settings in which methods differ.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         Table with a row for each method and a column for each setting. It has no
@@ -534,7 +534,7 @@ def _accuracy_table(methods: Methods) -> Table:
     """Make a table of the accuracy of each run on the test images.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         Table with the accuracy of the network that the training selected, and
@@ -592,7 +592,7 @@ def seconds_table(methods: Methods) -> Table:
     """Make a table of the time that an epoch of each method takes.
 
     Args:
-        methods: Runs of each method.
+        methods: Runs of each method. A method is a way to train a network.
 
     Returns:
         Table with a row for each method. Cells are means over the epochs of its

@@ -112,6 +112,7 @@ class TrainingLoss:
         divergences = kl_divergence(logits, targets) * ~rendered
         if self._positive_classes:
             classes = torch.arange(logits.shape[1], device=logits.device)
+            # Whether each class is not a positive class, shape (classes,).
             is_other = torch.stack([classes != label for label in self._positive_classes]).all(0)
             of_renders = kl_divergence(logits[:, is_other], targets[:, is_other]) * rendered
             divergences = divergences + of_renders
