@@ -583,7 +583,14 @@ def format_short_comparison(
 
 
 def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:
-    """Average the accuracy on the test images over runs. Return None if it is unknown for all."""
+    """Average the accuracy on the test images over runs.
+
+    Args:
+        runs: Runs of one method. The accuracy of some of them may be unknown.
+
+    Returns:
+        Mean of the known accuracies, without an interval. None if all are unknown.
+    """
     accuracies = [run.accuracy for run in runs if run.accuracy is not None]
     return Estimate(fmean(accuracies)) if accuracies else None
 

@@ -178,7 +178,7 @@ class MixedPrecision(nn.Module):
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        """Wrap a network, and change its weights to the channels-last memory format."""
+        """Wrap a network. The class explains the arguments."""
         super().__init__()
         self.network = network.to(memory_format=torch.channels_last)
         self.precision = precision

@@ -117,12 +117,12 @@ class Interrupted(SystemExit):
 
 
 class SignalHandler:
-    """Context manager in which the first signal does not end the process at once.
+    """Context manager that lets a process write a checkpoint when a signal should end it.
 
-    The signal is noted, and the block asks for it with `requested`, writes a checkpoint, and calls
-    `stop`. A second signal ends the process at once. If the block ends without `stop`, the noted
-    signal is raised then. Signals that the process ignores stay ignored. Only the main thread
-    can receive signals.
+    The first signal in the block is only noted. The block asks for it with `requested`, writes a
+    checkpoint, and ends the process with `stop`. If it does not, the noted signal takes effect at
+    the end of the block. A second signal ends the process at once. Signals that the process
+    ignores stay ignored. Only the main thread can receive signals.
     """
 
     def __init__(self) -> None:
@@ -144,7 +144,12 @@ class SignalHandler:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
-        """Restore the handlers. If no error ends the block, raise the noted signal again."""
+        """Restore the handlers, and let a noted signal take effect unless an error is raised.
+
+        Args:
+            error: Type of the error that ends the block. None without an error.
+            *rest: Not used. Python passes the error and its traceback.
+        """
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)

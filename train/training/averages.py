@@ -79,7 +79,7 @@ class Averages:
         soup: bool,
         keeps_latest: bool = False,
     ):
-        """Create the averages. They are empty until the first step and the first epoch."""
+        """Create the averages, which are empty at first. The class explains the arguments."""
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:

@@ -39,7 +39,7 @@ class Baseline:
     """
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
-        """Create the augmentation. For a transform of torchvision, this imports torchvision."""
+        """Create the augmentation. The class explains the arguments."""
         self._name = name
         self._model = model
         self._seed = seed

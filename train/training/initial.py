@@ -43,9 +43,9 @@ VALIDATION = 0.1
 class Initial:
     """Initial network: the network with whose weights a run begins.
 
-    The setting `train.init_from` names it. It may contain a wrapper that
-    normalizes the light of images. `weights` and `network` are those without the
-    wrapper.
+    The setting `train.init_from` names the network. If the network has a wrapper
+    that normalizes the light of images, `weights` and `network` are those inside
+    the wrapper.
 
     Attributes:
         source: File of the network of another run, or name of a classifier.
@@ -366,7 +366,7 @@ class CachedModel:
     """
 
     def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
-        """Compute the hash of all that decides the logits of an image."""
+        """Hash what decides the logits of an image. The class explains the arguments."""
         self._model = model
         self._cache = cache
         facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]

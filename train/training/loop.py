@@ -147,7 +147,7 @@ class Trainer:
         folder: Path,
         labeled: bool = True,
     ):
-        """Check the settings, copy the initial network, and build the optimizer and the loss."""
+        """Check the settings, and build the optimizer. The class explains the arguments."""
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(

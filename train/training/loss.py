@@ -38,7 +38,7 @@ class TrainingLoss:
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
-        """Store the networks and the settings. `compute` computes the loss of a batch."""
+        """Store the arguments, which the class explains."""
         self._model = model
         self._settings = settings
         self._positive_classes = positive_classes

@@ -43,7 +43,7 @@ class RelitBatches:
         teacher: nn.Module | None,
         seed: int,
     ):
-        """Read the range of the factors and the number of steps from the settings."""
+        """Store the arguments, which the class explains."""
         self._radius = math.log(settings.relight_gain)
         self._steps = settings.relight_steps
         self._model = model

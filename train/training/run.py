@@ -100,7 +100,7 @@ class Run:
         initial: Initial | None = None,
         command: str = "",
     ):
-        """Store the arguments. `load` checks them."""
+        """Store the arguments, which the class explains. The method `load` checks them."""
         self.settings = settings
         self.data = data
         self.folder = folder

@@ -28,7 +28,12 @@ class SharedTeacher(nn.Module):
     """
 
     def __init__(self, pupil: MixedPrecision, teacher: MixedPrecision):
-        """Register a hook on the last layer of the pupil, which stores the input of this layer."""
+        """Store what the last layer of the pupil, the network in training, gets as its input.
+
+        Args:
+            pupil: Network in training. A hook on its last layer stores the input.
+            teacher: Copy of the network before the training.
+        """
         super().__init__()
         name = last_layer(pupil.network)
         self.layer = teacher.network.get_submodule(name)
