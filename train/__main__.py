@@ -28,6 +28,7 @@ class TrainCommand(Command):
             super().__call__()
             return
         with self.handle_errors():
+            # torchrun sets this variable in the processes that it starts.
             if "TORCHELASTIC_RUN_ID" in os.environ:
                 raise InputError(
                     "torchrun cannot start a sweep (--multirun), since its processes train one "

@@ -517,8 +517,8 @@ def format_comparison(
 
     Raises:
         InputError: If the runs were scored on different photographs or classes,
-            if no run has the sub-folder `photographs` (unless this is the usual
-            name "photographs"), or if predictions cannot be read.
+            if no run has the sub-folder and its name is not the usual one, or if
+            predictions cannot be read.
     """
     methods = group_by_method(runs)
     groups = group_by_images(methods)
@@ -561,6 +561,7 @@ def format_short_comparison(
     groups = group_by_images(methods)
     group = _find_group(list(groups.values()), photographs)
     if group is None and groups:
+        # The first images on which runs were scored.
         group = next(iter(groups.values()))
     evaluations = read_evaluations(group, exclude, by) if group else {}
     if by != "source" and evaluations:
@@ -662,8 +663,8 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
         "photographs".
 
     Raises:
-        InputError: If runs of several groups have a sub-folder of this name, or
-            if no run has a sub-folder of another name than "photographs".
+        InputError: If runs of several groups have this sub-folder, or if no run
+            has it and its name is not the usual one.
     """
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
