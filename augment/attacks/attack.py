@@ -616,9 +616,9 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         message = (
-            "the light is negative in places, and without that its irradiance is off by "
-            f"{error:.0%} (rms) in {harmonics}: a higher degree is closer, "
-            "and allow_negative=True leaves the light as it is"
+            "the light has negative radiance, and its removal changes the irradiance by "
+            f"{error:.0%} (rms) in {harmonics}: give a higher degree, "
+            "or set allow_negative=True to keep the light as it is"
         )
         warnings.warn(message, stacklevel=stacklevel)
 

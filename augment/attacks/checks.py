@@ -140,14 +140,15 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
     reasons = []
     if lost_to_noise > success:
         reasons.append(
-            "most successes do not survive a sensor's noise, a larger margin helps",
+            "most successes are lost with sensor noise, and a larger margin helps",
         )
     if 0 < success <= checks["random_search"]:
         reasons.append("random search does as well or better")
+    # The following two are fractions of the examples.
     if checks["cost_fell"] < 1:
-        reasons.append("the cost rose in some examples")
+        reasons.append("the attack did not lower the cost of some examples")
     if checks["zero_gradient"] > 0:
-        reasons.append("some first gradients are exactly zero")
+        reasons.append("the first gradient of some examples is exactly zero")
     return reasons
 
 

@@ -113,6 +113,7 @@ class CMAES(GradientFree):
         Returns:
             Result of the A examples.
         """
+        # Strategies of an earlier run started from other values.
         self.populations.clear()
         self.generations.clear()
         return super().run(criterion, examples, start)

@@ -116,6 +116,7 @@ class Criterion:
         is_misclassified = predicted != self.source
         if self.target is None:
             return is_misclassified
+        # The target `NO_CLASS` stands for a view without a target.
         is_untargeted = self.target == NO_CLASS
         return torch.where(is_untargeted, is_misclassified, predicted == self.target)
 

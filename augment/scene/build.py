@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from augment.progress import progress
-from augment.scene.degree import degree_of_scene, reached_gloss, warn_of_cut_light
+from augment.scene.degree import degree_of_scene, reached_gloss, warn_of_low_degree
 from augment.scene.objects import SceneObject, add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
@@ -141,7 +141,7 @@ def build_scene(
         pixels = views * len(objects) * size**2
         degree = degree_of_scene(reached, scene_settings.degree, pixels)
         environment = load_light(environment, degree, reached.gloss)
-        warn_of_cut_light(str(scene_settings.light), environment)
+        warn_of_low_degree(str(scene_settings.light), environment)
     else:
         environment = as_tensor("light", environment)
         # `degree_of` raises InputError if the shape is not that of coefficients.

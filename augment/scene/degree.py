@@ -70,11 +70,11 @@ class Smoothest(NamedTuple):
         """
         return required_degree(self.roughness) if self.roughness < MATTE else 0
 
-    def warn(self, choice: str, degree: int) -> None:
+    def warn(self, subject: str, degree: int) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface.
 
         Args:
-            choice: Words of the warning that name the degree, such as "degree=6".
+            subject: Start of the sentence about the degree, such as "degree=6".
             degree: Degree of the lighting.
         """
         surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
@@ -82,7 +82,7 @@ class Smoothest(NamedTuple):
         error = highlight_error(degree, self.roughness)
         least_error = highlight_error(self.degree, self.roughness)
         errors = f"off by {error:.0%} (rms) instead of {least_error:.0%}"
-        message = f"{surface}, {needed}: {choice} shows the highlight of a point of light {errors}"
+        message = f"{surface}, {needed}: {subject} shows the highlight of a point of light {errors}"
         warnings.warn(message, stacklevel=4)
 
 
@@ -156,7 +156,7 @@ def _reached_roughness(
     return smallest_roughness(gloss.on(own_mesh))
 
 
-def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
+def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int:
     """Choose the degree of the spherical harmonics of a scene's lighting.
 
     If the user gives none, it is the lowest degree that shows the highlights of
@@ -164,7 +164,7 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
     limits it, or if the user gives a degree that is too low.
 
     Args:
-        reached: The smoothest surface, also after attacks and variations.
+        smoothest: The smoothest surface, also after attacks and variations.
         given: The degree that the user asked for, or None.
         pixels: Number of pixels of all views of all objects.
 
@@ -172,46 +172,45 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
         The degree, from 0 to 40.
     """
     if given is None:
-        degree = _affordable_degree(reached, pixels)
-        if degree < reached.degree:
-            reached.warn(f"there is memory for degree {degree} alone, which", degree)
+        degree = _affordable_degree(smoothest, pixels)
+        if degree < smoothest.degree:
+            smoothest.warn(f"degree={degree}, the highest that fits in memory,", degree)
         elif degree > DEGREE:
-            reached.warn(f"degree={DEGREE} takes less time, but", DEGREE)
+            smoothest.warn(f"degree={DEGREE} takes less time, but", DEGREE)
         return degree
-    if reached.degree > given:
-        reached.warn(f"degree={given}", given)
+    if smoothest.degree > given:
+        smoothest.warn(f"degree={given}", given)
     if given < MIN_SHADING_DEGREE:
-        fault = "shades no side of an object right"
+        fault = "is too low to shade objects correctly"
         if given == 0:
-            fault = "shades all sides of an object alike"
+            fault = "gives all sides of an object the same irradiance"
         message = (
-            f"degree={given} {fault} in light that is not even, and so do attacks and variations "
-            "of the light, which keep to this degree: "
-            f"give {MIN_SHADING_DEGREE} or more, or leave degree out"
+            f"degree={given} {fault}, and attacks and variations of the light have the same "
+            f"degree: give {MIN_SHADING_DEGREE} or more, or leave degree out"
         )
         warnings.warn(message, stacklevel=3)
     return given
 
 
-def _affordable_degree(reached: Smoothest, pixels: int) -> int:
+def _affordable_degree(smoothest: Smoothest, pixels: int) -> int:
     """Find the degree of lighting that the smoothest surface needs, as far as memory permits.
 
     Args:
-        reached: The smoothest surface, also after attacks and variations.
+        smoothest: The smoothest surface, also after attacks and variations.
         pixels: Number of pixels of all views of all objects.
 
     Returns:
         The needed degree, or the highest degree whose transfer operators (matrices from light
         to image) fit in memory. It is at least `DEGREE`.
     """
-    degree = max(DEGREE, reached.degree)
+    degree = max(DEGREE, smoothest.degree)
     cpu = torch.device("cpu")
     while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
         degree -= 1
     return degree
 
 
-def warn_of_cut_light(name: str, light: Tensor) -> None:
+def warn_of_low_degree(name: str, light: Tensor) -> None:
     """Warn if a named lighting was loaded with too low a degree for its irradiance.
 
     The irradiance is compared with that of the same lighting of degree 8. The
@@ -252,24 +251,26 @@ def with_needed_degree(
     Returns:
         A scene with more coefficients of the same lighting, or the given scene.
     """
-    reached = reached_gloss(scene.objects, material, layer)
+    smoothest = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree
     view_count = sum(len(cameras) for cameras in scene.cameras)
-    needed = _affordable_degree(reached, view_count * scene.settings.size**2)
+    needed = _affordable_degree(smoothest, view_count * scene.settings.size**2)
     if needed <= degree:
         return scene
+    # `lights_of_degree` loads the lighting of the scene with another degree. It is None if the
+    # user gave the degree or the coefficients.
     if scene.lights_of_degree is not None:
         # Lighting that was changed after `build_scene` cannot be loaded again with another
         # degree. Compare the lighting of the scene with what `build_scene` loaded.
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
         has_same_shape = scene.lights.shape[1:] == built.shape
         if has_same_shape and (scene.lights == built.to(scene.lights)).all():
-            reached.warn(f"degree={degree} takes less time, but", degree)
-            basis, lights = scene.lights_of_degree(needed, reached.gloss)
+            smoothest.warn(f"degree={degree} takes less time, but", degree)
+            basis, lights = scene.lights_of_degree(needed, smoothest.gloss)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
     # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
     # degree would add nothing, and no warning is needed.
     highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
     if highest_band.any():
-        reached.warn(f"degree={degree}", degree)
+        smoothest.warn(f"degree={degree}", degree)
     return scene

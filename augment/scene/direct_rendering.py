@@ -43,13 +43,13 @@ class FrozenView(NamedTuple):
     """What shadows and bounces of light add to one view of a mesh.
 
     Attributes:
-        change: Radiance that is added to each channel of each pixel, for each of
-            the K harmonic coefficients of the light, shape (3, K, size²).
+        added_transfer: Radiance that is added to each channel of each pixel, for
+            each of the K harmonic coefficients of the light, shape (3, K, size²).
         albedo_sums: Sum of the albedo of the samples of each pixel with which
-            `change` was computed, shape (3, size²).
+            `added_transfer` was computed, shape (3, size²).
     """
 
-    change: Tensor
+    added_transfer: Tensor
     albedo_sums: Tensor
 
 
@@ -100,13 +100,15 @@ class FrozenTransport:
         if not self._transport:
             return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
-        change = self._transport.change(surface, albedo.cpu().double())
-        if change is None:
+        # Added radiance for each of the K harmonic coefficients of the light, in the P pixels
+        # that the mesh covers, shape (3, K, P).
+        added_transfer = self._transport.change(surface, albedo.cpu().double())
+        if added_transfer is None:
             return
-        # `change` contains only the pixels that the mesh covers. A slightly different shape may
-        # cover others, so expand it to all pixels of the image, shape (3, K, size²).
-        all_pixels = change.new_zeros(*change.shape[:2], fragments.size**2)
-        all_pixels[..., surface.fragments.pixels] = change
+        # A slightly different shape may cover other pixels, so expand the radiance to all pixels
+        # of the image, shape (3, K, size²).
+        all_pixels = added_transfer.new_zeros(*added_transfer.shape[:2], fragments.size**2)
+        all_pixels[..., surface.fragments.pixels] = added_transfer
         self.views[camera] = FrozenView(all_pixels.to(albedo), _sum_by_pixel(fragments, albedo))
 
     def radiance(
@@ -129,11 +131,11 @@ class FrozenTransport:
         view = self.views[camera]
         if view is None:
             return light.new_zeros(3, len(fragments.pixels))
-        change = view.change[..., fragments.pixels]
+        added_transfer = view.added_transfer[..., fragments.pixels]
         old_sums = view.albedo_sums[..., fragments.pixels]
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         # Radiance with the albedo of the mesh, shape (3, P).
-        added = torch.einsum("ckp,kc->cp", change.to(light), light)
+        added = torch.einsum("ckp,kc->cp", added_transfer.to(light), light)
         # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
         # is no ratio, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)

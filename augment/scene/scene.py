@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 AT_ONCE = 2**24
 # A progress bar is shown if more views than this are rendered one by one. For fewer views, the bar
 # would make a step of an attack 4 % slower.
-UNCOUNTED_VIEWS = 8
+MAX_VIEWS_WITHOUT_PROGRESS = 8
 
 
 class Scene:
@@ -479,7 +479,7 @@ class Scene:
             One layer for each of the A · V images.
         """
         row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
-        if len(examples) * self.views > UNCOUNTED_VIEWS:
+        if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             row_and_view = progress(list(row_and_view), "rendering views")
         for image, (row, view) in enumerate(row_and_view):
             example_index = int(examples[row])

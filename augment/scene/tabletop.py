@@ -127,9 +127,11 @@ def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
     upper_part, below_horizon = _split_at_horizon(harmonics.degree)
     above = upper_part @ lights.cpu().double()
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    # Irradiance of the table, shape (E, 3). The irradiance from the lamp is the cosine of the
-    # angle between its direction and the vertical, which is the z component of the direction.
+    # Irradiance of the table from the environment, shape (E, 3). Only the harmonics with the
+    # indices `nonzero` contribute irradiance.
     from_sky = harmonics.irradiance(up)[0] @ above[:, harmonics.nonzero]
+    # The irradiance from the lamp is the cosine of the angle between its direction and the
+    # vertical, which is the z component of the direction.
     arriving = from_sky.clamp(min=0) + lamps[:, 2:].clamp(min=0)
     # Radiance of a Lambertian table, the same in all directions, shape (E, 3).
     reflected = albedo.cpu() * arriving / math.pi
@@ -237,6 +239,7 @@ def _from_lamp(room: Room, seen: _SeenPoints, normals: Tensor, lamp: Tensor) -> 
     may_be_shaded = (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius)
     # Positions of these points in (S, P): indices of samples, and indices of pixels.
     candidates = torch.nonzero(may_be_shaded, as_tuple=True)
+    # Rays start slightly above the surface, so that rounding cannot move their starts below it.
     offset = room.rays.offset * normals[point_to_surface[candidates]]
     starts = seen.points[candidates] + offset
     is_lit = room.rays.first_hit(starts, lamp.expand(len(starts), 3)) == NO_FACE
@@ -305,6 +308,7 @@ def _blocked_sky(
     for surface in (TABLE, WALL):
         # Pixels that show this surface.
         pixels = torch.nonzero(is_on_wall == surface).squeeze(1)
+        # Rays start slightly above the surface.
         starts = points[pixels] + room.rays.offset * normals[surface]
         may_hit = _passes_near_origin(starts, directions[surface].T, room.radius)
         # Each traced ray has an index of its start and an index of its direction.
@@ -439,6 +443,7 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     harmonics = Harmonics(degree)
     normals = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     irradiance = torch.zeros(2, harmonics.size, dtype=torch.float64)
+    # Only the harmonics with the indices `nonzero` contribute irradiance.
     irradiance[:, harmonics.nonzero] = harmonics.irradiance(normals)
     radiance = harmonics.radiance(directions.flatten(0, 1)).unflatten(0, (2, -1))
     return directions, radiance, irradiance
