@@ -616,7 +616,7 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         message = (
-            "the light has negative radiance, and its removal changes the irradiance by "
+            "the light has negative radiance, and after its removal the irradiance is off by "
             f"{error:.0%} (rms) in {harmonics}: give a higher degree, "
             "or set allow_negative=True to keep the light as it is"
         )
@@ -728,8 +728,8 @@ def target_labels(
     if len(names) != view_count:
         raise InputError(
             f"target={names} names "
-            f"{len(names)} classes for {view_count} views that share what is attacked: "
-            "give one class per view, and shared=True",
+            f"{len(names)} classes for {view_count} views of each example: "
+            "give one class for each view, and build the scene with shared=True",
         )
     indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
     labels = torch.tensor(indices, device=logits.device).expand(len(logits), view_count)

@@ -404,7 +404,7 @@ class Successes:
 
     @property
     def unsuccessful(self) -> Tensor:
-        """Return the indices of the examples without a success with sensor noise, shape (A,)."""
+        """Return the indices of the examples without a success with sensor noise."""
         return torch.nonzero(~self.with_noise).squeeze(1)
 
     def add(
@@ -617,8 +617,8 @@ def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> d
         result: The attack.
 
     Returns:
-        Two masks of the N examples, shape (N,). Their keys are the name of the search for
-        successes with sensor noise, and this name with "_without_noise" for those without.
+        Two masks of the N examples, shape (N,). For the method "random", the key "random" has
+        the successes with sensor noise, and "random_without_noise" those without.
     """
     is_clean = result.clean_correct
     return {

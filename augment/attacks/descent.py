@@ -145,8 +145,8 @@ class DescentResult:
             computed.
         success_before: Whether the initial values reach the criterion.
         success: Whether the returned candidate reaches the criterion, without noise.
-        cost_before: Cost of the initial values (equation 1 of the paper).
-        cost: Cost of the returned candidate (equation 1 of the paper).
+        cost_before: Cost of the initial values, see `augment.losses.adversarial_cost`.
+        cost: Cost of the returned candidate.
         predicted: Class predicted for each view of the returned candidate.
         zero_gradient: Whether the gradient at the initial values is exactly
             zero. False if no gradient was computed.
@@ -225,7 +225,8 @@ class Descent:
         expectation: Average of the model output over random transformations of
             an image.
         phases: Timer of the classifier passes.
-        seed: Seed of the sensor noise with which `noise_margin` is checked.
+        seed: Seed of the sensor noise that successes must survive, and of the
+            random numbers of searches without gradients.
     """
 
     model: nn.Module
@@ -566,8 +567,9 @@ class Score:
     """Cost, logit gap and predicted classes of N examples, or of N single images.
 
     Attributes:
-        cost: Cost that the attack lowers (equation 1 of the paper), shape (N,).
-            For an example, it is the sum over its views.
+        cost: Cost that the attack lowers, shape (N,), see
+            `augment.losses.adversarial_cost`. For an example, it is the sum over
+            its views.
         gap: Logit gap, shape (N,). It tells by how much the criterion is reached,
             and is negative if the criterion is not reached. For an example, it is
             the smallest gap of its views.

@@ -143,7 +143,7 @@ class AttackProblem:
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls.
 
-        The values of each parameter are projected by themselves.
+        The values of each parameter are projected separately.
 
         Args:
             values: D attack values of each of A examples, shape (A, D).

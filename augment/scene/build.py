@@ -137,10 +137,10 @@ def build_scene(
     degree = None
     if is_named:
         material = attack.material if attack else None
-        reached = reached_gloss(objects, material, vary.gloss if vary else None)
+        smoothest = reached_gloss(objects, material, vary.gloss if vary else None)
         pixels = views * len(objects) * size**2
-        degree = degree_of_scene(reached, scene_settings.degree, pixels)
-        environment = load_light(environment, degree, reached.gloss)
+        degree = degree_of_scene(smoothest, scene_settings.degree, pixels)
+        environment = load_light(environment, degree, smoothest.gloss_roughness)
         warn_of_low_degree(str(scene_settings.light), environment)
     else:
         environment = as_tensor("light", environment)
@@ -197,13 +197,16 @@ def _as_meshes(meshes: object) -> list[Any]:
     expected = "a list of pairs such as ('solid:orange', 'orange'), or of nb.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
-        raise InputError(f"meshes is empty: give {expected}")
+        raise InputError("meshes is empty: give pairs such as ('solid:orange', 'orange')")
     for index, member in enumerate(members):
         if isinstance(member, ObjectSettings):
             require_kind(f"meshes[{index}].label", member.label, str, LABEL)
             continue
         if len(member) != 2:
-            raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
+            raise InputError(
+                f"meshes[{index}] is {describe(member)}: give a pair of a mesh and a label, "
+                "such as ('solid:orange', 'orange')"
+            )
         mesh, label = member
         if not isinstance(mesh, str | Path):
             require_mesh(f"meshes[{index}]", mesh)
@@ -254,7 +257,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     expected = "a list of cameras, such as list(nb.load_cameras(path).values())"
     given = as_list("cameras", cameras, Camera, expected)
     if not given:
-        raise InputError(f"cameras is empty: give {expected}")
+        raise InputError("cameras is empty: give one camera for each view, or leave it out")
     if views not in (1, len(given)):
         raise InputError(f"views={views} does not fit {len(given)} cameras: leave views out")
     fixed = [camera.fixed() for camera in given]
@@ -340,10 +343,10 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
         >>> load_backgrounds([0.2, 0.8], 16).shape
         torch.Size([2, 1, 16, 16])
     """
-    expected = "gray values in [0, 1] or image files"
-    choices = as_list("backgrounds", choices, object, f"a list of {expected}")
+    expected = "a list of gray values in [0, 1] or image files"
+    choices = as_list("backgrounds", choices, object, expected)
     if not choices:
-        raise InputError(f"backgrounds is empty: give {expected}")
+        raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])

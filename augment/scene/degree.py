@@ -58,7 +58,7 @@ class Smoothest(NamedTuple):
     verb: str = "has"
 
     @property
-    def gloss(self) -> float | None:
+    def gloss_roughness(self) -> float | None:
         """Return the roughness, or None if no surface has gloss."""
         return self.roughness if self.roughness < MATTE else None
 
@@ -262,11 +262,11 @@ def with_needed_degree(
     if scene.lights_of_degree is not None:
         # Lighting that was changed after `build_scene` cannot be loaded again with another
         # degree. Compare the lighting of the scene with what `build_scene` loaded.
-        _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
+        _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss_roughness)
         has_same_shape = scene.lights.shape[1:] == built.shape
         if has_same_shape and (scene.lights == built.to(scene.lights)).all():
             smoothest.warn(f"degree={degree} takes less time, but", degree)
-            basis, lights = scene.lights_of_degree(needed, smoothest.gloss)
+            basis, lights = scene.lights_of_degree(needed, smoothest.gloss_roughness)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
     # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
     # degree would add nothing, and no warning is needed.

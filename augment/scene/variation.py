@@ -326,7 +326,8 @@ class _DrawnLights:
         Directional lights are white, and a surface that faces them has irradiance 1.
 
         Returns:
-            RGB coefficients in the basis of the scene, shape (E, K + L, 3).
+            RGB coefficients in the basis of the scene: K for the environment, then L for
+            projector and lamps, shape (E, K + L, 3).
         """
         environment = self.environment
         is_directional = self.directions.any(1)

@@ -301,7 +301,7 @@ def test_a_light_that_a_low_degree_hardly_cuts_off_is_not_told(sun_map):
 
 def test_a_degree_whose_operators_no_memory_holds_is_lowered_and_the_error_is_told():
     """Operators of 10⁹ pixels take 392 GB at degree 6, so that no higher degree is chosen."""
-    with pytest.warns(UserWarning, match="degree=6, the highest that fits in memory.* off by [0-9]+%"):
+    with pytest.warns(UserWarning, match="degree=6, the highest that fits.* off by [0-9]+%"):
         assert degree_of_scene(Smoothest(0.2, "ball"), None, 10**9) == 6
 
 
