@@ -119,7 +119,7 @@ def run_audit(
     if not settings.meshes:
         return _audit_photographs(settings, networks, is_named)
     # Caveats are sentences at the beginning of the report.
-    caveats = _compare_sizes(networks.values())
+    caveats = _size_caveats(networks.values())
     if not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     settings = complete(settings, networks[CLASSIFIER])
@@ -135,11 +135,11 @@ def run_audit(
                 plan.image_folders = {page.LABORATORY: renders} | plan.image_folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
-    caveats += _missing_gradients(networks.values())
+    caveats += _gradient_caveats(networks.values())
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
-        _begin(settings, out, renders)
+        _prepare_folder(settings, out, renders)
         plan.find_views(out / CLASSIFIER)
         if plan.image_folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
@@ -178,14 +178,14 @@ def _audit_photographs(
     find_unlabeled(published(Path(str(settings.photographs))))
     out = writable_folder(settings.out, "out")
     _require_continuable(out, settings.overwrite, is_named)
-    caveats = _compare_sizes(networks.values())
+    caveats = _size_caveats(networks.values())
     for network in networks.values():
         if not network.has_gradients:
             caveats.append(f"{network.name} has no gradients: only random search attacks it.")
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
-        _begin(settings, out, out / "renders")
+        _prepare_folder(settings, out, out / "renders")
         for key, network in networks.items():
             (out / key).mkdir(exist_ok=True)
             _measure_photographs(network.to(device), settings, out / key)
@@ -407,10 +407,11 @@ def _require_classes(
                 find_photographs(folder, network.classes, label)
 
 
-def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
+def _size_caveats(networks: Collection[Classifier]) -> list[str]:
     """Return a sentence for the report if the networks take images of different sizes.
 
-    The list is empty if they take images of the same size.
+    Returns:
+        List with the sentence. Empty if all networks take the same size.
     """
     sizes = [str(network.size) for network in networks]
     if len(set(sizes)) == 1:
@@ -419,7 +420,7 @@ def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
     return [f"The networks take images of {listed} pixels, and differ by that, too."]
 
 
-def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
+def _gradient_caveats(networks: Collection[Classifier]) -> list[str]:
     """Return a sentence for the report about each network that has no gradients."""
     return [
         f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
@@ -429,7 +430,7 @@ def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
     ]
 
 
-def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
+def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
     """Prepare the folder of an audit, and write the settings to its file config.yaml.
 
     With `settings.overwrite`, the results of an earlier audit are removed.

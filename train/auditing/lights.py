@@ -47,8 +47,8 @@ from train.auditing.frames import SIDE, frames_of
 BATCH = 16
 # Name of the environment lighting in which the views are rendered before an attack.
 LIGHT = "grace"
-# A random light is LIGHT with Gaussian noise in each spherical-harmonics coefficient.
-# The standard deviation is the same as in the paper's training with random lighting.
+# A random light is LIGHT plus a uniform random number in [-0.5, 0.5] in each
+# spherical-harmonics coefficient, as in the paper's training with random lighting.
 AMPLITUDE = 0.5
 # The names of random lights are "random 1", "random 2" and so on.
 RANDOM = "random "
@@ -192,7 +192,9 @@ def recognize_in_environments(
         For the name of each light, whether each view is classified correctly.
     """
     noise = generator(views.seed, "lights")
-    random_lights = perturb(load_light(LIGHT), random_light_count, AMPLITUDE, None, noise)
+    random_lights = perturb(
+        load_light(LIGHT), random_light_count, AMPLITUDE, radius=None, generator=noise
+    )
     lights = {Path(name).stem: load_light(name) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
@@ -201,6 +203,7 @@ def recognize_in_environments(
     recognized_by_light = {}
     for name, light in progress(lights.items(), "renders in other light"):
         exposed = views.exposure * light.to(scene.lights)
+        # All examples have the same light.
         conditions = Conditions(exposed.expand(len(scene), -1, -1))
         with torch.no_grad():
             images = scene.render(conditions, examples)

@@ -65,6 +65,7 @@ def fit(settings: FitSettings) -> None:
         bounces=settings.bounces,
     )
     out.mkdir(parents=True, exist_ok=True)
+    # The window is the square of the photograph that the found camera shows.
     background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
     write_values(out / "background.png", encode(background, settings.encoding))
     coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)

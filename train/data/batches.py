@@ -229,7 +229,8 @@ def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Tensor:
         epoch: Number of epochs before this epoch.
 
     Returns:
-        Whether each image is flipped, bool, shape (N,) for N images and renders.
+        Whether each image is flipped, bool, shape (N + R,) for N images of the
+        data set and R renders.
     """
     count = len(images.rows) + len(images.renders)
     draws = generator(seed, "flips")

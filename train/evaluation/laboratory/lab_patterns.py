@@ -85,7 +85,8 @@ def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
     """
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
-    return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
+    bright_fraction = rng.uniform(0.3, 0.7)
+    return patterns.stripes(scaled, shift, bright_fraction).double()[None]
 
 
 def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
@@ -117,7 +118,9 @@ def _half(points: Tensor, rng: np.random.Generator) -> Tensor:
         Weight of the first of two colors of light at each pixel, shape
         (1, H, W): 1 on the lit side, 0 on the other side.
     """
-    return patterns.half(points, 0.5 + rng.uniform(-0.12, 0.12)).double()[None]
+    line_x = rng.uniform(-0.12, 0.12)
+    # `half` lights the points to the right of the line x = shift - 0.5.
+    return patterns.half(points, shift=0.5 + line_x).double()[None]
 
 
 def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
@@ -136,7 +139,8 @@ def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
     count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
     for center in torch.from_numpy(rng.uniform(-1, 1, (count, 2))):
-        is_lit |= (points - center[:, None, None]).square().sum(0) < radius**2
+        squared_distance = (points - center[:, None, None]).square().sum(dim=0)
+        is_lit |= squared_distance < radius**2
     return is_lit.double()[None]
 
 
@@ -156,7 +160,8 @@ def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
     scaled = radius / rng.uniform(0.12, 0.4)
     shift = rng.uniform()
-    return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
+    bright_fraction = rng.uniform(0.3, 0.7)
+    return patterns.stripes(scaled, shift, bright_fraction).double()[None]
 
 
 def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
@@ -247,7 +252,9 @@ def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
         Weight of the first of two colors of light for each color channel and
         pixel, shape (3, H, W), in [0, 1].
     """
-    grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
+    row_count = rng.integers(3, 6)
+    column_count = rng.integers(3, 6)
+    grid = rng.uniform(0, 1, (row_count, column_count, 3))
     return _sample(grid, points, order=3).clamp(0, 1)
 
 
