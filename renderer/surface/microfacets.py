@@ -106,7 +106,8 @@ def fresnel(cosine: Tensor) -> Tensor:
     SCHLICK is 1 - (1 - cosine)⁵ and EDGE is (1 - cosine)⁵. DIELECTRIC is equation
     22 of Walter et al. (2007), for unpolarized light and the refractive index
     REFRACTIVE_INDEX. In this equation, the perpendicular and the parallel
-    polarization have the common factor (g - c)² / (g + c)², with the cosine c.
+    polarization have the common factor (g - c)² / (g + c)², with the cosine c and
+    g² = REFRACTIVE_INDEX² - 1 + c².
 
     Args:
         cosine: Cosine v·h of the angle of incidence, in [0, 1], shape (...).
