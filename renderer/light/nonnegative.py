@@ -391,9 +391,9 @@ class _QuadraticProgram:
         self._min_t = min(radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
         self.nearest = self._unconstrained_point().clip(low, high)
-        # For each channel, the harmonics in the M directions in which the constraint of
-        # the radiance is active (its multiplier is positive), shape (M, K). At first,
-        # there are no directions.
+        # This list has one array for each channel, shape (M, K). The array has the harmonics
+        # in the M directions in which the constraint of the radiance is active (its
+        # multiplier is positive). At first, there are no directions.
         self._active_constraints = [original[:0]] * len(original)
 
     def _unconstrained_point(self) -> Array:
@@ -609,8 +609,8 @@ def _find_negative_minima(
     radiance = lights @ grid.harmonics
     largest = np.abs(radiance).max(1)
     light_index, grid_index = _choose_starts(radiance, largest, rounding_radiance, grid, limits)
-    # For each start direction, the SH coefficients of the 3 first and the 9 second
-    # derivatives of its light. Axes: start, derivative, coefficient.
+    # SH coefficients of the 3 first and the 9 second derivatives of the light of each start
+    # direction. Axes: start, derivative, coefficient.
     derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
     directions = grid.directions[grid_index]
     for _ in range(_NEWTON_STEPS):

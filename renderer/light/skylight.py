@@ -38,10 +38,10 @@ ZENITH = (0.0, 90.0)
 _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
 # Order m of each coefficient, shape (49,).
 _ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])
-# For each coefficient of degree l and order m, the index of the coefficient of order -m.
+# Index of the coefficient of order -m, for each coefficient of order m.
 _OPPOSITE_ORDER = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
-# For each SH coefficient, the index of its polynomial in the fitted sky. The orders m and
-# -m have the same polynomial.
+# Index of the polynomial of each SH coefficient in the fitted sky. The orders m and -m have
+# the same polynomial.
 _ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
 
 

@@ -126,7 +126,8 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
         return interpolate_texture(textures[0], sample_uvs)
     sample_to_seen_face = fragments.sample_to_seen_face
     texture_of_sample = texture_of_face.index_select(0, sample_to_seen_face)
-    # For each texture, the samples that show it, and the values of the texture there.
+    # The two lists get the samples that show each texture, and the values of the texture
+    # at these samples.
     samples_by_texture = []
     values_by_texture = []
     for texture_id, texture in enumerate(textures):

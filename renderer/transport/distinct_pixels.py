@@ -114,7 +114,7 @@ def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels
     filling_groups = indices_of_true(groups.sample_count == fragments.samples**2)
     filled_pixels = groups.group_to_pixel.index_select(0, filling_groups)
     filling_face = groups.group_to_seen_face.index_select(0, filling_groups)
-    # For each seen face, the first of the pixels that it fills.
+    # Index of the first pixel that each seen face fills.
     face_to_first_pixel = filling_face.new_full((len(fragments.faces),), pixel_count)
     face_to_first_pixel.scatter_reduce_(0, filling_face, filled_pixels, "amin")
     first_pixels = face_to_first_pixel.index_select(0, filling_face)

@@ -59,7 +59,7 @@ class SparseTransfer(NamedTuple):
             - the indices of these functions, ascending, shape (L,).
         """
         functions, row_of_entry = self.function.unique(return_inverse=True)
-        # For each channel, all rows of the matrix after each other.
+        # One row for each channel, which has all rows of the matrix after each other.
         zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
         flat_position = row_of_entry * pixel_count + self.pixel
         flat_matrix = zeros.index_copy_(1, flat_position, self.weight.T)
@@ -311,7 +311,7 @@ class LocalLightView:
         self._points = self._surface.points
         self._normals = self._surface.normals
         self._planes = self._surface.planes
-        # For each light that stays in place, the paths that no face blocks.
+        # Unblocked paths of each light that stays in place.
         self._fixed_paths: dict[LocalBasis, LightPaths] = {}
 
     def radiance(

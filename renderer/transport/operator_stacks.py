@@ -265,7 +265,7 @@ class TransferOperators(Sequence[TransferOperator]):
         covered_values = []
         for stack in self._stacks:
             operator_count = len(stack.shown)
-            # For each image, the operator of the stack that it shows: 0, 0, ..., 1, 1, ...
+            # Index of the operator that each image shows: 0, 0, ..., 1, 1, ...
             operator_of_image = torch.arange(operator_count).repeat_interleave(lights_per_view)
             rows = slice(first_image, first_image + len(operator_of_image))
             first_image = rows.stop

@@ -744,7 +744,7 @@ def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
         Radiance, shape (..., B, 3, P).
     """
     if transfer.shape[-3] == COLORS:
-        # For each color, multiply the matrices (B, K) and (K, P).
+        # Multiply a matrix (B, K) and a matrix (K, P) for each color.
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     shared, *white = transfer.unbind(-3)
     # One row for each pair of a light and a color, so that one matrix product computes all.

@@ -290,7 +290,7 @@ class Rays:
             return torch.arange(len(fragments.pixels))
         # The normals are processed in blocks to limit the memory.
         blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
-        # For each seen face, the largest coordinate of a hull vertex along its normal.
+        # Largest coordinate of a hull vertex along the normal of each seen face.
         highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
         first_corner = surface.vertices[fragments.corners[:, 0]]
         height_of_face = (plane_normals * first_corner).sum(1)

@@ -416,7 +416,7 @@ class _Interpolation(torch.autograd.Function):
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
         # `value` is a view of some columns of `values`. Writing to it fills `values`.
         for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
-            # For each sample of the block, the column of the face that the sample shows.
+            # One column for each sample: the column of the face that the sample shows.
             at_corners = corner_rows.gather(1, seen_face.expand(len(corner_rows), -1))
             # Axes: corner, value, sample.
             at_corners = at_corners.unflatten(0, (3, -1))

@@ -123,7 +123,7 @@ def moving_outlines(
     sample_indices = torch.arange(
         len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device
     )
-    # For each sample of the image, its index among the covered samples, or NOT_COVERED.
+    # Index of each sample of the image among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
     crossings_on_cpu = _find_crossings(
         fragments.to("cpu"),
@@ -368,7 +368,8 @@ class _MovingView:
         along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
         # Gradient with respect to the position (x, y) of each crossing in the image.
         crossing_gradients = (self._crossing_gradients(upstream) * along * crossings.normal).T
-        # How far a crossing moves if the first, or the second, end of its edge moves by 1.
+        # Distances by which a crossing moves if the first, or the second, end of its edge
+        # moves by 1.
         end_weights = (1 - crossings.fraction, crossings.fraction)
         gradients = []
         for end_vertices, end_weight in zip(crossings.ends, end_weights, strict=True):
@@ -394,7 +395,7 @@ class _MovingView:
         # Two rows: pixels of the first samples, and pixels of the second samples.
         pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
         device = pixels_at_crossings.device
-        # For each pixel of the image, its column in `upstream`, or -1.
+        # Column of each pixel of the image in `upstream`, or -1.
         column_of_pixel = torch.full((self.fragments.size**2,), -1, device=device)
         upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
         column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
@@ -744,8 +745,8 @@ def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
     orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    # For each face and each of its three edges: 1 if the face lies on one side of the edge,
-    # and -1 if it lies on the other side. An edge leads to its higher vertex index.
+    # One number for each face and each of its three edges: 1 if the face lies on one side of
+    # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
     side_of_face = (orientation * edges.direction).ravel()
     side_sums = np.bincount(edges.edge_of_face_side, side_of_face, len(edges.face_count))
     # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
