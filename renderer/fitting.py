@@ -56,8 +56,8 @@ FIRST_WIDTH = 2.0
 # Width and height in pixels of the small images in which cameras are
 # searched. The best cameras are then refined in images of the full size.
 COARSE_SIZE = 32
-# Number of first cameras with the smallest errors that the search
-# refines, and also the largest number of cameras that the search returns.
+# Of the first cameras of a search, only this many are refined: those whose
+# images differ least from the photograph. The search returns at most as many.
 KEPT_CAMERAS = 3
 # Largest number of steps when one camera
 # is refined with the Gauss-Newton method.
@@ -99,11 +99,10 @@ MAX_NNLS_ITERATIONS = 100
 # The radiance of a light is first constrained in every 16th direction of the
 # grid. Directions in which the radiance is negative are added afterwards.
 FIRST_DIRECTION_STEP = 16
-# Number of subdivisions of the icosphere whose vertices are the directions in
-# which the radiance of a light is constrained, while a camera is searched.
+# The search for a camera prevents negative radiance of its lights in the
+# directions of the vertices of an icosphere with this number of subdivisions.
 SEARCH_GRID = 2
-# Number of subdivisions of the icosphere whose vertices are the
-# directions in which the radiance of the returned light is constrained.
+# The same number for the light that is returned.
 FINAL_GRID = 5
 # The object covers a pixel completely if its share of the pixel
 # is larger than this. A limit of 0.99 would be too low: a white

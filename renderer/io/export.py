@@ -240,6 +240,7 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     tree["meshes"] = [{"primitives": primitives}]
     tree["nodes"] = [{"mesh": 0}]
     for material in tree["materials"]:
+        # trimesh writes no extensions, so the name of a material ends with its factor.
         _, found, specular_factor = material["name"].partition(f", {SPECULAR} ")
         if found:
             material["extensions"] = {"KHR_materials_specular": {SPECULAR: float(specular_factor)}}
