@@ -56,8 +56,8 @@ FIRST_WIDTH = 2.0
 # Width and height in pixels of the small images in which cameras are
 # searched. The best cameras are then refined in images of the full size.
 COARSE_SIZE = 32
-# Of the first cameras of a search, only this many are refined: those whose
-# images differ least from the photograph. The search returns at most as many.
+# The search refines this many of its first cameras: those whose images
+# differ least from the photograph. It returns at most as many.
 KEPT_CAMERAS = 3
 # Largest number of steps when one camera
 # is refined with the Gauss-Newton method.

@@ -563,8 +563,8 @@ def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # Each quadrilateral becomes the triangles a, b, c and a, c, d.
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     ring_of_face = np.repeat(np.arange(ring_count - 1), 2 * point_count)
-    # Half of the triangles at the first and
-    # at the last ring have two equal corners.
+    # Two corners are equal in half of the
+    # triangles at the first and at the last ring.
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])
     return vertices, faces[has_area], ring_of_face[has_area]
 

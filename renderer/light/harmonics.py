@@ -313,7 +313,7 @@ def homogeneous_gradients(degree: int) -> Tensor:
     """
     gradients = gradient_matrices(degree)
     band_of_column = bands(degree)
-    # On the unit sphere, the sum over band l - 1 in x_d Y_k is ∂(r^l Y_k)/∂x_d / (2l + 1).
+    # The sum over band l - 1 in x_d Y_k is ∂(r^l Y_k)/∂x_d / (2l + 1) on the unit sphere.
     to_lower_band = gradients / (2 * band_of_column + 1)
     # Multiplying by x_d is symmetric, so the sum over band l + 1 has the transposed matrix.
     times_coordinate = to_lower_band + to_lower_band.mT

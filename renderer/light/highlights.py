@@ -23,8 +23,8 @@ from renderer.light.window import best_window
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.surface.microfacets import SCHLICK, reflectance
 
-# By default, `required_degree` leaves out the degrees of a light whose amplitude in a
-# highlight is at most this fraction of the amplitude of degree 0.
+# `required_degree` leaves out the degrees of a light whose amplitude in a highlight
+# is at most this fraction of the amplitude of degree 0, by default.
 AMPLITUDE = 0.1
 # Highlights at grazing angles are narrower than highlights along the normal.
 # `window_without_ringing` therefore also tests a highlight whose width α = roughness² is

@@ -216,7 +216,7 @@ class Lamps(LocalBasis):
         in_plane = in_plane.to(positions)
         # Unit vector from the origin to each disc, which is the axis of the disc.
         x, y, z = F.normalize(positions, dim=1).unbind(1)
-        # With the sign -1, `tangent_axes` is not singular for discs below the origin.
+        # `tangent_axes` would be singular for some discs below the origin without this sign.
         sign = torch.where(z < -0.5, -1.0, 1.0).to(z)
         plane_axes = [torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)]
         # Axes: set s, point p, plane coordinate a, lamp l, world coordinate w.

@@ -65,8 +65,8 @@ from renderer.vectors import tangent_axes
 
 Array = NDArray[Any]
 
-# In every direction, the radiance of a result of `project_nonnegative` or
-# `nearest_nonnegative` is at least minus this fraction of its largest radiance.
+# The radiance of a result of `project_nonnegative` or `nearest_nonnegative` is
+# at least minus this fraction of its largest radiance in every direction.
 TOLERANCE = 1e-4
 
 # `_find_negative_minima` ignores a minimum that is less negative than minus this fraction
@@ -121,9 +121,9 @@ class _StartLimits:
     above_neighbors: float
 
 
-# With these limits, which `nearest_nonnegative` uses, few negative minima are missed.
+# `nearest_nonnegative` uses these limits, with which few negative minima are missed.
 _MANY_STARTS = _StartLimits(above_zero=0.04, above_neighbors=1e-3)
-# With these limits, which `project_nonnegative` uses, a search only starts from grid
+# `project_nonnegative` uses these limits, with which a search only starts from grid
 # directions that are at most as bright as all their neighbors. The search is faster, and
 # the next round of the exchange method finds the minima that it misses.
 _LOWEST_STARTS = _StartLimits(above_zero=0.04, above_neighbors=0.0)
@@ -579,7 +579,7 @@ def _least_distance(
     residual = dual_matrix @ multipliers
     residual[size] -= 1
     if residual[size] > -(_MIN_DEPTH**2):
-        # Up to rounding, only one point satisfies the constraints.
+        # Only one point satisfies the constraints, up to rounding.
         return original.clip(low, high), harmonics
     nearest = original - residual[:size] / residual[size] * norm
     is_active = multipliers[: len(harmonics)] > 0

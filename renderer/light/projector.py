@@ -170,6 +170,6 @@ class Projector(LocalBasis):
         texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
-        # In contrast to lamps, no factor π is needed: Mitsuba's projector has it already.
+        # Mitsuba's projector has the factor π already, in contrast to its lamps.
         scale = albedo_scale * self.distance**2
         return [projector(pose_of(camera), self.fov, pattern, scale)]

@@ -31,8 +31,8 @@ from torch import Tensor
 
 from renderer.light.harmonics import bands, cache_tensors, lambertian_factors
 
-# In each round, `best_window` finds the angles at which its lobe is negative and constrains
-# the lobe there. This is the largest number of rounds. Eight are usual.
+# Largest number of rounds of `best_window`. Each round finds the angles at which the
+# lobe is negative, and constrains the lobe there. Eight rounds are usual.
 _MAX_ROUNDS = 100
 # `best_window` stops if the lobe that it makes non-negative is nowhere below minus this
 # fraction of its largest value.

@@ -41,7 +41,7 @@ from renderer.vectors import unit
 # of the amplitude with which it reflects degree 0.
 MIN_AMPLITUDE = 1e-3
 
-# For lights up to this degree, `lobe_functions` uses one common table of this degree.
+# `lobe_functions` uses one common table of this degree for all lights up to this degree.
 COMMON_DEGREE = 6
 # `_table` computes the lobe functions at this number of values of the roughness, and
 # interpolates them with the same number of Chebyshev polynomials in the roughness.
@@ -241,7 +241,7 @@ class ViewAxis(NamedTuple):
         """
         x, y, z = direction
         polar = Angle(sine=torch.hypot(x, y), cosine=z)
-        # At the poles, x / sin(polar) would divide by 0, but atan2 returns 0.
+        # x / sin(polar) would divide by 0 at the poles, but atan2 returns 0.
         azimuth = torch.atan2(y, x)
         return ViewAxis(polar, Angle(sine=azimuth.sin(), cosine=azimuth.cos()))
 
@@ -499,7 +499,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     sines = sines_and_cosines[:degree]
     # Rows with sin(ma) for m from -degree to degree.
     signed_sines = torch.cat([-sines, 0 * sines_and_cosines[:1], sines.flip(0)])
-    # In a band, the harmonic of order -m is 2 m rows before the harmonic of order m.
+    # The harmonic of order -m is 2 m rows before the harmonic of order m in its band.
     opposite_harmonic = torch.arange(len(order), device=coefficients.device) - 2 * order
     cosine_terms = coefficients * sines_and_cosines.index_select(0, degree + order.abs())
     opposite_coefficients = coefficients.index_select(0, opposite_harmonic)

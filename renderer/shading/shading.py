@@ -99,7 +99,7 @@ def radiance(
         weights = albedo / fragments.samples**2
         incoming = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
     reflected = incoming * weights.T
-    # With one sample per pixel, each column of `reflected` is a pixel already.
+    # Each column of `reflected` is a pixel already if a pixel has one sample.
     if fragments.samples > 1:
         zeros = reflected.new_zeros(COLORS, len(fragments.pixels))
         reflected = zeros.index_add(1, pixel, reflected)

@@ -116,7 +116,7 @@ def fresnel(cosine: Tensor) -> Tensor:
         Reflected fractions for SCHLICK, EDGE and DIELECTRIC, in [0, 1],
         shape (3, ...).
     """
-    # By Snell's law, this is REFRACTIVE_INDEX times the cosine of the refracted ray.
+    # This is REFRACTIVE_INDEX times the cosine of the refracted ray (Snell's law).
     refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()
     # Reflected fraction of the amplitude of light that is polarized perpendicular to the
     # plane of incidence.

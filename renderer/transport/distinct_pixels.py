@@ -71,8 +71,8 @@ class DistinctPixels:
         distinct = self.distinct.expand(*batch_shape, -1)
         copies = self.copies.expand(*batch_shape, -1)
         copy_to_distinct = self.copy_to_distinct.expand(*batch_shape, -1)
-        # On a CPU, `scatter_` and `gather` take half the time of `index_copy_` and
-        # `index_select`.
+        # `scatter_` and `gather` take half the time of `index_copy_` and `index_select` on
+        # a CPU.
         canvas.scatter_(-1, distinct, values)
         return canvas.scatter_(-1, copies, values.gather(-1, copy_to_distinct))
 

@@ -334,7 +334,7 @@ class ScatterLayers(torch.autograd.Function):
         """
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, layers, strict=True):
-            # On a CPU, `scatter_` takes half the time of `index_copy_`.
+            # `scatter_` takes half the time of `index_copy_` on a CPU.
             images = canvas[rows].scatter_(2, pixels.expand(values.shape), values)
             if isinstance(rows, Tensor):
                 # Indices give a copy of the images, not a view. Write the copy back.

@@ -301,7 +301,7 @@ class TransferOperator:
         if self._distinct_in_image is not None:
             self._distinct_in_image.write(encoded, images)
         else:
-            # On a CPU, `scatter_` takes half the time of `index_copy_`.
+            # `scatter_` takes half the time of `index_copy_` on a CPU.
             images.scatter_(-1, pixel_index, encoded)
         return images.view(image_shape), is_unclamped, clamped_values
 
@@ -1125,7 +1125,7 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     # Each pixel gets the albedo of one of its samples. The comparison below shows whether
     # its other samples have the same albedo.
     pixel_albedo = zeros.index_copy(1, fragments.sample_to_pixel, sample_albedo)
-    # In float64, `gather` takes a third of the time of `index_select`.
+    # `gather` takes a third of the time of `index_select` in float64.
     sample_to_pixel = fragments.sample_to_pixel.expand(COLORS, -1)
     difference = (sample_albedo - pixel_albedo.gather(1, sample_to_pixel)).abs_()
     is_equal = difference <= torch.finfo(dtype).eps * sample_albedo

@@ -47,7 +47,7 @@ from renderer.visibility.fragments import Fragments
 
 # Number of ray directions from each patch. They cover the whole sphere.
 PATCH_DIRECTIONS = 2**9
-# For light that bounces, the surface of a mesh is divided into about this many patches.
+# Approximate number of patches of the surface of a mesh, between which light bounces.
 PATCHES = 2**11
 # Image positions (x, y) of the corners of a triangle around the image center. In the
 # artificial view `Patches.view`, each piece of the mesh covers this triangle. A sample at

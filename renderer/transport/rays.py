@@ -38,11 +38,11 @@ DIRECTIONS = 512
 # coordinate. Otherwise, a ray could hit the surface on which it starts, because Embree
 # computes in float32.
 OFFSET = 1e-5
-# To find the pixels that need rays, faces are compared with vertices. This is the largest
+# Faces are compared with vertices to find the pixels that need rays. This is the largest
 # number of comparisons, which takes about a second. With more, all pixels cast rays.
 MAX_COMPARISONS = 2**30
-# With smooth shading, the plane of a face may block light that would reach the interpolated
-# normal. This is ignored if at most this fraction of uniform environment light is blocked.
+# The plane of a face may block light that would reach an interpolated normal (smooth
+# shading). This is ignored if at most this fraction of uniform environment light is blocked.
 MAX_IGNORED_LIGHT = 1 / 1024
 # Number of pairs of a pixel and a ray direction that `Rays.hits` processes at
 # once. It limits the memory.
@@ -223,7 +223,7 @@ class Rays:
             origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
             hit_face = self.first_hit(origins, directions[cast_direction])
             face_of_ray = torch.full_like(sample_of_ray, NO_FACE).index_put_(cast, hit_face)
-            # In directions below the plane of the face (height < 0), no sky is visible.
+            # The sky is not visible in directions below the plane of the face (height < 0).
             is_sky = (face_of_ray == NO_FACE) & (height >= 0)
             weight = (cosine * samples_in_pixel * solid_angle).masked_fill(is_sky, 0)
             yield RayHits(

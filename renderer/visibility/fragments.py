@@ -336,7 +336,7 @@ class Fragments:
               with respect to `albedo`.
         """
         if self.samples == 1 or len(self.sample_to_pixel) == 0:
-            # With one sample per pixel, each sample is a group of its own.
+            # Each sample is a group of its own if a pixel has one sample.
             return self.sample_to_pixel, self.sample_to_seen_face, albedo
         groups = self.groups
         samples_per_group = groups.sample_count.cpu().numpy()
@@ -635,7 +635,7 @@ def _group_by_pixel(covered_samples: np.ndarray, size: int, samples: int) -> _Co
         Pixels of the samples.
     """
     if samples == 1:
-        # With one sample per pixel, sample numbers and pixel indices are the same.
+        # Sample numbers and pixel indices are the same if a pixel has one sample.
         return _CoveredSamples(
             pixels=covered_samples,
             sample_count=np.ones(len(covered_samples), dtype=np.int64),

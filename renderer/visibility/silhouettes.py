@@ -498,7 +498,7 @@ def _find_crossings(
     end = places[:, ends[1]]
     # An edge (a, b) in axes with y down has the normal (b, a) in axes with y up.
     normal = np.stack([end[1] - start[1], end[0] - start[0]])
-    # For edges without length, divide by a small number instead of 0.
+    # Edges without length divide by a small number instead of 0.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
     silhouettes = _Silhouettes(fragments, places, nearness, sample_grid, ends, normal)
     in_rows = silhouettes.crossings_along(X)
@@ -570,7 +570,7 @@ class _Silhouettes:
         # the same for all cuts between the same two samples.
         distance = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         visible = np.flatnonzero(is_visible)
-        # Of all cuts between the same two samples, only the nearest one is kept.
+        # The nearest of all cuts between the same two samples is kept.
         kept = visible[_smallest_in_groups(distance[visible], after[visible])]
         return (
             self.ends[:, edge[kept]],
