@@ -386,8 +386,8 @@ class TrainSettings(Settings):
                 )
         if self.relight_steps and not self.consistency_weight:
             raise InputError(
-                f"relight_steps={self.relight_steps} attacks the predictions of the network "
-                "init_from, which needs a consistency loss: set consistency_weight",
+                f"relight_steps={self.relight_steps} attacks the images of the consistency loss, "
+                "whose weight is 0: set consistency_weight",
                 "relight_steps",
             )
 
@@ -564,8 +564,8 @@ class ExperimentSettings(NetworkSettings):
         """Check all values, and compute the number of renders."""
         super().__post_init__()
         if self.label is None:
-            # The label follows from the meshes and the classes of the network.
-            # `with_classes_of_meshes` then creates these settings again.
+            # The classes of the meshes will become the label when the classes of the network
+            # are known. `with_classes_of_meshes` then creates these settings again.
             return
         self._remove_generated_positives()
         if self.augment.renders and self.augment.mode != "folder":
@@ -742,12 +742,17 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
     """
     is_one_name = isinstance(label, str) or is_whole(label)
     listed = [label] if is_one_name else label
-    expected = "the name of a class, or several"
     if not isinstance(listed, Sequence):
-        raise InputError(f"label is {describe(label)}: give {expected}", "label")
+        raise InputError(
+            f"label is {describe(label)}: give the name of a class, or a list of names",
+            "label",
+        )
     for name in listed:
         if not (isinstance(name, str) or is_whole(name)):
-            raise InputError(f"label holds {describe(name)}: give {expected}", "label")
+            raise InputError(
+                f"label has {describe(name)} in its list: give only names of classes",
+                "label",
+            )
     names = [str(name) for name in listed]
     if not names or len(set(names)) < len(names):
         raise InputError(

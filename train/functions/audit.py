@@ -56,8 +56,9 @@ def audit(
             a `torch.nn.Module`.
         meshes: Meshes of one class: files, solids such as "solid:orange",
             `nb.Mesh`, or pairs of these and the class.
-        label: Class of the meshes, a name or an index. None if a mesh is in a
-            pair with its class, or is named by it.
+        label: Class of all meshes, by name or index. None if each mesh is given
+            in a pair with its class, or if its name is the class, as in
+            "orange.glb".
         hard_negatives: Meshes of other classes, rendered in the same lighting,
             with or without a class. None for generated fruit and balls.
         hardened: Hardened network, which is audited in the same way and shown

@@ -74,8 +74,9 @@ def harden(
 ) -> nn.Module:
     """Train a copy of a network to recognize objects under unusual lighting.
 
-    This is `pnb-train experiment=classifier`: the last layer learns from
-    renders, and its predictions for photographs stay nearly the same.
+    This is `pnb-train experiment=classifier`: the last layer of the network
+    learns from renders, while the predictions for photographs stay nearly the
+    same.
 
     Args:
         network: A plain network from images to logits, in evaluation mode, or
@@ -84,8 +85,9 @@ def harden(
             `nb.Mesh`, or pairs of these and the class. Meshes of several
             classes harden all of them.
         photographs: Folder of any photographs, with labels or without.
-        label: Class of the meshes, a name or an index. None if each mesh is in
-            a pair with its class, or is named by it.
+        label: Class of all meshes, by name or index. None if each mesh is given
+            in a pair with its class, or if its name is the class, as in
+            "orange.glb".
         hard_negatives: Meshes of other classes, which the network must not
             confuse with the class. None for generated fruit.
         classes: Names of the classes of a plain network, in the order of its

@@ -383,7 +383,9 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
     if len(heads) == 2 and heads[0].method == INITIAL and heads[1].method != "none":
+        # One network, before and after it was trained with renders.
         return dict(zip((BEFORE_HARDENING, AFTER_HARDENING), groups.values(), strict=True))
+    # Settings in which the groups with the same kind of renders differ.
     varied = {}
     for method in {head.method for head in heads}:
         varied[method] = varied_settings([head for head in heads if head.method == method])

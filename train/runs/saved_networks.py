@@ -144,6 +144,7 @@ def load_run(
         )
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
+    # Arguments of `build_network`, and entries for the wrapper around the network.
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:

@@ -158,9 +158,9 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
             f"train.init_from={name}: leave weights out",
             "weights",
         )
-    require_no_facts(
-        f"train.init_from={name}", as_facts(settings.classes, None, settings.normalization)
-    )
+    # The network of a run has its own classes and its own normalization.
+    given = as_facts(settings.classes, None, settings.normalization)
+    require_no_facts(f"train.init_from={name}", given)
     with keyed(run="train.init_from"):
         path, state = load_selected(source)
     return Initial(path, state["architecture"], plain_weights(state))
@@ -184,7 +184,9 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
             weights, or if the initial network lacks a class.
     """
     names = [] if settings.label is None else label_names(settings.label)
-    if names and not any(name.isdecimal() for name in names):
+    # A number can be the index of a class.
+    may_have_index = any(name.isdecimal() for name in names)
+    if names and not may_have_index:
         return settings
     initial = load_initial(settings)
     if names:
@@ -331,8 +333,10 @@ def _learned_from_other_kind(initial: Initial, data: DataSet) -> bool:
         data: Data set of the run.
     """
     record = initial.validation or {}
-    has_fraction = record.get("fraction") is not None
-    return data.rendered and has_fraction and "data" not in record
+    is_known = record.get("fraction") is not None
+    # Only a network that was trained on rendered images records the entry "data".
+    is_of_rendered = "data" in record
+    return data.rendered and is_known and not is_of_rendered
 
 
 def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | None:

@@ -302,6 +302,7 @@ class Trainer:
         if self._under_way is None:
             self._under_way = self._begin_epoch(plan, log)
         else:
+            # The run continues within an epoch, with the random numbers of the first attempt.
             restore_random_state(self._random_state)
         state = self._under_way
         with closing(self._remaining_batches(plan, state, log)) as batches:

@@ -74,8 +74,8 @@ class TrainingLoss:
             if not self._labeled:
                 labels = torch.where(rendered, labels, targets.argmax(1))
 
-        # A complementary label names the first positive class. An image with such a
-        # label is not of the other positive classes either.
+        # A complementary label (below 0) says that an image is not of the first positive
+        # class. Such an image is not of the other positive classes either.
         other_positives = self._positive_classes[1:]
         losses = label_loss(logits, labels, settings.label_smoothing, other_positives)
         if not self._labeled:

@@ -65,7 +65,7 @@ class RelitBatches:
         draws = generator(self._seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape
         light = draw_projected_light(count, size, draws, images).to(images.device)
-        # Logarithms of the factors of the slides.
+        # Logarithms of the factors by which the projected slide of each image is multiplied.
         log_gain = draw_log_gain(count, CELLS, self._radius, draws).to(images.device)
         unit = to_unit(images)
         if self._steps and self._teacher is not None:

@@ -47,7 +47,8 @@ def build_service(
     labels = torch.zeros(0, dtype=torch.int64, device=device)
     phases = Phases(device)
     names = label_names(settings.label)
-    # The ranking loss needs images of a positive class and others.
+    # The ranking loss compares images of a positive class with images of other classes. It
+    # needs both.
     is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1
     positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
