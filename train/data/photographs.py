@@ -264,7 +264,8 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     image_paths = sorted(path for path in all_paths if path.suffix.lower() in SUFFIXES)
     if not image_paths:
         raise InputError(
-            f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})",
+            f"{folder} holds no photographs: give a folder with image files whose names end in "
+            f"one of {', '.join(SUFFIXES)}",
         )
     return image_paths, all_paths
 
@@ -373,7 +374,7 @@ def _has_class_folders(
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
         raise InputError(
-            f"{folder / outside[0]} lies beside class folders: "
+            f"{folder / outside[0]} lies beside class folders, not in one of them: "
             "move it into the folder of its class",
         )
     return bool(names)

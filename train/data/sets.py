@@ -169,7 +169,10 @@ def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fra
             none or all of the images of a class.
     """
     if not 0 < fraction < 1:
-        raise InputError(f"{argument}={fraction} must lie between 0 and 1", argument)
+        raise InputError(
+            f"{argument}={fraction} must lie between 0 and 1: choose a fraction such as 0.1",
+            argument,
+        )
     is_held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(seed, "validation")
     for label in split.labels.unique():
@@ -380,7 +383,7 @@ def load_folder(
     classes = tuple(folder_names(train_root))
     if len(classes) < 2:
         raise InputError(
-            f"path={path} holds {len(classes)} class folders: it needs two or more",
+            f"path={path} holds {len(classes)} class folders: give a folder with two or more",
             "path",
         )
     other_files = unsupported_files(root)

@@ -123,7 +123,7 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
     "images, fault",
     [
         ([], "is not a folder"),
-        (["fig/a.png"], "holds 1 class folders: it needs two or more"),
+        (["fig/a.png"], "holds 1 class folders: give a folder with two or more"),
         (
             ["fig/a.png", "lime/.a.png"],
             "data/lime holds no image: put some there or remove the folder",
