@@ -280,3 +280,8 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         augment=replace(settings.augment, examples=examples),
         scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
     )
+
+
+def in_words(label: str) -> str:
+    """Write the label of an object in words: "other_sweet_pepper" becomes "sweet pepper"."""
+    return label.removeprefix(OTHER_PREFIX).replace("_", " ")

@@ -25,6 +25,7 @@ from train.auditing.remedies import (
     Recommendation,
     recommend,
 )
+from train.class_names import in_words
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -38,7 +39,6 @@ from train.report.first_screen import (
     choose_disagreements,
     compare_networks,
     describe_place,
-    in_words,
 )
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page

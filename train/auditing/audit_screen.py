@@ -11,6 +11,7 @@ from typing import Any
 
 from train.auditing.lights import KINDS, LightKind
 from train.auditing.plain_light import PlainViews
+from train.class_names import in_words
 from train.evaluation.scores.metrics import read_metric
 from train.evaluation.tables import Estimate, fraction
 from train.report import plots
@@ -19,7 +20,6 @@ from train.report.first_screen import (
     FirstScreen,
     ShownMetric,
     ShownPrediction,
-    in_words,
 )
 
 # Width of the picture that shows a view before and after an attack, in pixels.

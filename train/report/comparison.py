@@ -16,6 +16,7 @@ import numpy as np
 from augment.progress import progress
 from augment.settings import MODES
 from renderer.errors import InputError
+from train.class_names import in_words
 from train.evaluation.scores.metrics import (
     METRICS,
     TOP_RANKS,
@@ -214,7 +215,8 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
         name: Name of the metric in `METRICS`.
 
     Returns:
-        With one seed, the metric and its 95% interval. With several seeds, the
+        With one seed, the metric and its 95% interval, which is over objects and
+        images if some object is shown in several images. With several seeds, the
         mean, with the lowest and the highest value as the ends of the interval.
         None if the metric is unknown for every seed.
     """
@@ -222,7 +224,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
     values: list[float] = []
     for evaluation in evaluations:
         pool = evaluation.pools.get(subset)
-        metric = pool.metrics.find(name) if pool is not None else None
+        metric = pool.over_objects(name) if pool is not None else None
         if metric is not None and metric.value is not None:
             known.append(metric)
             values.append(metric.value)
@@ -310,7 +312,7 @@ def class_table(group: Scored) -> Table:
             for method, evaluations in methods.items():
                 metrics = (mean_metric(evaluations, subset, name) for name in TOP_RANKS)
                 cells = map(format_interval, metrics)
-                rows.append([subset.name, str(image_count), method, *cells])
+                rows.append([in_words(subset.name), str(image_count), method, *cells])
     return Table("by class, among all classes of the network", header, rows)
 
 

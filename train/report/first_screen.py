@@ -3,6 +3,7 @@
 It says whether hardening helped, and shows metrics and pictures before and after it.
 """
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import NamedTuple
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.data.photographs import DESCRIPTION, OTHER_PREFIX
+from train.class_names import in_words
+from train.data.photographs import DESCRIPTION
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.tables import Estimate, Table, join_words
 from train.report import comparison as compare
@@ -39,6 +41,7 @@ class ShownMetric:
         before: Value for the original network. None if only one network is shown.
         after: Value for the hardened network, or for the only network.
         is_percentage: Whether the metric is shown in percent.
+        interval: What the ends of the interval are.
     """
 
     title: str
@@ -46,6 +49,7 @@ class ShownMetric:
     before: Estimate | None
     after: Estimate
     is_percentage: bool = True
+    interval: str = "95% interval"
 
     def text(self, value: float) -> str:
         """Write a value of the metric in percent, or with two decimals if it is no percentage."""
@@ -113,6 +117,7 @@ class FirstScreen:
         rows: Rows of pictures, by the title of the row.
         names: Names of both networks, or of the only network.
         images: Sentence that says how many images and objects were scored.
+        note: Sentences that say how the pictures were chosen.
     """
 
     answer: str
@@ -121,6 +126,7 @@ class FirstScreen:
     rows: dict[str, list[ComparedImage]]
     names: Sequence[str]
     images: str
+    note: str = ""
 
     def __str__(self) -> str:
         """Return the answer, its reasons and the table of the metrics as text."""
@@ -142,7 +148,7 @@ class Compared(NamedTuple):
         names: Names of both networks in tables.
         subjects: Words for both networks as the subject of a sentence.
         place: Start of a sentence that says where the images are from, such as
-            "Under unusual lighting".
+            "Under projected patterns (rings and text)".
         change: What turned the first network into the second, such as
             "hardening".
         trained_objects: Classes whose images show the objects of the training.
@@ -189,7 +195,10 @@ class Compared(NamedTuple):
         after = compare.mean_metric(self.after, compare.ALL, name)
         if before is None or after is None:
             return None
-        return ShownMetric(title, note, before, after, is_percentage=name != "auc")
+        seed_count = max(len(self.before), len(self.after))
+        has_one_seed = seed_count == 1
+        interval = "95% interval" if has_one_seed else f"lowest and highest of {seed_count} seeds"
+        return ShownMetric(title, note, before, after, name != "auc", interval)
 
 
 def describe_place(folder: Path | None, name: str) -> str:
@@ -200,12 +209,23 @@ def describe_place(folder: Path | None, name: str) -> str:
         name: Name of the folder with the scores on these images.
 
     Returns:
-        "Under unusual lighting" for images that were rendered to test this.
-        Otherwise, a text with the name.
+        For path-traced renders, text with their lighting, such as "Under
+        projected patterns (rings and text)". Otherwise, a text with the name.
     """
-    # The command that renders test images writes a description of them to their folder.
-    is_laboratory = folder is not None and (folder / DESCRIPTION).is_file()
-    return "Under unusual lighting" if is_laboratory else f"In the images of “{name}”"
+    if folder is None or not is_laboratory(folder):
+        return f"In the images of “{name}”"
+    settings = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    patterns = settings.get("patterns", [])
+    is_only_patterns = patterns and not settings.get("environments")
+    if not is_only_patterns:
+        return "Under unusual lighting"
+    return f"Under projected patterns ({join_words(patterns, 'and')})"
+
+
+def is_laboratory(folder: Path) -> bool:
+    """Return whether a folder has renders of pnb-lab instead of photographs."""
+    # pnb-lab writes a description of the renders to their folder.
+    return (folder / DESCRIPTION).is_file()
 
 
 def compare_networks(
@@ -246,6 +266,19 @@ def compare_networks(
         rows=rows,
         names=compared.names,
         images=_describe_images(compared),
+        note=_describe_rows(label),
+    )
+
+
+def _describe_rows(label: str) -> str:
+    """Say how the rows of pictures were chosen.
+
+    Args:
+        label: Positive classes in words.
+    """
+    return (
+        f"For other objects, any answer but {label} counts as right. Shown are the images on "
+        "which the networks differ most: first one for each kind of object and light, then more."
     )
 
 
@@ -263,6 +296,8 @@ def _describe_images(compared: Compared) -> str:
         f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
         f"objects) and {auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
     )
+    if auc.has_repeated_objects and len(compared.after) == 1:
+        sentence += " The intervals are over objects and images."
     if compared.trained_objects:
         trained = join_words(compared.trained_objects, "and")
         sentence += f" The images of {trained} show the objects of the training in new light."
@@ -302,19 +337,22 @@ def _answer(
         auc: Difference of the area under the ROC curve.
 
     Returns:
-        Sentence such as "Hardening helped, at a price."
+        Sentence such as "Hardening improved the ranking (AUC +0.16 [0.10,
+        0.21]), at a price."
     """
+    assert auc.value is not None and auc.low is not None and auc.high is not None
     subject = change[0].upper() + change[1:]
+    gain = f"AUC {_rounded(auc.value, 2, '+')} [{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}]"
     match _direction(auc):
         case 1 if _direction(false_positives) > 0:
-            return f"{subject} helped, at a price."
+            return f"{subject} improved the ranking ({gain}), at a price."
         case 1:
-            return f"{subject} helped."
+            return f"{subject} improved the ranking ({gain})."
         case -1:
-            return f"{subject} did harm."
+            return f"{subject} made the ranking worse ({gain})."
     if _direction(recall) > 0 and _direction(false_positives) > 0:
-        return f"{subject} finds more, and mistakes more; a gain is not proven."
-    return f"It is not proven that {change} helped."
+        return f"{subject} finds more, and mistakes more; a better ranking is not proven ({gain})."
+    return f"It is not proven that {change} improved the ranking ({gain})."
 
 
 def _sentences(
@@ -370,10 +408,10 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
 
     Returns:
         Sentence with the values of both networks, the 95% interval of the
-        difference, and whether the difference is proven.
+        difference, and whether its sign is proven.
     """
     assert change.low is not None and change.high is not None
-    verdicts = {1: "a proven gain", -1: "a proven loss", 0: "a difference is not proven"}
+    verdicts = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}
     verdict = verdicts[_direction(change)]
     interval = f"95% interval: {_points(change.low)} to {_points(change.high)} points"
     return (
@@ -388,11 +426,29 @@ def _points(value: float) -> str:
         value: Difference, in [-1, 1].
 
     Returns:
-        Rounded percentage points with a sign, such as "+3", "−2" or "0".
+        Rounded percentage points with a sign, such as "+3", "−0.4" or "0".
     """
-    points = round(100 * value)
+    return _rounded(100 * value, 0, "+")
+
+
+def _rounded(value: float, decimals: int, sign: str = "") -> str:
+    """Write a number with a fixed number of decimals.
+
+    A number that would be rounded to 0 keeps one significant digit, so that its
+    sign is visible.
+
+    Args:
+        value: The number.
+        decimals: Number of decimals.
+        sign: "+" writes positive numbers with a plus sign.
+    """
+    text = f"{value:{sign}.{decimals}f}"
+    if float(text) == 0:
+        # Smaller numbers come from the rounding of floats.
+        is_zero = abs(value) < 1e-4
+        text = "0" if is_zero else f"{value:{sign}.1g}"
     # The text gets a typographic minus sign instead of a hyphen.
-    return f"{points:+d}".replace("-", "−") if points else "0"
+    return text.replace("-", "−")
 
 
 def choose_disagreements(
@@ -420,14 +476,12 @@ def choose_disagreements(
         that only the hardened network classifies correctly, and the images that
         only the original network does.
     """
-    pairs = zip(
-        _read_predictions(before, labels),
-        _read_predictions(after, labels),
-        strict=True,
-    )
+    predictions_before = _read_predictions(before, labels)
+    predictions_after = _read_predictions(after, labels)
+    image_count = len(predictions_before)
     gained = []
     lost = []
-    for pair in pairs:
+    for pair in zip(predictions_before, predictions_after, strict=True):
         was_correct = _is_correct(pair[0], labels)
         is_correct = _is_correct(pair[1], labels)
         if is_correct and not was_correct:
@@ -435,9 +489,11 @@ def choose_disagreements(
         elif was_correct and not is_correct:
             lost.append(pair)
     original, hardened = subjects
+    gained_title = f"Only {hardened} is right ({len(gained)} of {image_count} images)"
+    lost_title = f"Only {original} is right ({len(lost)} of {image_count} images)"
     return {
-        f"Only {hardened} is right": _draw_images(gained, images),
-        f"Only {original} is right": _draw_images(lost, images),
+        gained_title: _draw_images(gained, images),
+        lost_title: _draw_images(lost, images),
     }
 
 
@@ -540,8 +596,3 @@ def describe_prediction(prediction: Prediction) -> ShownPrediction:
         verdict = "wrong"
     text = f"{in_words(prediction.predicted)} {prediction.probability:.0%}"
     return ShownPrediction(text, verdict)
-
-
-def in_words(label: str) -> str:
-    """Write the label of an object in words: "other_sweet_pepper" becomes "sweet pepper"."""
-    return label.removeprefix(OTHER_PREFIX).replace("_", " ")

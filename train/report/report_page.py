@@ -18,6 +18,7 @@ from augment.progress import progress_message
 from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
+from train.class_names import in_words
 from train.evaluation.laboratory.kept_aside import can_be_generated
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.scores.sheet import evenly_spaced
@@ -38,7 +39,7 @@ from train.report.first_screen import (
     choose_disagreements,
     compare_networks,
     describe_place,
-    in_words,
+    is_laboratory,
 )
 from train.report.plots import Picture
 from train.report.summary import Methods, RunSummary, Scored, ScoredRun
@@ -129,13 +130,15 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
         folders: Folders that the user named.
 
     Returns:
-        Text with the numbers of networks, of unfinished runs and of attacks,
+        Text with the numbers of finished runs, of unfinished runs and of attacks,
         with the folders, and with the time of the newest file in them.
     """
     counts = []
     if found.runs:
         plural = "s" if len(found.runs) != 1 else ""
-        counts.append(f"{len(found.runs)} network{plural}")
+        is_hardened = any(run.before for run in found.runs)
+        change = ", before and after hardening" if is_hardened else ""
+        counts.append(f"{len(found.runs)} run{plural}{change}")
     if found.unfinished:
         counts.append(f"{len(found.unfinished)} unfinished or unreadable")
     if found.attacks:
@@ -420,7 +423,23 @@ def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
     before = fmean(known)
     after = fmean(run.scores["test/accuracy"] for run in runs)
     images = runs[0].config.get("test_images", "the test images")
-    return f"{method}: accuracy went from {before:.1%} to {after:.1%} on {images}."
+    sentence = f"{method}: accuracy went from {before:.1%} to {after:.1%} on {images}."
+    has_photographs = any(map(_is_scored_on_photographs, runs))
+    if OmegaConf.select(runs[0].config, "data.name") == "shapes" and not has_photographs:
+        sentence += (
+            " These are renders. No photographs were scored (setting evaluate.photos), so the "
+            "price on photographs is unknown."
+        )
+    return sentence
+
+
+def _is_scored_on_photographs(run: RunSummary) -> bool:
+    """Return whether a run has scores on other images than renders of pnb-lab."""
+    for name in run.photographs:
+        folder = images_folder(run, name)
+        if folder is None or not is_laboratory(folder):
+            return True
+    return False
 
 
 def _relit_sentences(methods: Methods) -> list[str]:

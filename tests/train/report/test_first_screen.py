@@ -1,5 +1,7 @@
 """The first screen shows images that only one of two networks gets right."""
 
+import json
+import re
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from train.data.photographs import Photograph
+from train.data.photographs import DESCRIPTION, Photograph
 from train.evaluation.scores.metrics import Pooled
 from train.evaluation.scores.predictions import (
     PREDICTIONS,
@@ -15,8 +17,15 @@ from train.evaluation.scores.predictions import (
     rank_classes,
     write_predictions,
 )
-from train.report.comparison import Evaluation, pools_of
-from train.report.first_screen import NETWORKS, Compared, choose_disagreements, compare_networks
+from train.report.comparison import Difference, Evaluation, pools_of
+from train.report.first_screen import (
+    NETWORKS,
+    Compared,
+    choose_disagreements,
+    compare_networks,
+    describe_place,
+    gain_sentence,
+)
 from train.report.summary import RunSummary
 
 # Classes of the images, and the classes that two networks predict.
@@ -44,10 +53,29 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
     before = write(tmp_path / "before", BEFORE)
     after = write(tmp_path / "after", AFTER)
-    gained, lost = choose_disagreements(before, after, tmp_path, LABELS).values()
+    rows = choose_disagreements(before, after, tmp_path, LABELS)
+    gained, lost = rows.values()
     # The third image is wrong twice, and the last one is right twice.
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
+    assert [re.findall(r"\d+", title) for title in rows] == [["2", "6"], ["2", "6"]]
+
+
+@pytest.mark.parametrize(("environments", "is_named"), [([], True), (["grace.pfm"], False)])
+def test_the_patterns_are_named_if_they_are_the_only_lighting(tmp_path, environments, is_named):
+    description = {"patterns": ["rings", "text"], "environments": environments}
+    (tmp_path / DESCRIPTION).write_text(json.dumps(description))
+    place = describe_place(tmp_path, "laboratory")
+    assert ("rings" in place, "text" in place) == (is_named, is_named)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"), [(-0.004, 0.364, ["−0.4", "+36"]), (0.0, 0.016, ["0", "+2"])]
+)
+def test_an_end_of_an_interval_is_shown_as_0_only_if_it_is_0(low, high, expected):
+    change = Difference(0.1, low, high, before=0.2, after=0.3)
+    interval = gain_sentence("Recall", change).partition("interval: ")[2]
+    assert re.findall(r"[−+]?\d[\d.]*", interval) == expected
 
 
 def evaluation(predicted: tuple[str, ...], labels: tuple[str, ...]) -> Evaluation:

@@ -356,6 +356,27 @@ class Pool:
         negative_objects = _object_indices(self.for_roc.negatives)
         return bootstrap(statistic, positive_objects, negative_objects)
 
+    def over_objects(self, name: str) -> Estimate | None:
+        """Return a metric with a 95% interval over objects and images.
+
+        The Wilson interval of a fraction in `metrics` treats each image as a
+        different object. If some object is shown in several images, it is too
+        narrow. It is then replaced by the interval of the bootstrap.
+
+        Args:
+            name: Name of the metric in `METRICS`, or "top5".
+
+        Returns:
+            The metric. None if it was not computed.
+        """
+        metric = self.metrics.find(name)
+        if not isinstance(metric, Proportion) or metric.value is None:
+            return metric
+        object_count = _count_objects(self.outcomes[name].predictions)
+        if object_count == metric.n:
+            return metric
+        return _estimate_or_wilson(metric.value, self.replicates[name], object_count)
+
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
         """For each metric that is known, its bootstrap replicates, shape (REPLICATES,)."""

@@ -7,8 +7,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binomtest, mannwhitneyu
 from scipy.stats import bootstrap as scipy_bootstrap
-from scipy.stats import mannwhitneyu
 
 from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import (
@@ -210,3 +210,34 @@ def test_the_interval_of_one_image_per_class_is_that_of_scipys_bootstrap_over_im
     metric = estimate(hits.mean(), replicates[0])
     assert metric.low == pytest.approx(reference.low, abs=0.03)
     assert metric.high == pytest.approx(reference.high, abs=0.03)
+
+
+@pytest.mark.parametrize(("second_is_found", "low"), [(False, 0.0), (True, 0.342380)])
+def test_the_interval_of_a_recall_is_over_objects(second_is_found, low):
+    """Compare with closed forms for two objects of 20 images.
+
+    If one object is found, a replicate shows the same object twice with the probability 1/2. If
+    both are found, the low end is 2 / (2 + z²), Wilson's for 2 of 2, with z = 1.959964.
+    """
+    classes = ["orange", "pear"]
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), "orange", None, (), f"{number // 20}.glb")
+        for number in range(40)
+    ]
+    logits = torch.tensor([[1.0, 0.0]] * 20 + [[float(second_is_found), 0.5]] * 20)
+    scored = pool(rank_classes(photographs, logits, classes, ["orange"]))
+    metric = scored.over_objects("recall")
+    assert metric.value == (1.0 if second_is_found else 0.5)
+    assert (metric.low, metric.high) == pytest.approx((low, 1.0), abs=1e-5)
+
+
+def test_the_interval_of_a_recall_is_wilsons_if_each_image_shows_another_object():
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), "orange", None, (), f"{number}.glb")
+        for number in range(8)
+    ]
+    logits = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]] * 5)
+    scored = pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
+    metric = scored.over_objects("recall")
+    wilson = binomtest(3, 8).proportion_ci(method="wilson")
+    assert (metric.low, metric.high) == pytest.approx((wilson.low, wilson.high))
