@@ -197,7 +197,7 @@ def _audit_photographs(
 
 
 def _measure_photographs(network: Classifier, settings: AuditSettings, results: Path) -> None:
-    """Attack a network through the light on photographs, unless the results exist.
+    """Attack a network by the light of a projector on photographs, unless the results exist.
 
     Args:
         network: Network to attack.

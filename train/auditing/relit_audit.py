@@ -74,7 +74,7 @@ class RelitSection:
 
 
 def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
-    """Attack a network through the light of a projector on photographs.
+    """Attack a network by changing the light of a projector on photographs.
 
     Args:
         classifier: Network to attack.

@@ -20,7 +20,7 @@ MAX_UNREADABLE = 3
 
 
 def run(settings: AttackExperimentSettings) -> None:
-    """Attack a network through the light on photographs, write the results, and print them.
+    """Attack a network by the light of a projector on photographs, and print the results.
 
     Args:
         settings: Settings of pnb-attack. `attack.relighting` has the settings

@@ -169,7 +169,7 @@ def attack_folder(
     seed: int = 0,
     limit: int | None = None,
 ) -> RelitScores:
-    """Attack a network through the light on photographs, and write the results to files.
+    """Attack a network by the light of a projector on photographs, and write the results.
 
     Args:
         classifier: Network to attack.

@@ -224,7 +224,7 @@ class Pool:
 
     @property
     def outcomes(self) -> dict[str, Outcome]:
-        """For each metric that is a fraction of images, which predictions are hits."""
+        """Hits and misses for each metric that is a fraction of images, such as recall."""
         # `true_rank` is None if the network lacks the class. No prediction is then a
         # hit, because infinity is above every rank.
         ranks = [prediction.true_rank or np.inf for prediction in self.positives]
