@@ -229,6 +229,7 @@ def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
     """
     image = _openimageio().ImageBuf(texels.contiguous().numpy())
     with replacing(path) as temporary:
+        # The data type "unknown" keeps the float32 values of the image.
         if not image.write(str(temporary), "unknown", file_format):
             raise OSError(image.geterror())
 

@@ -696,9 +696,10 @@ def _step_down(directions: Array, derivatives: Array) -> Array:
 def _harmonics(directions: Array, degree: int) -> Array:
     """Evaluate all spherical harmonics up to a degree, in few directions.
 
-    On the unit sphere, x² + y² + z² = 1. Each harmonic is therefore a homogeneous
-    polynomial of degree `degree` or `degree` - 1 in x, y and z. For few
-    directions, this is faster than `harmonics.evaluate_harmonics`.
+    A factor x² + y² + z² is 1 on the unit sphere, and raises the degree of a
+    polynomial by 2. So each harmonic equals a homogeneous polynomial of degree
+    `degree` or `degree` - 1 in x, y and z. For few directions, this is faster than
+    `harmonics.evaluate_harmonics`.
 
     Args:
         directions: D unit vectors, shape (D, 3).

@@ -892,8 +892,8 @@ def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
     # vector h (Walter et al. 2007, equation 14).
     weighted_lobe = reflected * light_cosine * solid_angles * 4 * half_cosine
 
-    # The directions to the light are rotated to axes in which the camera direction is the
-    # z-axis, and the normal lies in the plane of x and z.
+    # Here the normal is the z-axis. The harmonics need the directions to the light in other
+    # axes, whose z-axis is the direction to the camera. Both frames share the y-axis.
     x_axis = torch.stack([cosines, zeros, sines], dim=1)
     light_x = (light * x_axis[:, None]).sum(2)
     light_y = light[..., 1]

@@ -417,8 +417,8 @@ class TransferOperator:
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
             gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
-            # Gradient that each nonzero entry of the matrix adds to its coefficient: one row
-            # for each entry, one column for each color.
+            # Each nonzero entry of the sparse matrix links a pixel to a coefficient of the
+            # light. One row for each entry: the gradient that it adds to its coefficient.
             contributions = gradient_of_entry * self.sparse.weight
             gradient = gradient.index_add(-2, self.sparse.function, contributions)
         return (
@@ -676,8 +676,8 @@ class _Image(torch.autograd.Function):
             Gradient, shape (..., coefficients, 3), and None for the other two
             arguments of `forward`.
         """
-        # Second derivatives raise an error, which `once_differentiable` does. It takes
-        # notable time, so it is only used if the caller set create_graph=True.
+        # `_backward_once` raises an error if a second derivative is computed. Its decorator
+        # takes notable time, so it only runs if the caller set create_graph=True.
         if torch.is_grad_enabled():
             return _Image._backward_once(ctx, upstream)
         return _Image._backward(ctx, upstream)

@@ -500,8 +500,8 @@ class _PatchLinks:
         receiving = []
         factors = []
         for hits in rays.hits(surface, directions):
-            # The rays of a patch start at the centers of its pieces. Each piece counts by its
-            # fraction of the area of the patch.
+            # A patch consists of several pieces of surface. A ray that starts at a piece has
+            # the fraction of the piece in the area of the patch as a weight.
             weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
             from_sky[hits.pixels] -= weights @ sky_radiance
             receiving.append(hits.pixels)
