@@ -270,9 +270,9 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         with_class_name(item, classes, "scene.hard_negatives")
         for item in settings.scene.hard_negatives
     ]
-    # `ExperimentSettings` may remove a hard negative, because it now knows the name of the
-    # positive class. If `scene.views` is set, the number of examples follows from the number
-    # of objects, and None lets `ExperimentSettings` compute it again.
+    # If `scene.views` is set, the number of examples follows from the number of objects. It
+    # is then computed again, because `ExperimentSettings` removes a generated hard negative
+    # whose name is the positive class.
     examples = settings.augment.examples if settings.scene.views is None else None
     return replace(
         settings,

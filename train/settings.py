@@ -426,10 +426,11 @@ class EvaluationSettings(Settings):
                 "laboratory_setups",
             )
         photos = self.photos
-        folders = photos.values() if isinstance(photos, dict) else [photos]
-        is_one_folder = photos is None or isinstance(photos, str)
-        is_mapping = isinstance(photos, dict) and all(isinstance(path, str) for path in folders)
-        if not (is_one_folder or is_mapping):
+        if isinstance(photos, dict):
+            is_valid = all(isinstance(folder, str) for folder in photos.values())
+        else:
+            is_valid = photos is None or isinstance(photos, str)
+        if not is_valid:
             raise InputError(
                 f"photos={photos} must be a folder, or a mapping of names to folders",
                 "photos",

@@ -280,6 +280,7 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
         if initial_network is None:
             continue
         for reference, reference_run in first_runs.items():
+            # The initial network is the method whose settings name the same network.
             if reference_run.settings == initial_network.settings:
                 pairs.append((method, reference))
     trained = [method for method, run in first_runs.items() if run.method != INITIAL]

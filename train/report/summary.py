@@ -273,7 +273,7 @@ def _read(folder: Path) -> RunSummary | None:
     if is_finished(folder):
         return _read_run(folder)
     path = folder.absolute()
-    # A network without a run has the last two parts of its path as a name.
+    # The last two parts of the path are the name of a network without a run.
     name = str(Path(*path.parts[-2:]))
     settings = {"network": str(path)}
     if (folder / SUMMARY).is_file():
@@ -552,7 +552,7 @@ def _accuracy_table(methods: Methods) -> Table:
                 last = run.scores.get("test/accuracy_last")
                 line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
                 lines.setdefault(method, []).append(line)
-    # A dictionary keeps each name once, in order.
+    # A dictionary has each name once, in the order of the runs.
     names = dict.fromkeys(name for name in test_images if name)
     title = " or ".join(f"accuracy on {name}" for name in names)
     return _run_table(title, ["test accuracy", "of the last epoch"], lines)

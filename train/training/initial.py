@@ -218,7 +218,8 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     size = settings.data.size
     is_file = is_network_file(name)
     with keyed(name="train.init_from", size="data.size"):
-        # The size is given only for a file, which may not record the size of its images.
+        # A file may not record the size of its images, so it gets the size of the settings.
+        # Any other classifier has a size of its own.
         known_size = size if is_file else None
         classifier = load_classifier(
             name, settings.weights, settings.classes, known_size, settings.normalization
