@@ -95,9 +95,8 @@ class ProjectedLight:
 
         Args:
             photographs: Photographs in [0, 1], sRGB, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied, in
-                each cell of a grid, shape (B, 3, cells, cells). None for no
-                factors.
+            log_gain: Logarithms of factors by which the slide is multiplied,
+                see `light`.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
@@ -113,9 +112,8 @@ class ProjectedLight:
 
         Args:
             albedo: Linear values of the photographs, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied, in
-                each cell of a grid, shape (B, 3, cells, cells). None for no
-                factors.
+            log_gain: Logarithms of factors by which the slide is multiplied,
+                see `light`.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
