@@ -185,7 +185,7 @@ class AttackSettings(ParameterSettings):
         has_radius = all(steps.radius is not None for steps in self.parameters.values())
         if self.restarts and not has_radius:
             raise InputError(
-                "restarts draws from the norm-balls: "
+                "restarts draws from the norm-balls, but a parameter has no radius: "
                 "set the radius of every parameter, or restarts=0",
                 "restarts",
             )

@@ -21,8 +21,7 @@ NO_CLASS = -(10**9)
 def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
     """Compute the cost that an attack decreases.
 
-    It is −CE(logits, source) + CE(logits, target), equation 1 of the paper, where CE is the cross
-    entropy.
+    It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy.
 
     Args:
         logits: Logits of N images, shape (N, classes).

@@ -18,7 +18,7 @@ NUMBERS_PER_PIXEL = 10
 # An attack on the light also keeps about so many numbers for each pixel of the images that are
 # rendered at the same time.
 NUMBERS_PER_RENDERED_PIXEL = 16
-# The same number, if effects of a camera such as blur and noise are rendered, too: an attack keeps
+# If effects of a camera, such as blur and noise, are rendered, an attack on the light keeps about
 # so many numbers for each pixel of the images that are rendered at the same time.
 NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
 

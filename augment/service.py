@@ -220,7 +220,7 @@ class AugmentationService:
         seed: int = 0,
         **of_scene: Any,
     ) -> AugmentationService:
-        """Build a source of renders for any training loop, with a scene as in the paper.
+        """Build a source of renders for any training loop.
 
         There is a render for each mesh, camera and background.
 
@@ -259,7 +259,10 @@ class AugmentationService:
         members = as_list("meshes", meshes, tuple | list, expected)
         for index, member in enumerate(members):
             if len(member) != 2:
-                raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
+                raise InputError(
+                    f"meshes[{index}] is {describe(member)}: give a pair of a mesh and the index "
+                    "of its class, such as ('solid:orange', 53)"
+                )
             require_whole(f"meshes[{index}]: its label", member[1])
         named = [(mesh, str(label)) for mesh, label in members]
         paper: dict[str, Any] = {
@@ -346,7 +349,10 @@ class AugmentationService:
         require_kind("state", state, Mapping, expected)
         if "scene" not in state or state.keys() - {"scene", "values"}:
             found = ", ".join(str(key) for key in state) or "nothing"
-            raise InputError(f"state contains {found}: give {expected}")
+            raise InputError(
+                f"state contains {found}: give the result of state_dict of a service with the same "
+                "scene"
+            )
         values = state.get("values")
         if values is not None:
             values = as_tensor("state", values)

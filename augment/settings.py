@@ -78,13 +78,18 @@ class MeshSettings(Settings):
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
         super().__post_init__()
-        expected = "give [roughness, metallic, specular factor] in [0, 1]"
         if self.gloss == "file" and self.mesh.startswith("solid:"):
             raise InputError(
-                f"gloss=file, but {self.mesh} is not a file with a material: {expected}", "gloss"
+                f"gloss=file, but {self.mesh} is not a file with a material: "
+                "give [roughness, metallic, specular factor] in [0, 1]",
+                "gloss",
             )
         if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
-            raise InputError(f"gloss={self.gloss}: {expected}, or file", "gloss")
+            raise InputError(
+                f"gloss={self.gloss}: "
+                "give [roughness, metallic, specular factor] in [0, 1], or file",
+                "gloss",
+            )
         require_color("color", self.color)
 
 
@@ -108,7 +113,7 @@ def require_color(name: str, color: Sequence[float] | None) -> None:
     if color is None:
         return
     if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
-        raise InputError(f"{name}={color} must be red, green and blue from 0 to 1", name)
+        raise InputError(f"{name}={color}: give red, green and blue from 0 to 1", name)
 
 
 @dataclass
@@ -134,7 +139,8 @@ class PropSettings(MeshSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.at) != 2:
-            raise InputError(f"at={self.at} must be x and y", "at")
+            message = f"at={self.at}: give two numbers, the position x and y on the ground"
+            raise InputError(message, "at")
 
 
 @dataclass
@@ -421,8 +427,8 @@ class CameraEffectSettings(Settings):
 class VariationSettings(Settings):
     """Ranges of the random pose, lighting and surroundings of each render during training.
 
-    By default nothing is random, as in the paper. An attack changes the lighting of the object
-    only. The background keeps the random lighting.
+    By default nothing is random. An attack changes the lighting of the object only. The
+    background keeps the random lighting.
 
     >>> import norm_balls as nb
     >>> nb.VariationSettings(shift=0.1).moves, nb.VariationSettings(exposure=[0.5, 2.0]).moves
@@ -683,8 +689,8 @@ class AugmentationSettings(Settings):
 def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
     """Compute the number of views of each mesh from the number of renders.
 
-    The number of renders is meshes × views × backgrounds. In the paper, these are 2 meshes × 10
-    views × 5 backgrounds = 100 renders.
+    The number of renders is meshes × views × backgrounds. For example, 2 meshes, 10 views and 5
+    backgrounds give 100 renders.
 
     Args:
         examples: Number of renders. None if it follows from the views.

@@ -142,7 +142,7 @@ def _read_torchscript(path: Path) -> Content:
                 "contains weights without their network: give its architecture and the weights, "
                 f"as in classifier=torchvision:resnet50 weights={path}"
             )
-        raise InputError(f"name={path} {advice}", "name")
+        raise InputError(f"name={path} cannot be loaded, because it {advice}", "name")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
         return Content(Scripted(torch.jit.load(path, map_location="cpu").eval()))

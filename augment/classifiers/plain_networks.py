@@ -304,7 +304,10 @@ def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequenc
     expected = "'imagenet', or (mean, std) of three numbers each"
     rows = as_list("normalization", normalization, tuple | list, expected)
     if [len(row) for row in rows] != [COLORS, COLORS] or not min(rows[1]) > 0:
-        raise InputError(f"normalization is {describe(normalization)}: give {expected}")
+        raise InputError(
+            f"normalization is {describe(normalization)}: "
+            "give 'imagenet', or (mean, std) of three numbers each"
+        )
     return rows[0], rows[1]
 
 

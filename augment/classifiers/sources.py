@@ -472,7 +472,9 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
     # torch and safetensors raise many kinds of errors for damaged files.
     except Exception as error:
         if (advice := advice_for_pickles(path)) is not None:
-            raise InputError(f"weights={path} {advice}", "weights") from error
+            raise InputError(
+                f"weights={path} cannot be loaded, because it {advice}", "weights"
+            ) from error
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
             reason = "it is not a file of weights, or contains other objects"

@@ -177,7 +177,7 @@ def attack_photographs(
     require_kind("settings", settings, RelightingSettings | None, "RelightingSettings(...) or None")
     require_seed("seed", seed)
     settings = settings or RelightingSettings()
-    counting = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
+    success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = photographs.shape[-1]
     with gradient_flags_kept(network):
         classifier = as_classifier(
@@ -188,7 +188,7 @@ def attack_photographs(
                 f"photographs have {size} pixels per side, "
                 f"but the network takes {classifier.size}: resize them",
             )
-        attack = _PhotographAttack(classifier, photographs, settings, counting, seed)
+        attack = _PhotographAttack(classifier, photographs, settings, success_settings, seed)
         return attack.run()
 
 
@@ -199,8 +199,8 @@ class _PhotographAttack:
         classifier: The attacked network.
         photographs: Photographs, uint8, shape (N, 3, size, size).
         settings: Settings of the searches.
-        counting: Settings that decide whether a change of the class counts: the
-            sensor noise. They also have the batch size.
+        success_settings: Sensor noise in which a change of the class must remain
+            to count as a success, and the batch size.
         seed: Seed of all random numbers.
     """
 
@@ -209,14 +209,14 @@ class _PhotographAttack:
         classifier: Classifier,
         photographs: Tensor,
         settings: RelightingSettings,
-        counting: AttackSettings,
+        success_settings: AttackSettings,
         seed: int,
     ):
         """Prepare the attack. See the class for the arguments."""
         self.classifier = classifier
         self.photographs = photographs
         self.settings = settings
-        self.counting = counting
+        self.success_settings = success_settings
         self.seed = seed
         self.device = device_of(classifier)
         self.model = Quantized(classifier)
@@ -231,7 +231,7 @@ class _PhotographAttack:
         self.predicted = {name: torch.empty(shape, dtype=torch.int64) for name in self.lights}
         self.changed = {name: torch.zeros(shape, dtype=torch.bool) for name in self.lights}
         self.log_gain = {name: torch.zeros(*shape, 3, cells, cells) for name in self.lights}
-        batches = torch.arange(count).split(self.counting.batch_size)
+        batches = torch.arange(count).split(self.success_settings.batch_size)
         with frozen_eval_mode(self.classifier):
             for rows in progress(batches, "relighting photographs", len(batches)):
                 with torch.no_grad():
@@ -377,7 +377,7 @@ class _PhotographAttack:
             predicted[:, None],
             noise_indices,
             criterion,
-            self.counting,
+            self.success_settings,
             self.seed,
         )
         self.predicted[light][rows, slide] = predicted.cpu()

@@ -95,8 +95,9 @@ class ProjectedLight:
 
         Args:
             photographs: Photographs in [0, 1], sRGB, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied,
-                see `light`.
+            log_gain: Logarithms of factors by which the slide is multiplied, in
+                each cell of a grid, shape (B, 3, cells, cells). None for no
+                factors.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
@@ -112,8 +113,9 @@ class ProjectedLight:
 
         Args:
             albedo: Linear values of the photographs, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied,
-                see `light`.
+            log_gain: Logarithms of factors by which the slide is multiplied, in
+                each cell of a grid, shape (B, 3, cells, cells). None for no
+                factors.
 
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).

@@ -14,7 +14,13 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.auditing.audit_screen import attack_pictures, charts, plain_sentence, screen_of_one
+from train.auditing.audit_screen import (
+    attack_pictures,
+    charts,
+    plain_sentence,
+    screen_of_one,
+    withstood_sentence,
+)
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.auditing.plain_light import PlainViews
 from train.auditing.relit_audit import relit_sections
@@ -39,6 +45,7 @@ from train.report.first_screen import (
     choose_disagreements,
     compare_networks,
     describe_place,
+    describe_prediction,
 )
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
@@ -52,6 +59,8 @@ VERDICTS = {
 # Names of the two folders of test images, and of the subfolders with their scores.
 LABORATORY = "laboratory"
 PHOTOGRAPHS = "photographs"
+# The images in these folders, in words.
+IN_WORDS = {LABORATORY: "path-traced test images", PHOTOGRAPHS: "photographs"}
 # Result file: in which environment lights a network recognizes each view.
 RECOGNIZED = "recognized.json"
 # Result file: the ordinary light in which the audited network recognizes most views.
@@ -134,21 +143,22 @@ def write_audit_page(
         sentence = recommendation.sentence
         if recommendation.remedy == HARDENING:
             # The top of the report shows the gain by hardening already.
-            sentence = f"Recommended: {HARDENING}."
+            sentence = recommendation.advice
         screen = replace(screen, sentences=[*screen.sentences, sentence])
     last_folder = list(results.values())[-1]
     path = write_page(
         out,
         "audit.html.jinja",
-        title=f"Audit: {label} under unusual lighting",
+        title=f"Audit: {in_words(label)} under unusual lighting",
         about=" and ".join(results),
-        label=label,
+        label=in_words(label),
         kinds=KINDS,
         steps=(STEPS, ADDITIONAL_STEPS),
         counts=counts,
         correct=correct,
         plain_sentence=plain_sentence(label, first_name, plain),
         pictures={name: attack_pictures(path, counts[name]) for name, path in results.items()},
+        withstood={name: withstood_sentence(name, counts[name]) for name in results},
         charts=charts(counts),
         slider=_slider(counts),
         script=SLIDER_SCRIPT if _slider(counts) else "",
@@ -270,12 +280,15 @@ def _first_screen(
         )
         if screen is not None:
             return screen
-    scores = read_json(folder / images / SUMMARY) if images is not None else None
+    pool = None
+    if images is not None:
+        (evaluation,) = _evaluations({name: folder / images})[name]
+        pool = evaluation.pools[compare.ALL]
     _, _, answer = write_answer(label, name, folder, folders).partition("? ")
     # "No: it recognizes 20% of orange" becomes "No".
     short_answer = answer.partition(":")[0]
     verdict = VERDICTS.get(short_answer, short_answer)
-    return screen_of_one(label, name, verdict, plain, counts[name], scores)
+    return screen_of_one(label, name, verdict, plain, counts[name], pool)
 
 
 def _compare(
@@ -357,7 +370,8 @@ def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
     for name in images:
         files = read_json(folder / name / SUMMARY)["unreadable"]
         if files:
-            yield f"{len(files)} of the {name} cannot be read, the first being {files[0]}."
+            images_in_words = IN_WORDS[name]
+            yield f"{len(files)} of the {images_in_words} cannot be read, such as {files[0]}."
 
 
 def _agreement(scored: Predictions) -> Proportion:
@@ -436,9 +450,9 @@ def _find_rates(label: str, folder: Path, images: Collection[str]) -> list[Findi
     for name in images:
         scores = read_json(folder / name / SUMMARY)
         recall = read_metric(scores, "recall")
-        findings.append(_recognized(f"{label} in the {name}", recall))
+        findings.append(_recognized(f"{label} in the {IN_WORDS[name]}", recall))
         false_positive_rate = read_metric(scores, "false_positive_rate")
-        subject = f"other objects for {label} in the {name}"
+        subject = f"other objects for {label} in the {IN_WORDS[name]}"
         findings.append(_not_mistaken(subject, false_positive_rate))
     return [finding for finding in findings if finding is not None]
 
@@ -494,7 +508,7 @@ def _attack_faults(folder: Path) -> list[str]:
         for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
             if 0 < counts["correct"] <= 2 * fooled_count:
                 attack = f"an attack with {light.title} of radius {radius:g}"
-                faults.append(f"{attack} loses half of the views")
+                faults.append(f"{attack} loses {fooled_count} of {counts['correct']} views")
                 break
     return faults
 
@@ -579,8 +593,13 @@ def _worst(
         positives = [item for item in items if item.prediction.photograph.label == label]
         negatives = [item for item in reversed(items) if item.prediction.photograph.label != label]
         draw = partial(_draw_image, folders, scored)
-        galleries[f"{label} that {name} doubts most"] = list(map(draw, positives[:WORST]))
-        galleries[f"what {name} most takes for {label}"] = list(map(draw, negatives[:WORST]))
+        label_in_words = in_words(label)
+        galleries[f"{label_in_words} that {name} doubts most"] = [
+            draw(item) for item in positives[:WORST]
+        ]
+        galleries[f"what {name} most takes for {label_in_words}"] = [
+            draw(item) for item in negatives[:WORST]
+        ]
     return galleries
 
 
@@ -597,7 +616,7 @@ def _draw_image(folders: Mapping[str, Path], scored: Predictions, item: _ScoredI
     texts = []
     for network, by_images in scored.items():
         prediction = by_images[item.images][item.image_index]
-        texts.append(f"{network}: {prediction.probability:.0%} {prediction.predicted}")
-    caption = f"{photograph.label}, {photograph.source}: {'; '.join(texts)}"
+        texts.append(f"{network}: {describe_prediction(prediction).text}")
+    caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
     image = Image.fromarray(read_square(folders[item.images] / photograph.path, SIDE))
     return plots.encoded(image, caption, caption)

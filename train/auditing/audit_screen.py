@@ -12,8 +12,8 @@ from typing import Any
 from train.auditing.lights import KINDS, LightKind
 from train.auditing.plain_light import PlainViews
 from train.class_names import in_words
-from train.evaluation.scores.metrics import read_metric
-from train.evaluation.tables import Estimate, fraction
+from train.evaluation.scores.metrics import Pool
+from train.evaluation.tables import Estimate, fraction, join_words
 from train.report import plots
 from train.report.first_screen import (
     ComparedImage,
@@ -91,7 +91,7 @@ def screen_of_one(
     answer: str,
     plain: PlainViews,
     counts: Counts,
-    scores: Mapping[str, Any] | None,
+    pool: Pool | None,
 ) -> FirstScreen:
     """Make the top of the report of an audit of one network.
 
@@ -102,8 +102,7 @@ def screen_of_one(
         plain: How many views the network recognizes in plain light.
         counts: For each kind of lighting, the numbers of views that are correct
             before the attack and misclassified after it.
-        scores: Content of summary.json with the scores on test images. None
-            without test images.
+        pool: Predictions for the test images. None without test images.
 
     Returns:
         Headline, main numbers and sentences.
@@ -128,14 +127,14 @@ def screen_of_one(
             f"If an attacker controls {KINDS[kind].title}, it still recognizes {remaining_count} "
             f"of the {correct_count} views that it recognizes before the attack."
         )
-    false_positive_rate = read_metric(scores, "false_positive_rate") if scores else None
+    false_positive_rate = pool.over_objects("false_positive_rate") if pool else None
     if false_positive_rate is not None and false_positive_rate.value is not None:
         title = f"Other objects called {in_words(label)}"
         numbers.append(
             ShownMetric(title, "lower is better", before=None, after=false_positive_rate)
         )
-    if scores:
-        sentences += _score_sentence(label, scores)
+    if pool:
+        sentences += _score_sentence(label, pool)
     return FirstScreen(
         answer=answer,
         sentences=sentences,
@@ -146,19 +145,19 @@ def screen_of_one(
     )
 
 
-def _score_sentence(label: str, scores: Mapping[str, Any]) -> list[str]:
+def _score_sentence(label: str, pool: Pool) -> list[str]:
     """Write a sentence about recall and false positives on test images.
 
     Args:
         label: Class whose objects were tested.
-        scores: Content of summary.json.
+        pool: Predictions for the test images.
 
     Returns:
         List with the sentence. Empty if one of the two metrics is unknown.
     """
-    recall = read_metric(scores, "recall")
-    mistaken = read_metric(scores, "false_positive_rate")
-    if recall is None or mistaken is None or recall.value is None or mistaken.value is None:
+    recall = pool.metrics.recall
+    mistaken = pool.metrics.false_positive_rate
+    if recall.value is None or mistaken.value is None:
         return []
     name = in_words(label)
     return [
@@ -176,7 +175,8 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
             before the attack and misclassified after it.
 
     Returns:
-        Pictures with the two predictions. A kind of lighting by which no attack
+        Pictures with the two predictions, and with the number of views that the
+        attack at the largest radius changes. A kind of lighting by which no attack
         succeeds has no picture.
     """
     compared = []
@@ -187,8 +187,31 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
         path = folder / f"{kind}.png"
         alt_text = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
         for picture in plots.from_file(path, alt_text, PAIR_WIDTH):
-            compared.append(ComparedImage(picture, light.title, *answers))
+            lost = f"{counts[kind]['adversarial'][-1]} of {counts[kind]['correct']} views lost"
+            compared.append(ComparedImage(picture, f"{light.title}: {lost}", *answers))
     return compared
+
+
+def withstood_sentence(name: str, counts: Counts) -> str:
+    """Name the kinds of lighting by which no attack on a network succeeds.
+
+    Args:
+        name: Name of the network.
+        counts: For each kind of lighting, the numbers of views that are correct
+            before the attack and misclassified after it.
+
+    Returns:
+        Sentence. Empty if an attack with each kind of lighting succeeds, or if
+        the network recognizes no view before it.
+    """
+    withstood = [
+        light.title
+        for kind, light in KINDS.items()
+        if counts[kind]["correct"] and not counts[kind]["adversarial"][-1]
+    ]
+    if not withstood:
+        return ""
+    return f"No attack on {name} succeeded with {join_words(withstood, 'or')}."
 
 
 def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:

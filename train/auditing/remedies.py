@@ -25,6 +25,14 @@ ORIGINAL = "the original network"
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
+# What a user does for each remedy.
+CHECK = "Choose its threshold and check it on your own photographs first."
+ADVICE = {
+    ORIGINAL: "Recommended: the original network, unchanged.",
+    LIGHT_ALONE: "Recommended: the network as it is, with normalize_light=true.",
+    HARDENING: f"Recommended: the hardened network. {CHECK}",
+    BOTH: f"Recommended: the hardened network, with normalize_light=true. {CHECK}",
+}
 # Remedies are compared by top-1 accuracy if there are several positive classes.
 TOP1 = "class_top1"
 
@@ -35,12 +43,14 @@ class Recommendation:
 
     Attributes:
         remedy: Name of the recommended remedy. None if none is recommended.
-        sentence: Recommendation in words.
+        advice: What the user should do, in words.
+        sentence: The advice and the reason for it.
         table: Metric of the network with each remedy, and its gain over the
             original network.
     """
 
     remedy: str | None
+    advice: str
     sentence: str
     table: Table
 
@@ -121,16 +131,21 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     title = metric_title(metric)
     gain = gains.get(chosen)
     if gain is None:
-        listed = ", ".join(remedies)
-        sentence = f"Recommended: nothing. No gain in {title} is proven for: {listed}."
+        reason = f"No gain in {title} is proven for: {', '.join(remedies)}."
     else:
-        sentence = f"Recommended: {chosen}. " + gain_sentence(f"With it, {title}", gain)
+        reason = gain_sentence(f"With {chosen}, {title}", gain)
     rows = []
     for name, evaluations_of_network in evaluations.items():
         value = format_interval(mean_metric(evaluations_of_network, ALL, metric))
         rows.append([name, value, format_interval(gains.get(name), "+")])
     table = Table("", ["network", title, "gain over the original network"], rows)
-    return Recommendation(None if gain is None else chosen, sentence, table)
+    advice = ADVICE[chosen]
+    return Recommendation(
+        remedy=None if gain is None else chosen,
+        advice=advice,
+        sentence=f"{advice} {reason}",
+        table=table,
+    )
 
 
 def _metric_for(evaluations: Sequence[Evaluation]) -> str:

@@ -173,7 +173,8 @@ class Material(Parameter):
         """Find the nearest values whose gloss the renderer can show.
 
         Args:
-            values: Attack values, shape (A, 4), as in `apply`.
+            values: Roughness, metallic factor, specular factor and rotation of the
+                hue, each divided by its unit in the settings, shape (A, 4).
             within: Norm-ball that must contain the result, or None.
 
         Returns:

@@ -248,7 +248,7 @@ class _MovableObject:
         return torch.where(self.object_mask[:, None], moved, bent)
 
     def _bend(self, vertices: Tensor, joint_rotations: Tensor) -> Tensor:
-        """Rotate the J joints, and return the vertices that they move, shape (N, 3).
+        """Rotate the J joints, and return all vertices after that, shape (N, 3).
 
         Args:
             vertices: Vertices of the object, its props and its table,

@@ -20,6 +20,7 @@ from renderer.light.presets import load_light
 from train.auditing import audit, lights
 from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
+from train.auditing.audit_screen import withstood_sentence
 from train.auditing.frames import frames_of
 from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
 from train.auditing.plain_light import find_plain_views
@@ -391,4 +392,15 @@ def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_
     write_parts(tmp_path, 400, 400, adversarial=[0, 1, 2, 4])
     text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     for light in KINDS.values():
-        assert f"{light.title} of radius {light.radii[2]:g} " in text
+        assert f"{light.title} of radius {light.radii[2]:g} loses 2 of 4 views" in text
+
+
+def test_the_kinds_of_lighting_are_named_that_no_attack_succeeds_with():
+    counts = {kind: {"correct": 4, "adversarial": [0, 0, 0, 1]} for kind in KINDS}
+    assert withstood_sentence("dark", counts) == ""
+    counts["skylight"] = {"correct": 4, "adversarial": [0, 0, 0, 0]}
+    # Without a recognized view there is nothing to attack.
+    counts["lamps"] = {"correct": 0, "adversarial": [0, 0, 0, 0]}
+    text = withstood_sentence("dark", counts)
+    named = [kind for kind, light in KINDS.items() if light.title in text]
+    assert named == ["skylight"]

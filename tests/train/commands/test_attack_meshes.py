@@ -144,7 +144,7 @@ class TestARasterizerThatDoesNotStart:
         ),
         (
             ["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
-            r"props\[0\]\.at=\[1\] must be x and y",
+            r"props\[0\]\.at=\[1\]: give two numbers",
         ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
