@@ -350,8 +350,7 @@ class AugmentationService:
         if "scene" not in state or state.keys() - {"scene", "values"}:
             found = ", ".join(str(key) for key in state) or "nothing"
             raise InputError(
-                f"state contains {found}: give the result of state_dict of a service with the same "
-                "scene"
+                f"state has the keys {found}, which a service does not write: give {expected}"
             )
         values = state.get("values")
         if values is not None:

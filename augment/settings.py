@@ -87,7 +87,8 @@ class MeshSettings(Settings):
         if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
             raise InputError(
                 f"gloss={self.gloss}: "
-                "give [roughness, metallic, specular factor] in [0, 1], or file",
+                "give [roughness, metallic, specular factor] in [0, 1], "
+                "or the word file for the material in the file of the mesh",
                 "gloss",
             )
         require_color("color", self.color)

@@ -401,10 +401,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     settings = ImageSettings(**description["image"])
     angle_unit = description.get(ANGLE_UNIT)
     cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
-    shown = _read_object(folder, description)
+    attacked_object = _read_object(folder, description)
     for camera in cameras:
         # This raises InputError if the camera is inside of the mesh.
-        camera.depths(shown.mesh.vertices)
+        camera.depths(attacked_object.mesh.vertices)
     local_lights = []
     for name in description["local_lights"]:
         path = folder / f"{Path(name).name}.json"
@@ -415,8 +415,12 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     if isinstance(background, str):
         background = folder / BACKGROUND
     shape = (len(cameras), 3, settings.size, settings.size)
+    # An attack on single pixels also stores the offset of each pixel value.
+    pixel_offsets = None
+    if description["pixels"]:
+        pixel_offsets = _read_images(folder / PIXELS, shape)
     return Adversary(
-        shown=shown,
+        shown=attacked_object,
         cameras=cameras,
         light=light,
         basis=basis,
@@ -424,7 +428,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         settings=settings,
         images_in_views_before=_read_images(folder / f"{BEFORE}.npy", shape),
         images_in_views=_read_images(folder / f"{AFTER}.npy", shape),
-        pixels=_read_images(folder / PIXELS, shape) if description["pixels"] else None,
+        pixels=pixel_offsets,
     )
 
 

@@ -198,7 +198,7 @@ class AttackResult:
 
     @property
     def backward_passes(self) -> Tensor:
-        """Number of images of each example whose gradient was computed, (E,) int64."""
+        """Number of images of each example whose gradient was computed, shape (E,), int64."""
         return self.descent.backward_passes
 
     @property

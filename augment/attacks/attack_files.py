@@ -85,10 +85,10 @@ def save(
     require_result(result)
     folder = as_folder("folder", folder)
     if checks is not None:
-        require_kind("checks", checks, Mapping, "the result of nb.check")
+        require_kind("checks", checks, Mapping, "the dictionary that norm_balls.check returns")
         if missing := CHECKED - checks.keys():
             names = ", ".join(sorted(missing))
-            raise InputError(f"checks lacks {names}: give the result of nb.check")
+            raise InputError(f"checks lacks the keys {names}: give what norm_balls.check returns")
     verify = [verify] if isinstance(verify, str) else verify
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)

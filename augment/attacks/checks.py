@@ -617,8 +617,9 @@ def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> d
         result: The attack.
 
     Returns:
-        Two masks of the N examples, shape (N,). For the method "random", the key "random" has
-        the successes with sensor noise, and "random_without_noise" those without.
+        Two masks of the N examples, shape (N,). The key "adversarial" or "random" has the
+        successes with sensor noise, and the same key with the ending "_without_noise" has those
+        without noise.
     """
     is_clean = result.clean_correct
     return {

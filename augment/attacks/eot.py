@@ -197,9 +197,10 @@ def _moved(images: Tensor, movements: Tensor) -> Tensor:
 
     Args:
         images: Images, shape (N, 3, H, W).
-        movements: For each image the shift across and the shift down as
-            fractions of the size, the rotation in radians, and the increase of
-            the size as a fraction of the size, shape (N, 4).
+        movements: Movement of the positions of each image, shape (N, 4): the
+            shift across and the shift down as fractions of the image size, the
+            rotation in radians, and a number g. Distances of the positions from
+            the center of the image are multiplied by 1 + g.
 
     Returns:
         Moved images, shape (N, 3, H, W).

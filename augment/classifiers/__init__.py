@@ -70,7 +70,11 @@ class Source(NamedTuple):
 
 
 def _efficientnet_lite(version: int) -> Source:
-    """Return the functions that make the classifier EfficientNet-Lite 0, 1 or 2."""
+    """Return the functions that load or build a classifier EfficientNet-Lite.
+
+    Args:
+        version: Number of the classifier in its family: 0, 1 or 2.
+    """
     load = partial(load_efficientnet_lite, version)
     build = partial(build_efficientnet_lite, version)
     return Source(load, build)

@@ -104,7 +104,7 @@ def as_facts(
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
-    """Check that the user gives no classes, size or normalization for a network that has its own.
+    """Check that the user gives no classes, size or normalization for a network that defines them.
 
     Args:
         name: Name of the network, for the error.
@@ -113,9 +113,13 @@ def require_no_facts(name: str, facts: NetworkFacts) -> None:
     Raises:
         InputError: If one of them is not None.
     """
-    for key, value in vars(facts).items():
+    for setting, value in vars(facts).items():
         if value is not None:
-            raise InputError(f"{key} cannot be set for {name}, which has its own: remove it", key)
+            raise InputError(
+                f"{setting} cannot be set for {name}, because this network already defines "
+                f"{setting}: leave {setting} out",
+                setting,
+            )
 
 
 def index_names(count: int) -> tuple[str, ...]:
@@ -173,7 +177,7 @@ def as_classifier(
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             raise InputError(
                 "classes, normalization and value_range are for a plain network: "
-                "leave them out, because a Classifier has its own"
+                "leave them out, because the given Classifier already defines them"
             )
         if size not in (None, network.size):
             raise InputError(

@@ -242,7 +242,7 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     """
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
-    except Exception as error:  # The network, the disk or the file's hash may fail.
+    except Exception as error:  # The connection, the disk or the check of the hash may fail.
         raise InputError(
             f"name={name} cannot be downloaded ({single_line(error)}): "
             f"set weights=FILE to a copy of {published.url}",
@@ -367,7 +367,7 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
         return build_timm(model, None, facts, pretrained=True)
     except InputError:
         raise
-    except Exception as error:  # The network, the disk or timm's hub may fail.
+    except Exception as error:  # The connection, the disk or timm's hub may fail.
         reason = single_line(error)
         raise InputError(
             f"name=timm:{model} cannot be downloaded ({reason}): set weights=FILE",

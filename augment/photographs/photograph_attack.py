@@ -86,7 +86,9 @@ class PhotographAttackResult:
     log_gain: dict[str, Tensor]
 
     def kept(self, light: str = ADVERSARIAL) -> Tensor:
-        """Return a mask of the photographs that keep their class with all of their slides.
+        """Return a mask of the photographs that keep their class in the light of every slide.
+
+        A slide is a picture that the projector shows on a photograph.
 
         Args:
             light: "slide" (slides as they are), "random" (slides with random

@@ -159,7 +159,7 @@ def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Gene
     Returns:
         Linear light in [0, 1], on the CPU, shape (count, 3, size, size).
     """
-    # Index of the photograph in each picture, shape (count,).
+    # Index of the random photograph that each of the pictures shows, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)
     # Three numbers in [0, 1] of each picture, shape (count,) each.
     turn, zoom, saturation = torch.rand(3, count, generator=draws)

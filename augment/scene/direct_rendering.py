@@ -96,6 +96,7 @@ class FrozenTransport:
             fragments: The S samples of the mesh that the camera sees.
             albedo: Albedo of the mesh at the samples, shape (S, 3).
         """
+        # None says that shadows and bounces add nothing to the view.
         self.views[camera] = None
         if not self._transport:
             return
@@ -109,7 +110,10 @@ class FrozenTransport:
         # of the image, shape (3, K, size²).
         all_pixels = added_transfer.new_zeros(*added_transfer.shape[:2], fragments.size**2)
         all_pixels[..., surface.fragments.pixels] = added_transfer
-        self.views[camera] = FrozenView(all_pixels.to(albedo), _sum_by_pixel(fragments, albedo))
+        # The method `radiance` scales the added radiance of a pixel by the ratio of its new albedo
+        # to this albedo.
+        albedo_sums = _sum_by_pixel(fragments, albedo)
+        self.views[camera] = FrozenView(all_pixels.to(albedo), albedo_sums)
 
     def radiance(
         self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor

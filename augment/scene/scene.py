@@ -459,7 +459,7 @@ class Scene:
                 radiance = view_in_lamps.radiance(
                     lamps, albedo, light[row, lamp_rows], positions[row]
                 )
-                # Positions of the pixels that the object covers among the pixels of the layer.
+                # Positions of the pixels that the object covers in the sorted list `pixels`.
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))
                 lamp_radiances.append(canvas.index_copy(1, covered, radiance))

@@ -374,7 +374,8 @@ def _find_shown_points(room: Room, mesh: Mesh, camera: Camera, image: ImageSetti
         starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
     forward = F.normalize(points - starts, dim=1)
     face_of_pixel = room.rays.first_hit(starts, forward)
-    # M of the pixels show the object. Replace their points by those of the faces.
+    # M of the pixels show the object. Replace the point of each by the point of the face of the
+    # object that the ray of the pixel hits.
     mesh_pixels = torch.nonzero(face_of_pixel != NO_FACE).squeeze(1)
     corners = torch.from_numpy(mesh.vertices[mesh.faces[face_of_pixel[mesh_pixels].numpy()]])
     first, second, third = corners.unbind(1)

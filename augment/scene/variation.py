@@ -101,7 +101,9 @@ def _vary_geometry(
         scene: Scene of E examples.
         settings: Ranges of the random changes.
         draws: Generator of the random numbers.
-        once: Whether the new examples are rendered in one lighting only.
+        once: Whether each new example is rendered in one lighting only. The copy
+            then renders it directly where that is faster than a transfer
+            operator, which can be used for many lightings.
         is_on_table: Mask of the examples whose object stands on a table, shape (E,).
     """
     examples = _draw_cameras(scene, settings, draws, is_on_table)

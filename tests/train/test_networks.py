@@ -398,7 +398,7 @@ class TestANetworkThatIsPartOfThePackage:
 
 def test_the_folder_of_a_run_is_no_name_of_a_classifier(finished):
     for path in (finished, finished / "weights.pt"):
-        with pytest.raises(InputError, match=f"belongs to a run: give run:{finished}"):
+        with pytest.raises(InputError, match=f"give name=run:{finished}"):
             load_network(str(path))
 
 

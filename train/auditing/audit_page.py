@@ -537,7 +537,8 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
         hits = np.array([correct[name] for name in sorted(names)], float).T
         if hits.min() == hits.max():
             # If all renders have the same result, the bootstrap interval has no width.
-            # Wilson's interval is used instead, with one render of each view.
+            # Wilson's interval for the fraction of views is used instead. The results in all
+            # lights are equal, so those in the first light are counted.
             rates[title] = fraction(int(hits[:, 0].sum()), len(hits))
             continue
         # Index of the view in each entry of `hits.ravel()`.

@@ -255,7 +255,8 @@ def adversaries(
     # `AttackSettings` has an attribute for each kind of lighting, with the norm-ball.
     settings: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
     if additional:
-        # The attack never stops early, because it cannot reach a margin of MAX_SCALE.
+        # An attack stops when the wrong class leads by the margin in every view. With this
+        # margin, which no attack can reach, it takes all steps.
         settings |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}

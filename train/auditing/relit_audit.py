@@ -84,9 +84,11 @@ def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Pa
     Raises:
         InputError: If the folder holds no photograph that can be read.
     """
+    # A path below pretrained/ is found from any working folder.
+    folder = published(Path(str(settings.photographs)))
     attack_folder(
         classifier,
-        published(Path(str(settings.photographs))),
+        folder,
         RelightingSettings(passes=PASSES),
         out,
         seed=settings.seed,

@@ -53,11 +53,13 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
         InputError: If the network cannot be loaded.
     """
     if settings.run is None:
+        # Error messages about the argument `name` begin with the setting `classifier` instead.
         with keyed(name="classifier"):
             return load_chosen(settings)
     # The file of a training run has its classes, size and normalization. These settings
     # are therefore an error here.
-    facts = as_facts(settings.classes, settings.size, settings.normalization)
-    require_no_facts(f"run={settings.run}", facts)
+    given_values = as_facts(settings.classes, settings.size, settings.normalization)
+    require_no_facts(f"run={settings.run}", given_values)
     classifier = load_run(settings.run, settings.weights, settings.model)
+    # The returned copy normalizes the light of each image, unless the setting is None.
     return classifier.normalizing_light(settings.normalize_light)

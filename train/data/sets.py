@@ -85,7 +85,7 @@ class Split:
         return (images[batch] for batch in rows)
 
     def sample(self, count: int) -> Tensor:
-        """Return images at equal distances in the split.
+        """Return images whose indices are evenly spread from the first to the last image.
 
         Args:
             count: Number of images to return. If the split has fewer, all are

@@ -53,7 +53,7 @@ class Table:
     rows: Sequence[Sequence[object]]
 
     @property
-    def known(self) -> "Table":
+    def without_unknown_columns(self) -> "Table":
         """Copy of the table without the columns whose cells are all "-", for unknown."""
         known_columns = []
         for column in range(len(self.header)):

@@ -188,14 +188,14 @@ def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Eval
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Check that there are photographs of each source that a user excludes.
+    """Check that each source that a user excludes is the source of some photograph.
 
     Args:
         names: Names of the excluded sources.
         predictions: Predictions for all photographs, with their sources.
 
     Raises:
-        InputError: If no photograph is of one of the sources.
+        InputError: If an excluded source has no photograph.
     """
     sources = {item.photograph.source for item in predictions}
     unknown = set(names) - sources
@@ -370,9 +370,9 @@ def difference(
     assert change.low is not None and change.high is not None
     margin = 0.0
     if change.low == change.high:
-        # All replicates are equal: both methods agree on every image. The true
-        # difference can still be up to the upper end of the Wilson interval (Wilson
-        # 1927) for 0 differences among the images.
+        # All bootstrap replicates of the difference are equal, because both methods
+        # agree on every image. The true difference can still be up to the upper end
+        # of the Wilson interval (Wilson 1927) for 0 differences among the images.
         image_count = min(len(pools[0].positives), len(pools[0].negatives))
         margin = fraction(0, max(1, image_count)).high or 0.0
     return Difference(
@@ -494,7 +494,7 @@ def _format_tables(tables: Sequence[Table]) -> str:
 
     A table without rows, and a column without known values, are left out.
     """
-    return "\n\n".join(str(table.known) for table in tables if table.rows)
+    return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
 
 
 def format_comparison(
@@ -550,8 +550,8 @@ def format_short_comparison(
         photographs: Name of the sub-folder of each run with its scores on
             photographs. If no run has the usual sub-folder "photographs", the
             first photographs on which the runs were scored are compared.
-        by: "source" for a row for each method. "mesh" or "class" for a row for
-            each method and each mesh or class.
+        by: "mesh" or "class" for a row for each method and each mesh or class.
+            "source" for a row for each method only.
 
     Returns:
         Markdown table of means over the runs of a method. A row for each method
@@ -568,7 +568,7 @@ def format_short_comparison(
         group = next(iter(groups.values()))
     evaluations = read_evaluations(group, exclude, by) if group else {}
     if by != "source" and evaluations:
-        return str(group_table(evaluations, _title_of_all(exclude), by).known)
+        return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
     titles = [title for title, members in groups.items() if members is group]
     rows = []
     for method, runs_of_method in methods.items():
@@ -583,7 +583,7 @@ def format_short_comparison(
         gain = _format_gain(evaluations, method)
         rows.append([method, len(runs_of_method), *values, gain])
     header = ["network", "runs", "test accuracy", *map(metric_title, SHORT_METRICS)]
-    return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).known)
+    return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
 
 
 def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:

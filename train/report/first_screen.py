@@ -444,7 +444,7 @@ def _rounded(value: float, decimals: int, sign: str = "") -> str:
     """
     text = f"{value:{sign}.{decimals}f}"
     if float(text) == 0:
-        # Smaller numbers come from the rounding of floats.
+        # A number below 1e-4 is taken as 0 with a rounding error.
         is_zero = abs(value) < 1e-4
         text = "0" if is_zero else f"{value:{sign}.1g}"
     # The text gets a typographic minus sign instead of a hyphen.

@@ -628,7 +628,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         "name": title,
         "sheets": sheets,
         "rocs": rocs,
-        "tables": [table.known for table in tables],
+        "tables": [table.without_unknown_columns for table in tables],
         "problem": problem,
     }
 

@@ -114,9 +114,11 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         folder: Folder of the run.
 
     Returns:
-        Pair of the content, and None. If last.pt is missing or damaged, the
-        content is that of previous.pt, and a sentence that says what is wrong
-        with last.pt replaces None.
+        Two values:
+        - the content of last.pt, or of previous.pt if last.pt is missing or
+          damaged;
+        - None if last.pt was read, or else a sentence that says what is wrong
+          with last.pt.
 
     Raises:
         InputError: If there is no undamaged checkpoint.

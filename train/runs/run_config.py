@@ -40,7 +40,7 @@ NOT_RECORDED = ("run=", "train.resume=")
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[str]:
-    """Read a text file, whose text is parsed in the block.
+    """Read a text file for a `with` block that parses the text. Errors name the file.
 
     Args:
         path: File in UTF-8.
@@ -49,8 +49,8 @@ def opened_text(path: Path) -> Iterator[str]:
         Text of the file.
 
     Raises:
-        InputError: If the file cannot be read, or if the block raises any error.
-            The message names the file.
+        InputError: If the file cannot be read, or if the `with` block raises any
+            error. The message names the file.
     """
     try:
         if not path.is_file():
@@ -115,6 +115,7 @@ def read_config(path: Path) -> DictConfig:
         InputError: If the file is missing or damaged, or holds an alias or an
             interpolation.
     """
+    # `opened_text` turns any error in its block into an InputError that names the file.
     with opened_text(path) as text:
         events = yaml.parse(text, yaml.SafeLoader)
         if "${" in text or any(isinstance(event, yaml.AliasEvent) for event in events):

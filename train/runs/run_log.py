@@ -30,7 +30,7 @@ EXAMPLE = 128
 # Phases of an epoch. The log has the seconds of each phase. Together, the phases take
 # the whole time of the epoch.
 PHASES = ("attack", "training", "evaluation", "input_output")
-# Number of renders in a row of an image with all renders of an epoch.
+# All renders of an epoch are logged as one image, a grid with this many columns.
 GRID_COLUMNS = 20
 
 

@@ -76,7 +76,9 @@ def load_network(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     folder = _find_run(Path(name))
     if folder is not None:
-        raise InputError(f"name={name} belongs to a run: give {RUN}{folder} instead", "name")
+        raise InputError(
+            f"name={name} is a file of a training run: give name={RUN}{folder} instead", "name"
+        )
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
         # Errors about the folder name the argument `name`, in which the user gave it.

@@ -180,7 +180,8 @@ class SignalHandler:
         If a batch system sent the signal and has installed a handler for it, this handler is
         called first. It may put the job into the queue again and end the process.
         """
-        # If only another process got a signal, this process ends as if by SIGTERM.
+        # `_number` is None if other processes of the run got a signal, but not this process.
+        # This process then ends as if it got SIGTERM.
         number = self._number or signal.SIGTERM
         if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
             signal.raise_signal(number)

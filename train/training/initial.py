@@ -294,7 +294,7 @@ def choose_validation(
     """
     asked = settings.data.validation
     fraction = _default_fraction(data) if asked is None else asked
-    # Record of the images that this run leaves out.
+    # Numbers that determine which training images the run leaves out for validation.
     record = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
     if data.rendered:
         record["data"] = "shapes"

@@ -165,7 +165,7 @@ class Trainer:
         self.history: list[dict[str, float]] = []
 
         # State of the epoch that has begun. None between two epochs.
-        self._under_way: EpochState | None = None
+        self._epoch_state: EpochState | None = None
         # States of the random generators at the checkpoint from which a run is resumed.
         self._random_state: dict[str, Any] = {}
         # Content of best.pt, until it is written.
@@ -272,7 +272,7 @@ class Trainer:
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
-                if is_stopping or is_last or (is_due and self._under_way is None):
+                if is_stopping or is_last or (is_due and self._epoch_state is None):
                     self._save()
                 if is_stopping:
                     signals.stop()
@@ -299,12 +299,12 @@ class Trainer:
             its last step.
         """
         plan = self._plan(split, rows)
-        if self._under_way is None:
-            self._under_way = self._begin_epoch(plan, log)
+        if self._epoch_state is None:
+            self._epoch_state = self._begin_epoch(plan, log)
         else:
             # The run continues within an epoch, with the random numbers of the first attempt.
             restore_random_state(self._random_state)
-        state = self._under_way
+        state = self._epoch_state
         with closing(self._remaining_batches(plan, state, log)) as batches:
             for batch in batches:
                 step_in_run = self.epoch * plan.total + state.step
@@ -483,14 +483,16 @@ class Trainer:
             rows: Indices of the validation images in `split`, shape (N,).
             log: Log of the run. None in all processes but the first one.
         """
-        state = cast(EpochState, self._under_way)
-        self._under_way = None
+        state = cast(EpochState, self._epoch_state)
+        self._epoch_state = None
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
             validated = evaluate(self._validated, split, rows)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
+        # The network of this epoch replaces the selected network if it is better, or if the
+        # settings select the last network.
         if self.averages.is_kept(validated["accuracy"]):
             self._best = {
                 "model": self.averages.weights(),
@@ -539,8 +541,8 @@ class Trainer:
 
         The former last.pt is renamed to previous.pt. Only the first process writes.
         """
-        if self._under_way:
-            self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
+        if self._epoch_state:
+            self._require_finite(float(self._epoch_state.sums[0]), self.epoch + 1)
         with self.phases("input_output"):
             state = self.state_dict()
             best = self._best
@@ -592,7 +594,7 @@ class Trainer:
             "precision": self.model.precision,
             "service": self.service.state_dict(),
             "random_state": random_state(),
-            "under_way": self._under_way.state_dict() if self._under_way else None,
+            "under_way": self._epoch_state.state_dict() if self._epoch_state else None,
             "history": self.history,
         }
 
@@ -618,7 +620,7 @@ class Trainer:
             self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
         if state["under_way"]:
-            self._under_way = self._restore_epoch(state["under_way"])
+            self._epoch_state = self._restore_epoch(state["under_way"])
 
     def _restore_epoch(self, state: Mapping[str, Any]) -> EpochState:
         """Restore the state of an epoch that had begun when a checkpoint was written.
@@ -658,7 +660,7 @@ class Trainer:
             # last.pt is damaged. It is removed, since it would otherwise replace the
             # undamaged previous.pt when the next checkpoint is written.
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)
-        steps = self._under_way.step if self._under_way else 0
+        steps = self._epoch_state.step if self._epoch_state else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
 
     def _require_own_best(self) -> None:

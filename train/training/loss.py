@@ -67,12 +67,13 @@ class TrainingLoss:
         """
         settings = self._settings
         logits = self._model(to_unit(images))
-        targets = None
+        teacher_logits = None
         if self._teacher is not None:
             with torch.no_grad():
-                targets = self._teacher(to_unit(images))
+                teacher_logits = self._teacher(to_unit(images))
+            # Without labels, a photograph has the class that the teacher predicts.
             if not self._labeled:
-                labels = torch.where(rendered, labels, targets.argmax(1))
+                labels = torch.where(rendered, labels, teacher_logits.argmax(1))
 
         # A complementary label (below 0) says that an image is not of the first positive
         # class. Such an image is not of the other positive classes either.
@@ -81,12 +82,12 @@ class TrainingLoss:
         if not self._labeled:
             losses = losses * rendered
         loss = losses.mean()
-        if targets is not None:
-            divergences = self._divergences(logits, targets, rendered)
+        if teacher_logits is not None:
+            divergences = self._divergences(logits, teacher_logits, rendered)
             loss = loss + settings.distillation_weight * divergences.mean()
-        if targets is not None and augmented is not None:
+        if teacher_logits is not None and augmented is not None:
             augmented_logits = self._model(to_unit(augmented))
-            divergences = kl_divergence(augmented_logits, targets) * ~rendered
+            divergences = kl_divergence(augmented_logits, teacher_logits) * ~rendered
             loss = loss + settings.consistency_weight * divergences.mean()
         if self._positive_classes and settings.ranking_weight:
             loss_sum = sum(ranking_loss(logits, labels, label) for label in self._positive_classes)

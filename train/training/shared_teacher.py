@@ -60,10 +60,11 @@ class SharedTeacher(nn.Module):
         self._features = inputs[0].detach()
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of the teacher for the images with which the pupil was called last.
+        """Return the logits of the teacher for the last images of the network in training.
 
         Args:
-            images: The same images, shape (B, 3, H, W).
+            images: The images with which the network in training (the pupil) was
+                called last, shape (B, 3, H, W).
 
         Returns:
             Logits, shape (B, classes).

@@ -141,8 +141,10 @@ class Parameter(ABC):
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
 
         Args:
-            values: D values in each of A examples, shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            values: D attacked values of each of A examples, shape (A, D). An example is an
+                object with its views.
+            examples: Index of each of the A examples among all examples of the attacked scene,
+                shape (A,).
 
         Returns:
             Projected values, shape (A, D).

@@ -51,11 +51,14 @@ def kept_aside_settings(
     meshes: list[Any] = []
     for label in labels:
         meshes += _positives(settings, label)
+    # Names are compared in lower case and with spaces instead of "_" and "-", as `simplified`
+    # returns them.
     simplified_labels = {simplified(label) for label in labels}
     class_of_simplified = {simplified(name): name for name in classes}
     for solid_name in NEGATIVES:
         if simplified(solid_name) in simplified_labels:
             continue
+        # A solid that is no class of the network gets a label that marks it as another object.
         label = class_of_simplified.get(simplified(solid_name), OTHER_PREFIX + solid_name)
         meshes += _generated(solid_name, label, NEGATIVE_COUNT)
     return LabSettings(

@@ -258,7 +258,9 @@ def write_laboratory(settings: LabSettings) -> int:
     paths = [Path(path) for path in settings.environments]
     environments = {path.stem: _read_environment(path) for path in paths}
     groups = _group_subjects(subjects, label_names(settings.label))
+    # Pictures that a projector can show.
     slides = [_read_slide(path) for path in settings.slides]
+    # A shot, or setup, is a random lighting, camera and pose in which objects are rendered.
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
         _require_empty(out, settings.overwrite)
@@ -342,7 +344,7 @@ def _write_render(
     shot: Shot,
     number: int,
 ) -> str:
-    """Render a mesh in a shot, and write the image as an 8-bit sRGB file.
+    """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file.
 
     Args:
         out: Folder of the test set.

@@ -121,8 +121,8 @@ def draw_shots(
     for lighting, index in product(lightings, range(shots_per_lighting)):
         rng = np.random.default_rng(stream_seed(settings.seed, "shot", lighting, index))
         extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", lighting, index))
-        # The range of log(brightness) is divided into equal intervals. Each shot draws
-        # its brightness from one of them.
+        # The range of log(brightness) is divided into equal intervals, one for each of
+        # the shots in a lighting. A shot draws its brightness from its interval.
         position = (index + rng.uniform()) / shots_per_lighting
         brightness = dimmest * (brightest / dimmest) ** position
         patterns = PLAIN_PATTERN if lighting in environments else lighting

@@ -247,7 +247,7 @@ class Pool:
             predictions: Predictions. Each of their labels has a threshold.
 
         Returns:
-            The predictions. Those above the threshold are hits.
+            All given predictions, and whether each is a hit: above the threshold.
         """
         hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
         return Outcome(predictions, hits)
