@@ -14,7 +14,7 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 WIDTH = 1000
-HEIGHT = 1000
+HEIGHT = 1060
 COLORS = 128  # Colors of the file's palette.
 
 
