@@ -705,8 +705,9 @@ class _Target(NamedTuple):
         Returns:
             Weight of each coefficient, shape (49,).
         """
-        # Coefficient 0 is uniform light. The small summand keeps
-        # the weights above 0, even if the object is black.
+        # Entry (0, 0) is the sum over pixels of the squared radiance under
+        # uniform light (coefficient 0). The small summand keeps the sum
+        # above 0 if the object is black.
         squared_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
         return SMOOTHNESS_WEIGHT * squared_brightness * (1 + (band * (band + 1)).square())

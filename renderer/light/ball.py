@@ -78,11 +78,12 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
 def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
     """Project each row of values onto the intersection of a box and an L2 ball.
 
-    Let v be a row, c the center of its ball, and λ the Lagrange multiplier of the
-    ball. The projection is the point of the box that is nearest to
-    c + (v - c) / (1 + λ). The squared distance of this point from c is a concave
-    and piecewise linear function of s = 1 / (1 + λ)². Newton's method from s = 0
-    therefore reaches the squared radius without passing it.
+    Let v be a row and c the center of its ball. The projection is the point of the
+    box that is nearest to c + f (v - c), with a factor f from 0 to 1. (It is
+    1 / (1 + λ) with the Lagrange multiplier λ of the ball.) The squared distance of
+    this point from c is a concave and piecewise linear function of f². Newton's
+    method, which starts at f² = 0, therefore reaches the squared radius without
+    passing it.
 
     Args:
         values: N rows v of values, shape (N, ...).
@@ -96,23 +97,26 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     offset = values - ball.center
     squared_radius = ball.radius**2
     rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
-    # The number s = 1 / (1 + λ)² of each row, in a shape that broadcasts to `values`.
-    s = offset.new_zeros(())
+    # The factor f² of each row, in a shape that broadcasts to `values`.
+    squared_factor = offset.new_zeros(())
     # Squared distance between the center and the nearest point of the box, and its
-    # derivative with respect to s.
+    # derivative with respect to f².
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
     for _ in range(_MAX_STEPS):
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
-        s = (s + step.clamp(min=0)).clamp(max=1)
-        # The target c + √s (v - c) is v if s = 1. Taking `values` avoids rounding errors.
-        target = torch.where(s < 1, ball.center + s.sqrt() * offset, values)
+        squared_factor = (squared_factor + step.clamp(min=0)).clamp(max=1)
+        # The point between the center (factor 0) and the row of `values` (factor 1). For
+        # factor 1, `values` has no rounding errors.
+        between = ball.center + squared_factor.sqrt() * offset
+        target = torch.where(squared_factor < 1, between, values)
         nearest = target.clamp(low, high)
-        # Clamped values do not change with s.
+        # Clamped values do not change with the factor.
         slope = _squared_norm(offset * (nearest == target))
         squared_distance = _squared_norm(nearest - ball.center)
-        is_too_short = (s < 1) & (squared_radius - squared_distance > rounding)
+        is_inside = squared_radius - squared_distance > rounding
+        is_too_short = (squared_factor < 1) & is_inside
         if not is_too_short.any():
             break
     return nearest

@@ -344,8 +344,8 @@ class LocalBasis(Basis):
 
         Args:
             coefficients: RGB coefficients of the light, shape (size, 3).
-            albedo_scale: Factor for the albedo of the mesh. It multiplies the
-                emitters instead, which gives the same image.
+            albedo_scale: Factor for the albedo of the mesh. Here it multiplies the
+                light, which gives the same image.
 
         Returns:
             For each emitter, the dictionary that describes it in a Mitsuba scene.
@@ -357,7 +357,9 @@ class LocalBasis(Basis):
         return [LocalPart(slice(0, self.size), self)]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Clamp RGB coefficients to [0, power], so that the light can exist.
+        """Clamp RGB coefficients to the range from 0 to the `power` of this light source.
+
+        A lamp or projector cannot emit less than nothing or more than its power.
 
         Args:
             coefficients: RGB coefficients of the lights, shape (..., size, 3).

@@ -342,17 +342,21 @@ def monomial_coefficients(degree: int) -> Tensor:
     # coefficient of x^(a-1) y^b z^c in the derivative with respect to x, divided by a. If
     # a = 0, the derivative with respect to y is used, and if a = b = 0, to z.
     lower_coefficients = monomial_coefficients(degree - 1)
-    lower_gradients = homogeneous_gradients(degree)[:, : lower_coefficients.shape[1]]
-    along_x, along_y, along_z = lower_coefficients @ lower_gradients
-    divisors = []
+    # Derivatives with respect to x, y and z as sums of harmonics of bands below `degree`.
+    # Axes: direction of the derivative, harmonic in the sum, harmonic Y_k.
+    in_harmonics = homogeneous_gradients(degree)[:, : degree**2]
+    # The same derivatives as sums of monomials of degree `degree` - 1: one row for each
+    # monomial, one column for each harmonic Y_k.
+    along_x, along_y, along_z = lower_coefficients @ in_harmonics
+    powers = []
     for a in range(degree, -1, -1):
         for b in range(degree - a, -1, -1):
-            # Divide by a, or by b if a = 0, or by the power of z (`degree`) if a = b = 0.
-            divisors.append(a or b or degree)
-    # First all monomials with a factor x, then those with a factor y but not x (the
-    # last `degree` rows of the derivative with respect to y), and then z^degree.
+            # Power of x, or of y if a = 0, or of z if a = b = 0.
+            powers.append(a or b or degree)
+    # First come all monomials with x. Those with y but without x come from the last
+    # `degree` rows of `along_y`, which are without x. The last monomial is z^degree.
     derivatives = torch.cat([along_x, along_y[-degree:], along_z[-1:]])
-    return derivatives / torch.tensor(divisors)[:, None]
+    return derivatives / torch.tensor(powers)[:, None]
 
 
 def monomials(vectors: Tensor, degree: int) -> Tensor:

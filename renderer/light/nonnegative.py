@@ -466,9 +466,11 @@ class _QuadraticProgram:
     def _step_to_sphere(
         self, velocity: Array, displacement: Array, missing_squared: float
     ) -> float:
-        """Find the change of t that brings the solution onto the sphere |x - c| = r.
+        """Find the change of t that brings the solution x onto the sphere |x - c| = r.
 
-        The change s solves the quadratic equation |displacement + s velocity| = r.
+        The solution is the projection of the point c + t (v - c), which lies between
+        the center c of the ball (t = 0) and the given light v (t = 1). The change s
+        of t solves the quadratic equation |displacement + s velocity| = r.
         It is clipped so that t stays between its minimum and 1.
 
         Args:
@@ -477,7 +479,7 @@ class _QuadraticProgram:
             missing_squared: r² - |x - c|².
 
         Returns:
-            The change s of t.
+            The change s.
         """
         squared_speed = float((velocity * velocity).sum())
         slope = float((velocity * displacement).sum())
@@ -565,7 +567,8 @@ def _least_distance(
     norm = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
-    # Matrix G, with the M directions first, then the lower and then the upper bounds.
+    # Matrix G of the constraints G d ≥ h. First come the rows for the radiance in M
+    # directions, then those for the lower bounds, and then those for the upper bounds.
     left_sides = np.concatenate([harmonics, axes, -axes])
     from_low = (low - original)[is_bounded]
     from_high = (original - high)[is_bounded]

@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 # inequalities, relative to their right sides. The second is the duality gap (the sum of
 # the products of slacks and multipliers), relative to the squared length of y.
 _TOLERANCE = 1e-9
-# `shortest` stops only if y = matrixᵀ multipliers holds, too, up to this number times the
-# length of y.
+# At the optimum, the shortest vector y is matrixᵀ multipliers. `shortest` only stops if the
+# length of the difference is at most this number times the length of y.
 _STATIONARITY_TOLERANCE = 1e-6
 # Largest number of steps of `shortest`. 15 to 40 are usual.
 _MAX_STEPS = 80

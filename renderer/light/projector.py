@@ -131,8 +131,8 @@ class Projector(LocalBasis):
             One path for each point that lies within the pattern and faces the
             projector, also if an object blocks the path.
         """
-        # A camera in the direction of the projector has the axes of the pattern: right, up
-        # and back (away from the origin), one axis for each row.
+        # Axes of the pattern, one for each row: right, up and back (away from the origin). A
+        # camera at the position of the projector has the same axes.
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]
         right, up, back = ((points - source) @ axes.T).unbind(1)
@@ -161,8 +161,8 @@ class Projector(LocalBasis):
 
         Args:
             coefficients: RGB coefficients of the pixels, shape (pixels², 3).
-            albedo_scale: Factor for the albedo of the mesh. It multiplies the
-                pattern instead, which gives the same image.
+            albedo_scale: Factor for the albedo of the mesh. Here it multiplies the
+                light, which gives the same image.
 
         Returns:
             List with one entry.
@@ -170,6 +170,8 @@ class Projector(LocalBasis):
         texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
-        # Mitsuba's projector has the factor π already, in contrast to its lamps.
+        # The coefficients are irradiances at the origin. Mitsuba needs those at distance 1
+        # from the projector, which are larger by the factor distance². Mitsuba
+        # itself multiplies them by π.
         scale = albedo_scale * self.distance**2
         return [projector(pose_of(camera), self.fov, pattern, scale)]

@@ -275,11 +275,12 @@ class SampleGloss(NamedTuple):
             Factor A_l - s B_l of each of the K coefficients, shape (K, S), or
             (K, 1) if all samples have the same gloss.
         """
-        # Factors B_l with one row for each degree l and one column for each sample.
+        # Factors B_l of the light that the coat reflects: one row for each degree l, one column
+        # for each sample.
         coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ roughness_polynomials(
             self.roughness
         )
-        # Factors A_l with one entry for each SH coefficient of the light.
+        # Factors A_l without a coat, one for each SH coefficient of the light.
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 

@@ -497,7 +497,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     # Rows for m from -degree to degree: sin(|m| a) if m < 0, and cos(ma) if m ≥ 0.
     sines_and_cosines = _complex_powers(angle.cosine, angle.sine, degree)
     sines = sines_and_cosines[:degree]
-    # Rows with sin(ma) for m from -degree to degree.
+    # Rows with sin(ma) for the orders m from -degree to degree, with the angle a.
     signed_sines = torch.cat([-sines, 0 * sines_and_cosines[:1], sines.flip(0)])
     # The harmonic of order -m is 2 m rows before the harmonic of order m in its band.
     opposite_harmonic = torch.arange(len(order), device=coefficients.device) - 2 * order
@@ -674,8 +674,9 @@ def _coat_coefficients() -> Tensor:
         Factors of the products, float64. Each row belongs to a polynomial in the
         roughness, and each column to a polynomial in the cosine.
     """
-    # E(μ) is the integral of the reflectance times n·l over all directions of light. This
-    # is √(4π) times the SH coefficient of degree 0. The table contains π times it.
+    # The reflected fraction E(μ) is the integral of the lobe (reflectance times the cosine
+    # n·l) over all directions l of light. This is √(4π) times the SH coefficient of degree 0
+    # of the lobe. The table contains π times this coefficient.
     return _table(COMMON_DEGREE)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
 
@@ -953,7 +954,8 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
     x = polar.sin() * azimuth.cos()
     y = polar.sin() * azimuth.sin()
     half = torch.stack([x, y, polar.cos()], -1).flatten(1, 2)
-    # Derivative dθ_h / dψ. The solid angle is sin θ_h (dθ_h / dψ) dψ dφ.
+    # Derivative dθ_h / dψ of the polar angle θ_h, given by tan θ_h = α tan ψ. With the
+    # azimuth φ, the solid angle is sin θ_h (dθ_h / dψ) dψ dφ.
     polar_per_psi = alpha * (polar.cos() / psi.cos()) ** 2
     per_azimuth = (largest_psi * weight / 2 * polar_per_psi * polar.sin()).flatten(1)
     return half, per_azimuth * (2 * math.pi / AZIMUTH_COUNT)

@@ -483,8 +483,10 @@ class _IrradiancePolynomial:
 def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Compute the matrices that map SH coefficients of a light to the gradient of irradiance.
 
-    The irradiance is the polynomial c + a · n + p(n) of the normal n, see
-    `_IrradiancePolynomial`.
+    The irradiance is a polynomial c + a · n + p(n) of the normal n. The constant c
+    comes from the harmonic of degree 0, the vector a from those of degree 1, and
+    the homogeneous polynomial p from those of even degree from 2 on. The gradient
+    is therefore a + ∇p(n).
 
     Args:
         degree: Degree of the light.
@@ -492,14 +494,16 @@ def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) ->
         device: Device of the result.
 
     Returns:
-        One matrix for each of the 3 components of the gradient,
-        shape (3, J + 1, K'). The first J rows give the coefficients of ∇p in
-        monomials, and the last row gives the vector a. The K' columns belong to
-        the SH coefficients up to the degree of p.
+        One matrix for each of the 3 components of the gradient, with one column
+        for each SH coefficient up to the degree of p. The last row gives the
+        component of a. The other rows give the coefficients of the component of
+        ∇p, one for each monomial. Shape (3, monomials + 1, coefficients).
     """
     even_degree = _even_degree(degree)
-    # `_gradients(1)` has a column for each of the 4 harmonics up to degree 1.
-    linear_gradients = F.pad(_gradients(1), (0, (even_degree + 1) ** 2 - 4))
+    coefficient_count = (even_degree + 1) ** 2
+    # Gradients of the 4 harmonics up to degree 1, and zeros for all other harmonics.
+    linear_gradients = F.pad(_gradients(1), (0, coefficient_count - 4))
+    # Axes: component of the gradient, monomial (the constant 1 last), harmonic.
     gradients = torch.cat([_gradients(even_degree), linear_gradients], dim=1)
     irradiance_gradients = gradients * harmonics.lambertian_factors(even_degree)
     return irradiance_gradients[..., : (degree + 1) ** 2].to(device, dtype)
@@ -539,7 +543,10 @@ def _gradients(degree: int) -> Tensor:
         harmonic. Columns are zero for l = 0 and for l of the other parity.
     """
     band = harmonics.bands(degree)
+    # Each gradient as a sum of harmonics below `degree`. Axes: component of the gradient,
+    # harmonic in the sum, harmonic Y_k.
     in_harmonics = harmonics.homogeneous_gradients(degree)[:, : degree**2]
+    # The same gradients as sums of monomials.
     in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
     has_same_parity = band % 2 == degree % 2
     return in_monomials * ((band > 0) & has_same_parity)

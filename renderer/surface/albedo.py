@@ -126,9 +126,9 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
         return interpolate_texture(textures[0], sample_uvs)
     sample_to_seen_face = fragments.sample_to_seen_face
     texture_of_sample = texture_of_face.index_select(0, sample_to_seen_face)
-    # The two lists get the samples that show each texture, and the values of the texture
-    # at these samples.
+    # Indices of the samples that show each texture.
     samples_by_texture = []
+    # Values of each texture at these samples.
     values_by_texture = []
     for texture_id, texture in enumerate(textures):
         samples = torch.nonzero(texture_of_sample == texture_id).squeeze(1)

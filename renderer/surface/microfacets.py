@@ -27,9 +27,9 @@ from renderer.vectors import unit
 # the default of glTF.
 REFRACTIVE_INDEX = 1.5
 
-# Indices of the three Fresnel terms in the results of `fresnel` and `reflectance`. For
-# metals, Schlick's approximation is F0 + (F90 - F0) (1 - cosine)⁵ = F0 · SCHLICK + F90 ·
-# EDGE. For other surfaces, DIELECTRIC is exact.
+# Indices of the three Fresnel terms in the results of `fresnel` and `reflectance`. A metal
+# reflects the fraction F0 · SCHLICK + F90 · EDGE (Schlick's approximation), with the
+# fractions F0 at 0° and F90 at 90°. Other surfaces reflect the fraction DIELECTRIC.
 SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
@@ -101,22 +101,23 @@ def _masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
 
 
 def fresnel(cosine: Tensor) -> Tensor:
-    """Compute the fraction of light that a microfacet reflects, in three models.
+    """Compute three Fresnel terms, which depend on the angle between light and microfacet.
 
-    SCHLICK is 1 - (1 - cosine)⁵ and EDGE is (1 - cosine)⁵. DIELECTRIC is equation
-    22 of Walter et al. (2007), for unpolarized light and the refractive index
-    REFRACTIVE_INDEX. In this equation, the perpendicular and the parallel
-    polarization have the common factor (g - c)² / (g + c)², with the cosine c and
-    g² = REFRACTIVE_INDEX² - 1 + c².
+    A metal reflects the fraction F0 · SCHLICK + F90 · EDGE (Schlick's
+    approximation), with SCHLICK = 1 - (1 - c)⁵, EDGE = (1 - c)⁵ and the cosine c
+    of the angle of incidence. The fractions at 0° and 90° are F0 and F90. Other
+    surfaces reflect the fraction DIELECTRIC of unpolarized light. With
+    g² = n² - 1 + c² and the refractive index n (REFRACTIVE_INDEX), it is
+    ((g - c) / (g + c))² (1 + ((c (g + c) - 1) / (c (g - c) + 1))²) / 2
+    (Walter et al. 2007, equation 22).
 
     Args:
-        cosine: Cosine v·h of the angle of incidence, in [0, 1], shape (...).
+        cosine: Cosine c of the angle of incidence, in [0, 1], shape (...).
 
     Returns:
-        Reflected fractions for SCHLICK, EDGE and DIELECTRIC, in [0, 1],
-        shape (3, ...).
+        SCHLICK, EDGE and DIELECTRIC, each in [0, 1], shape (3, ...).
     """
-    # This is REFRACTIVE_INDEX times the cosine of the refracted ray (Snell's law).
+    # Refractive index times the cosine of the refracted ray (Snell's law).
     refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()
     # Reflected fraction of the amplitude of light that is polarized perpendicular to the
     # plane of incidence.

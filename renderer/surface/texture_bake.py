@@ -196,7 +196,7 @@ class _TextureSheet:
         self._mesh = mesh
         self._faces = faces
         self._old_texture = mesh.textures[texture_id]
-        # A gloss texture without channels stands for a mesh without gloss textures.
+        # An image with 0 channels is used if the mesh has no gloss textures.
         self._old_gloss_texture = np.zeros((1, 1, 0), dtype=np.uint8)
         if mesh.gloss_textures:
             self._old_gloss_texture = mesh.gloss_textures[texture_id]
@@ -244,7 +244,8 @@ class _TextureSheet:
 
         Args:
             albedo: Linear albedo of T texels, changed in place, shape (T, 3).
-            texels: The T texels.
+            texels: The T texels. `texels.chart` is the index of the face of each
+                texel.
             corner_albedo: Linear color of the three corners of each of the N
                 faces, shape (N, 3, 3).
         """
@@ -289,7 +290,7 @@ class _Charts:
     """
 
     def __init__(self, uvs: np.ndarray, old_size: tuple[int, int]) -> None:
-        """Compute the size of each chart, and place the charts on the sheet.
+        """Compute the size of the rectangle of each face, and place it on the new texture.
 
         Args:
             uvs: Texture coordinates in the old texture of the three corners of

@@ -28,8 +28,9 @@ FEWEST_COPIES = 2**12
 
 @dataclass(frozen=True)
 class DistinctPixels:
-    """The D distinct pixels of a view, and the other pixels, which are copies of them.
+    """D groups of pixels of a view that are equal in every light.
 
+    One pixel of each group is its distinct pixel. The others are its copies.
     Pixels are given by their indices among the P covered pixels, or, after `at`,
     by other indices such as those in the image.
 
@@ -58,10 +59,10 @@ class DistinctPixels:
         return replace(self, distinct=distinct, copies=copies)
 
     def write(self, values: Tensor, canvas: Tensor) -> Tensor:
-        """Write the values of the distinct pixels to these pixels and to their copies.
+        """Write one value for each group of equal pixels to all pixels of the group.
 
         Args:
-            values: Values of the distinct pixels, shape (..., D).
+            values: Values of the D groups, shape (..., D).
             canvas: Tensor to change in place, shape (..., pixels).
 
         Returns:
@@ -77,13 +78,13 @@ class DistinctPixels:
         return canvas.scatter_(-1, copies, values.gather(-1, copy_to_distinct))
 
     def add_up(self, values: Tensor) -> Tensor:
-        """Add the values of all copies to the values of the distinct pixels.
+        """Add up the values of the pixels in each of the D groups of equal pixels.
 
         Args:
             values: Values of the pixels, shape (..., pixels).
 
         Returns:
-            Sums for the distinct pixels, shape (..., D).
+            Sums for the groups, shape (..., D).
         """
         batch_shape = values.shape[:-1]
         distinct = self.distinct.expand(*batch_shape, -1)

@@ -36,7 +36,8 @@ class SparseTransfer(NamedTuple):
     """The N nonzero entries of a matrix from light coefficients to pixel radiance.
 
     Attributes:
-        function: Index of the basis function of each entry, int64, shape (N,).
+        function: Index of the basis function (lamp, or pixel of a projector) whose
+            light each entry describes, int64, shape (N,).
         pixel: Index of the covered pixel of each entry, int64, shape (N,).
         weight: Radiance of the pixel per unit of the function's coefficient, in
             C = 1 or 3 color channels, shape (N, C).
@@ -66,7 +67,10 @@ class SparseTransfer(NamedTuple):
         return flat_matrix.unflatten(1, (len(functions), pixel_count)), functions
 
     def is_sparse(self, pixel_count: int) -> bool:
-        """Tell whether multiplying entry by entry is faster than a product with `dense`.
+        """Tell whether multiplying entry by entry is faster than a product with a dense matrix.
+
+        The dense matrix has one column for each covered pixel, and one row for each
+        basis function that has a nonzero entry.
 
         Args:
             pixel_count: Number P of covered pixels.
@@ -74,10 +78,12 @@ class SparseTransfer(NamedTuple):
         Returns:
             True if entry by entry is faster.
         """
-        dense_size = len(self.function.unique()) * pixel_count
+        row_count = len(self.function.unique())
+        dense_size = row_count * pixel_count
         if dense_size <= SMALL_MATRIX_SIZE:
             return False
-        return len(self.function) < SPARSE_FRACTION * dense_size
+        entry_count = len(self.weight)
+        return entry_count < SPARSE_FRACTION * dense_size
 
     def to(self, device: torch.device | str) -> SparseTransfer:
         """Return a copy of the entries on another device.

@@ -304,8 +304,9 @@ def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
     except RuntimeError as error:
         given = tuple(images.shape)
         raise InputError(
-            f"background of shape {given} does not broadcast to the images {tuple(shape)}: "
-            "give one background image, or one per view and light"
+            f"background has the shape {given}, which does not broadcast to the shape "
+            f"{tuple(shape)} of the rendered images: give one background image, or one per view "
+            "and light"
         ) from error
 
 

@@ -363,14 +363,17 @@ class TransferOperator:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
-        """Compute the radiance of the D distinct pixels, without autograd or checks of `lights`.
+        """Compute the light that D pixels send to the camera, without autograd or checks.
+
+        Pixels that are equal in every light are computed once, which leaves the D
+        distinct pixels.
 
         Args:
-            lights: Coefficients, shape (..., coefficients, 3).
+            lights: Coefficients of the lights, shape (..., coefficients, 3).
 
         Returns:
-            Radiance times coverage, in a new tensor with the dtype of the lights,
-            shape (..., 3, D).
+            Radiance of each pixel, times the fraction of the pixel that the mesh
+            covers, in a new tensor with the dtype of the lights, shape (..., 3, D).
         """
         dtype = self.distinct_transfer.dtype
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
@@ -393,7 +396,9 @@ class TransferOperator:
         return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
     def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """Convert a gradient from the radiance of the D distinct pixels to the lights.
+        """Convert a gradient from the radiance of D pixels to the lights.
+
+        The D pixels are the distinct pixels: one of each group of equal pixels.
 
         Args:
             radiance_gradient: Gradient with respect to the radiance, which is not
@@ -1003,8 +1008,9 @@ class _OperatorBuilder:
             environment: Environment light of the basis.
             surface: Points, normals and gloss at the samples of the view.
             channels: Channels and albedo of the transfer matrix.
-            distinct: Pixels that differ from each other, and their copies. None
-                computes all pixels.
+            distinct: Groups of pixels that are equal in every light. Only one pixel
+                of each group (the distinct pixel) is computed. None computes all
+                pixels.
 
         Returns:
             Rows of the matrix, for the distinct pixels if `distinct` is given.
@@ -1025,7 +1031,8 @@ class _OperatorBuilder:
         if self.transport is not None:
             change = self.transport.change(surface, channels.sample_albedo)
         if change is not None:
-            # Unlike `transfer`, the change has a row for every SH coefficient.
+            # `change` has a row for every SH coefficient, and `transfer` only for those in
+            # `coefficients`.
             transfer = change.index_add_(1, coefficients, transfer.double())
             coefficients = all_coefficients
         return _DenseRows(transfer.to(self.dtype), environment.rows.start + coefficients)

@@ -88,6 +88,10 @@ class Patches:
     def from_mesh(mesh: Mesh) -> "Patches":
         """Divide the surface of a mesh into patches of about the same area.
 
+        The faces are first divided into small faces, called pieces. A patch is a
+        group of neighboring pieces. The fronts and the backs of the same pieces are
+        different patches. The backs of a closed mesh are left out.
+
         Args:
             mesh: Mesh to divide.
 
@@ -128,18 +132,21 @@ class Patches:
         )
         smallest = torch.finfo(areas.dtype).tiny
         fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
-        # One row for the fronts of all pieces, one for the backs. Rays never hit the backs
-        # of a closed mesh. For them, `expand` repeats the row of the fronts.
+        # One row for the fronts of all faces, one for their backs. A closed mesh has no row
+        # for backs, because rays never hit them. `expand` then repeats the first row.
         patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
         return Patches(
             pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
         )
 
     def mean(self, values: Tensor) -> Tensor:
-        """Average values of the S sides of pieces over each of the N patches.
+        """Average values over each of the N patches.
+
+        A patch is a group of sides (fronts or backs) of pieces, the small faces of
+        the mesh.
 
         Args:
-            values: D values for each side, in the order of the samples of `view`,
+            values: D values for each of S sides, in the order of the samples of `view`,
                 shape (S, D).
 
         Returns:
@@ -150,6 +157,8 @@ class Patches:
 
     def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
         """Add up the weights of the rays from a pixel that hit the same patch.
+
+        A patch is a group of pieces, the small faces of the mesh `pieces`.
 
         Args:
             hits: Pieces that rays from B pixels hit in D directions, as indices
@@ -275,9 +284,10 @@ class Transport:
                 change = self._sky.new_zeros(shape)
             sample_of_ray = hits.sample_of_ray
             if gloss is not None:
-                # Specular reflectance along each ray: one row for each pixel, one column for
-                # each direction.
-                colored, white = self._reflect_rays(gloss, surface, sample_of_ray)
+                # Two specular reflectances along each ray: one that is later multiplied by
+                # the albedo, because metals color reflections, and one that is white. Axes
+                # of both: pixel, direction.
+                metallic, white = self._reflect_rays(gloss, surface, sample_of_ray)
                 cosine = self._cosines(surface, sample_of_ray)
                 # Fraction of the light that passes the coat to the diffuse layer below it.
                 transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
@@ -285,8 +295,8 @@ class Transport:
                 # Reflected radiance per irradiance, for light along each ray.
                 reflectance = diffuse_albedo[channel][sample_of_ray]
                 if gloss is not None:
-                    metal = albedo_by_channel[channel][sample_of_ray] * colored
-                    specular = metal + white / fragments.samples**2
+                    colored = albedo_by_channel[channel][sample_of_ray] * metallic
+                    specular = colored + white / fragments.samples**2
                     reflectance = reflectance * transmittance + specular
                 blocked = hits.weight * reflectance
                 # Subtract the light of the sky that the mesh blocks: one row for each SH
@@ -298,11 +308,13 @@ class Transport:
         return change
 
     def _received(self, patches: Patches, hits: RayHits, blocked: Tensor, channel: int) -> Tensor:
-        """Compute how much light from patches B pixels reflect, in one color channel.
+        """Compute the light that B pixels receive from patches and reflect, in one color channel.
+
+        A patch is a group of small faces (pieces) of the mesh.
 
         Args:
             patches: The N patches of the mesh.
-            hits: Pieces of patches that rays from the pixels hit in D directions.
+            hits: Pieces that rays from the pixels hit in D directions.
             blocked: Reflected radiance of each pixel per unit radiance that arrives
                 from each direction, shape (B, D). It is 0 in directions of the sky.
             channel: Index of the color channel.
@@ -500,8 +512,8 @@ class _PatchLinks:
         receiving = []
         factors = []
         for hits in rays.hits(surface, directions):
-            # A patch consists of several pieces of surface. A ray that starts at a piece has
-            # the fraction of the piece in the area of the patch as a weight.
+            # A patch consists of several small faces (pieces). The weight of a ray contains
+            # the area of the piece from which it starts, divided by the area of the patch.
             weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
             from_sky[hits.pixels] -= weights @ sky_radiance
             receiving.append(hits.pixels)

@@ -207,10 +207,12 @@ class Rays:
         solid_angle = 4 * math.pi / len(directions)
         pixels_per_block = max(1, BLOCK // len(directions))
         for block in pixels.split(pixels_per_block):
-            # Number of samples of each pixel of the block. The second axis is for directions.
+            # Number of samples of each pixel of the block, with an axis of size 1 for the ray
+            # directions.
             samples_in_pixel = sample_count[block, None]
-            # Deal the directions, in shuffled order, to the samples of the pixel. Adding the
-            # index of the pixel varies the sample for a direction between neighbors.
+            # Each ray of a pixel starts at one of its samples. Shuffled numbers spread the
+            # directions over the samples. Adding the index of the pixel makes neighboring
+            # pixels use different samples for the same direction.
             rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
             sample_of_ray = first_sample[block, None] + rank_in_pixel
             cosine = _dot(surface.normals[sample_of_ray], directions).clamp(min=0)

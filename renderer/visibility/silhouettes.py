@@ -297,8 +297,10 @@ class _MovingView:
         # The difference is NaN if one of the two samples shows no mesh.
         difference.nan_to_num_(0)
         self._correct_pixel_borders(dim, difference, upstream_at_samples)
-        # Differences across silhouettes belong to `gradient_of_silhouettes`.
-        is_along_axis = self.crossings.horizontal == (axis == X)
+        # Set the difference to 0 if a silhouette passes between the two samples. The
+        # function `gradient_of_silhouettes` computes the gradient there.
+        is_in_row = self.crossings.horizontal
+        is_along_axis = is_in_row if axis == X else ~is_in_row
         difference.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
         # The gradient of a sample is the sum of its differences to both neighbors.
         gradient = difference.clone()
@@ -542,7 +544,7 @@ class _Silhouettes:
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
-        # Places where edges cut rows of samples (for the axis X) or columns (for Y).
+        # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
         cuts = _cut_edges(
             start_across=start[1 - axis],
             end_across=end[1 - axis],
@@ -586,15 +588,17 @@ class _Silhouettes:
     ) -> np.ndarray:
         """Tell at which of K places (cuts) a silhouette edge is visible.
 
-        A cut is the place where an edge crosses a row or a column of samples. It is
-        hidden if the surfaces at both samples beside it are nearer than the edge.
+        A cut is the place where an edge crosses a row or a column of samples. The
+        edge is hidden there if the surfaces at both samples beside it are nearer to
+        the camera. It counts as hidden, too, if no sample beside it shows a surface.
 
         Args:
             cuts: The K cuts.
-            samples: Indices of the covered samples before and after each cut, or
-                NOT_COVERED, shape (2, K).
-            surface_nearness: Nearness (larger for nearer points), at each cut, of
-                the surfaces that the two samples show, shape (2, K).
+            samples: Index of the sample before (row 0) and after (row 1) each cut,
+                or NOT_COVERED (-1) if this sample shows no surface, shape (2, K).
+            surface_nearness: Nearness (a number that is larger for nearer points)
+                of the surfaces that the two samples show, extended to the cut,
+                shape (2, K). Minus infinity for NOT_COVERED.
 
         Returns:
             True for visible cuts, shape (K,).
@@ -602,8 +606,12 @@ class _Silhouettes:
         tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
         start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
         edge_nearness = start_nearness + cuts.fraction * (end_nearness - start_nearness)
-        is_in_front = edge_nearness >= surface_nearness.min(axis=0) - tolerance
-        return (samples >= 0).any(axis=0) & is_in_front
+        # If one of the two samples shows no surface, the minimum is minus infinity, and the
+        # edge is in front.
+        farther_nearness = surface_nearness.min(axis=0)
+        is_in_front = edge_nearness >= farther_nearness - tolerance
+        shows_surface = (samples != NOT_COVERED).any(axis=0)
+        return shows_surface & is_in_front
 
     def _surface_nearness(self, samples: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Compute how near the faces beside K cuts are, if they are extended to the cuts.
@@ -758,14 +766,15 @@ def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
 class _Edges(NamedTuple):
     """The N edges of a mesh with F faces.
 
-    Each face has three sides. An edge is a side of one or more faces.
+    Each face has three sides: from corner 0 to corner 1, from 1 to 2, and from 2
+    to 0. Sides with the same two vertices are one edge.
 
     Attributes:
         corners: Vertex indices of the three corners of each face, shape (3, F).
         ends: Vertices at both ends of each edge, the lower index first,
             shape (2, N).
-        edge_of_face_side: Index of the edge for each side of each face, the
-            first sides of all faces first, shape (3 F,).
+        edge_of_face_side: Index of the edge of each side of each face,
+            shape (3 F,). Side i of face f is entry i F + f.
         direction: 1 for sides of faces that lead from the lower to the higher
             vertex index, and -1 for other sides, shape (3, F).
         face_count: Number of faces at each edge, shape (N,).

@@ -35,8 +35,8 @@ SUBSAMPLES = 2**SUBSAMPLE_BITS
 # Depth of the far plane. Depths are integers with 24 bits. Surfaces at the far plane
 # are not drawn.
 FAR = 2**24 - 1
-# A key is an integer that holds the depth of a face at a sample, and in this number of low
-# bits the index of the face.
+# A key is an integer with the depth of a face at a sample in its high bits, and the index
+# of the face in its low bits. This is the number of low bits.
 FACE_BITS = 32
 # Key of samples without a face: a depth just in front of the far plane, and the face index
 # -1 in the low bits.
