@@ -251,14 +251,16 @@ def gradient_matrices(degree: int) -> Tensor:
 
 
 def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
-    """Set the columns of the harmonics Y_lm and Y_l,-m in `gradient_matrices`, in place.
+    """Set the derivatives of the harmonics Y_lm and Y_l,-m in the matrices, in place.
 
-    The derivative of Y_lm with respect to z is a harmonic of the same order in
+    A column of a matrix belongs to a harmonic of band l. Its rows hold the
+    coefficients of the harmonics of band l - 1 in the derivative. The derivative of Y_lm with respect to z is a harmonic of the same order in
     band l - 1. The derivatives with respect to x and y are sums of harmonics of
     the orders m - 1 and m + 1 in band l - 1 (ladder operators).
 
     Args:
-        matrices: Matrices, shape (3, K, K) for K harmonics.
+        matrices: Matrices of the derivatives with respect to x, y and z,
+            shape (3, K, K) for K harmonics.
         l: Band, at least 1.
         m: Order, at least 0.
     """

@@ -152,8 +152,8 @@ class Lamps(LocalBasis):
             a lamp, or `POINTS_PER_SET` paths if the lamps are discs.
         """
         positions = points.new_tensor(self.positions) if positions is None else positions
-        # Points on the lamps, with the axes: set of points, lamp, point, coordinate. For
-        # point lamps, the first and the third axis have the size 1.
+        # Points on the lamps. Neighboring surface points use different sets of points. Axes:
+        # set, lamp, point, coordinate. A point lamp has one set of one point.
         sources = self._disc_points(positions) if self.radius else positions[None, :, None]
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
         # First find the paths with light, without recording operations for gradients.

@@ -712,7 +712,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
         Values of the K = (degree + 1)² harmonics, shape (D, K).
     """
     exponents, coefficients = _polynomials(degree)
-    # Powers 0 to degree of the components x, y and z, shape (degree + 1, 3, D).
+    # Powers 0 to degree of x, y and z of D directions, shape (degree + 1, 3, D).
     powers = np.ones((degree + 1, *directions.T.shape))
     for power in range(degree):
         powers[power + 1] = powers[power] * directions.T
@@ -744,9 +744,10 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
     for total in range(degree, max(degree - 2, -1), -1):
         for a in range(total, -1, -1):
             exponents += [(a, b, total - a - b) for b in range(total - a, -1, -1)]
-        # The columns of harmonics with the other parity have no meaning. Set them to 0.
-        has_parity = (bands(total) - total) % 2 == 0
-        homogeneous = monomial_coefficients(total) * has_parity
+        # Monomials of degree `total` only express harmonics whose degree has the same
+        # parity (even or odd) as `total`. Set the columns of all others to 0.
+        has_same_parity = (bands(total) - total) % 2 == 0
+        homogeneous = monomial_coefficients(total) * has_same_parity
         coefficients.append(F.pad(homogeneous, (0, (degree + 1) ** 2 - homogeneous.shape[1])))
     return np.array(exponents).T, torch.cat(coefficients).numpy()
 

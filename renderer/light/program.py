@@ -109,7 +109,10 @@ class _Iterate:
         self._compute_residuals()
 
     def _compute_residuals(self) -> None:
-        """Compute `dual_residual`, `primal_residual` and `gap` from the current vectors."""
+        """Compute how far y, the slacks and the multipliers are from the optimum.
+
+        At the optimum, `dual_residual`, `primal_residual` and `gap` are 0.
+        """
         self.dual_residual = self.y - self._matrix.T @ self.multipliers
         self.primal_residual = self._matrix @ self.y - self.slacks - self._lower_bounds
         self.gap = self.slacks @ self.multipliers
@@ -125,8 +128,9 @@ class _Iterate:
     def step(self) -> None:
         """Change y, the slacks and the multipliers by one predictor-corrector step.
 
-        At the optimum, the product s_i μ_i of the slack and the multiplier of each
-        inequality i is 0. The predictor is a Newton step toward products of 0. It
+        The method finds the shortest vector y that satisfies inequalities. A slack
+        tells how much an inequality could be tightened. At the optimum, the product
+        s_i μ_i of the slack and the multiplier of each inequality i is 0. The predictor is a Newton step toward products of 0. It
         is not taken. Its length, up to which no slack or multiplier is negative,
         decides how small the products shall become: the longer, the smaller. The
         corrector is a Newton step toward these equal, positive products. It also

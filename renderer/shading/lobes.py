@@ -120,9 +120,11 @@ class ViewFrame(NamedTuple):
         """Compute the spherical-harmonic coefficients of the lobe at each sample.
 
         The lobe is the specular reflectance as a function of the direction to the
-        light. The coefficients are in intermediate axes: the view axes if `tilt`
-        is None, otherwise the view axes in the order y, z, x. The coefficients in
-        world axes are `frame.to_world(frame.harmonics(lobes))`.
+        light. The z-axis of the view axes is the mean direction to the camera. If
+        all samples have the same direction to the camera (`tilt` is None), the
+        result is in view axes. Otherwise, it is in the view axes in the order y, z,
+        x. The coefficients in world axes are
+        `frame.to_world(frame.harmonics(lobes))`.
 
         Args:
             lobes: Values of the M lobe functions at the S samples, from

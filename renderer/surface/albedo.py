@@ -342,7 +342,8 @@ def paint_faces(
         hue_of_face = hue.index_select(0, fragments.faces)
         hue_at_samples = hue_of_face.index_select(0, sample_to_seen_face)
 
-    # First, change the corners and interpolate them, as if no face had a texture.
+    # First, change the colors of the corners of faces and interpolate them, as if no face
+    # had a texture.
     seen_faces = fragments.faces.cpu().numpy()
     corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0)).to(added)
     # Axes: seen face, corner, channel.

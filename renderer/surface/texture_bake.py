@@ -186,7 +186,7 @@ class _TextureSheet:
     """
 
     def __init__(self, mesh: Mesh, texture_id: int, faces: np.ndarray) -> None:
-        """Place the charts of N faces on the new texture.
+        """Place a rectangle (chart) for each of N faces on the new texture.
 
         Args:
             mesh: Mesh with the old texture.

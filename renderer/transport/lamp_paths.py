@@ -309,15 +309,15 @@ class LocalLightView:
         vertices: Tensor | None = None,
         gloss: Gloss | None = None,
     ):
-        """Compute the points and normals at the samples. No ray is cast yet."""
+        """Compute the points and normals at the samples. Rays are cast in the first render."""
         self._rays = rays
         vertices = None if vertices is None else vertices.cpu()
         self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
-        # `Surface` computes its properties when they are first read, which is here.
+        # Reading these properties computes them now, and not in the first render.
         self._points = self._surface.points
         self._normals = self._surface.normals
         self._planes = self._surface.planes
-        # Unblocked paths of each light that stays in place.
+        # For each light that stays in place, its paths to samples that no face blocks.
         self._fixed_paths: dict[LocalBasis, LightPaths] = {}
 
     def radiance(

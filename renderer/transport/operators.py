@@ -1170,7 +1170,8 @@ def _box_filter(
     pixel_count = len(fragments.pixels)
     is_flat = surface.settings.normals == "flat"
     if is_flat:
-        # Values A_l Y_lm(n): one row for each seen face, one column for each harmonic.
+        # Irradiance of each seen face from a light with a single coefficient of 1: one row for
+        # each face, one column for each coefficient.
         face_values = basis.irradiance(surface.face_planes)
         if albedo is None and _are_pixels_mostly_filled(fragments):
             return _copy_from_faces(fragments, face_values, dtype, distinct)

@@ -592,7 +592,7 @@ def _fragments_of_view(
     # so that they move together below. Axes: row of a pixel, row in the pixel, column of a
     # pixel.
     pixel_rows = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
-    # Bring the ids into the order of pixels instead of image rows.
+    # All face ids of the first pixel, then all of the second pixel, and so on.
     ids_by_pixel = pixel_rows.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)
     covered_samples = np.flatnonzero(ids_by_pixel >= 0)
     seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))

@@ -721,8 +721,8 @@ def _cut_edges(
     first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
     end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
     cuts_per_edge = end_line - first_line
-    # One entry for each pair of an edge and a line that the edge crosses. The index of an
-    # edge is repeated for all its lines.
+    # One entry for each pair of an edge and a line (row or column of samples) that the edge
+    # crosses. The index of an edge is repeated for all lines that it crosses.
     edge = np.repeat(np.arange(len(start_across)), cuts_per_edge)
     cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
     line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]

@@ -130,6 +130,9 @@ def _draw(
 ) -> None:
     """Draw T triangles: lower the keys of the samples at which a triangle is nearest so far.
 
+    A key is an integer. Its high bits are the depth of the nearest face at a
+    sample, and its low FACE_BITS bits are the index of this face.
+
     Args:
         keys: Smallest key of each sample so far, changed in place, shape (R²,).
         triangles: Positions (x, y) of the three corners in subsamples,
@@ -310,7 +313,7 @@ def _edges(triangles: np.ndarray) -> _EdgeLines:
     # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
     # right again.
     downward = _sort((y << 32) + x)
-    # The low 32 bits, as a number with a sign, are x. The rest is y.
+    # Each integer is 2³² y + x. Take x, which may be negative, from the low 32 bits.
     x = ((downward + 2**31) & (2**32 - 1)) - 2**31
     y = (downward - x) >> 32
     # Indices of the sorted corners (0 top, 1 middle, 2 bottom) at both ends of the edges.
@@ -388,15 +391,18 @@ def _expand(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     Yields:
         For a block of B entries, the indices and the numbers, shape (B,) each.
     """
-    ends = np.cumsum(counts)
-    starts = ends - counts
-    begin = 0
-    entries_before = 0
-    while begin < len(counts):
-        end = int(np.searchsorted(ends, entries_before + ENTRIES_PER_BLOCK, side="right"))
-        end = max(begin + 1, end)
-        item = np.repeat(np.arange(begin, end), counts[begin:end])
-        position = np.arange(entries_before, entries_before + len(item))
-        yield item, position - starts.take(item)
-        begin = end
-        entries_before = int(ends[end - 1])
+    # Number of entries of all items up to each item, with and without the item itself.
+    entries_with_item = np.cumsum(counts)
+    entries_before_item = entries_with_item - counts
+    first_item = 0
+    entries_before_block = 0
+    while first_item < len(counts):
+        # The block has at least one item, even if the item has too many entries.
+        largest_total = entries_before_block + ENTRIES_PER_BLOCK
+        next_item = int(np.searchsorted(entries_with_item, largest_total, side="right"))
+        next_item = max(first_item + 1, next_item)
+        item = np.repeat(np.arange(first_item, next_item), counts[first_item:next_item])
+        entry = np.arange(entries_before_block, entries_before_block + len(item))
+        yield item, entry - entries_before_item.take(item)
+        first_item = next_item
+        entries_before_block = int(entries_with_item[next_item - 1])

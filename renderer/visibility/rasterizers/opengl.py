@@ -74,7 +74,7 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 
     Raises:
         InputError: If there is no EGL device, or if the driver fails or renders
-            wrong ids.
+            wrong indices of faces.
     """
     # Sort the corners, so that two faces with the same corners in another order get exactly
     # the same depth. If the orientation of faces matters, the corners are only rotated, so
@@ -96,7 +96,7 @@ def device() -> str:
 
     Raises:
         InputError: If there is no EGL device, or if the driver fails or renders
-            wrong ids.
+            wrong indices of faces.
     """
     with _context() as context:
         return context.info["GL_RENDERER"]
@@ -111,7 +111,7 @@ def _context() -> Iterator[moderngl.Context]:
 
     Raises:
         InputError: If there is no EGL device, or if the driver fails or renders
-            wrong ids.
+            wrong indices of faces.
     """
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.
