@@ -254,9 +254,10 @@ def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
     """Set the derivatives of the harmonics Y_lm and Y_l,-m in the matrices, in place.
 
     A column of a matrix belongs to a harmonic of band l. Its rows hold the
-    coefficients of the harmonics of band l - 1 in the derivative. The derivative of Y_lm with respect to z is a harmonic of the same order in
-    band l - 1. The derivatives with respect to x and y are sums of harmonics of
-    the orders m - 1 and m + 1 in band l - 1 (ladder operators).
+    coefficients of the harmonics of band l - 1 in its derivative. The derivative
+    of Y_lm with respect to z is a harmonic of the same order in band l - 1. The
+    derivatives with respect to x and y are sums of harmonics of the orders m - 1
+    and m + 1 in band l - 1 (ladder operators).
 
     Args:
         matrices: Matrices of the derivatives with respect to x, y and z,

@@ -218,8 +218,8 @@ def _project_with_mean(light: Array) -> Array:
             weighted_change = shortest(constraints[:, 1:] / weights[1:], -constraints @ light)
             nearest = np.concatenate([[mean], light[1:] + weighted_change / weights[1:]])
         else:
-            # First mix uniform light into the smoothed light until it is non-negative in
-            # all directions so far. Then mix the result into the nearest light.
+            # Mix uniform light into the smoothed light until its radiance is not negative in
+            # any direction that was found. Then mix the result into the nearest light.
             filler = _mix_to_nonnegative(smoothed, uniform, constraints)
             filler = _mix_to_nonnegative(filler, uniform, new_constraints)
             nearest = _mix_to_nonnegative(nearest, filler, new_constraints)
@@ -404,8 +404,10 @@ class _QuadraticProgram:
         """Constrain the radiance in additional directions, and solve the program again.
 
         Earlier constraints that are not active (their multiplier is zero) are
-        dropped. With a ball, Newton steps change t until the solution x lies on
-        the sphere |x − c| = r, or inside of it with t = 1.
+        dropped. With a ball of center c and radius r, the solution x is the
+        projection of the point c + t (v - c) between the center (t = 0) and the
+        given light v (t = 1). Newton steps change t until x lies on the sphere
+        |x − c| = r, or inside of it with t = 1.
 
         Args:
             new_harmonics: For each of the C channels, the harmonics in M new
@@ -470,8 +472,8 @@ class _QuadraticProgram:
 
         The solution is the projection of the point c + t (v - c), which lies between
         the center c of the ball (t = 0) and the given light v (t = 1). The change s
-        of t solves the quadratic equation |displacement + s velocity| = r.
-        It is clipped so that t stays between its minimum and 1.
+        of t solves the quadratic equation |displacement + s velocity| = r. It is
+        clipped so that t stays between its minimum and 1.
 
         Args:
             velocity: Derivative of the solution x with respect to t, shape (C, K).
@@ -505,7 +507,10 @@ class _SolutionDerivative:
     multiplier_derivatives: Array
 
     def keeps_active(self, step: float) -> bool:
-        """Tell whether all active constraints stay active if t changes by `step`."""
+        """Tell whether all active constraints stay active if t changes by `step`.
+
+        A constraint stays active if its multiplier does not become negative.
+        """
         return bool(np.all(self.multipliers + step * self.multiplier_derivatives >= 0))
 
 

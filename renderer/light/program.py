@@ -130,11 +130,13 @@ class _Iterate:
 
         The method finds the shortest vector y that satisfies inequalities. A slack
         tells how much an inequality could be tightened. At the optimum, the product
-        s_i μ_i of the slack and the multiplier of each inequality i is 0. The predictor is a Newton step toward products of 0. It
-        is not taken. Its length, up to which no slack or multiplier is negative,
-        decides how small the products shall become: the longer, the smaller. The
-        corrector is a Newton step toward these equal, positive products. It also
-        removes the second-order error of the predictor.
+        s_i μ_i of the slack and the multiplier of each inequality i is 0.
+
+        The predictor is a Newton step toward products of 0. It is not taken. Its
+        length, up to which no slack or multiplier is negative, decides how small the
+        products shall become: the longer, the smaller. The corrector is a Newton
+        step toward these equal, positive products. It also removes the second-order
+        error of the predictor.
 
         Raises:
             LinAlgError: If the linear system is not positive definite.

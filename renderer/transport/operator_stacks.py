@@ -463,7 +463,7 @@ class OperatorStack:
         )
         slot_count = max(images_per_row.tolist(), default=0)
         slot_of_image = _rank_in_row(image_to_row, images_per_row)
-        # Position of each image in the table, if all rows are written after each other.
+        # Cell of each image in the table. The cells are numbered row by row.
         cell = image_to_row * slot_count + slot_of_image
         has_gaps = len(cell) != len(operators) * slot_count
         is_ordered = not has_gaps and bool((cell.diff() == 1).all())

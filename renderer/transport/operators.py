@@ -604,7 +604,7 @@ class _PreparedBackground(NamedTuple):
 
 
 class _Radiance(torch.autograd.Function):
-    """Radiance under a light, differentiable with respect to the light."""
+    """Radiance of the covered pixels of a view, differentiable with respect to the light."""
 
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
@@ -1056,7 +1056,7 @@ class _OperatorBuilder:
     def _local_rows(
         self, local_light: LocalPart, entries: SparseTransfer, surface: Surface
     ) -> _DenseRows:
-        """Write the nonzero entries of a local light into dense rows of the matrix.
+        """Write the transfer matrix of a lamp or projector (a local light) as dense rows.
 
         Args:
             local_light: Local light of the basis.

@@ -192,10 +192,10 @@ def _group_sides(
 ) -> np.ndarray:
     """Group the S sides (fronts and backs) of the faces of a mesh into patches.
 
-    The faces of the mesh are small. They are called pieces. Two sides belong to the same
-    patch if the centers of their pieces lie in the same cell of a cubic grid, if
-    the normals are equal after each component is rounded to -1, 0 or 1, and if
-    both sides are fronts or both are backs.
+    The faces of the mesh are small. They are called pieces. Two sides belong to
+    the same patch if the centers of their pieces lie in the same cell of a cubic
+    grid, if the normals are equal after each component is rounded to -1, 0 or 1,
+    and if both sides are fronts or both are backs.
 
     Args:
         pieces: Mesh of the pieces.

@@ -403,7 +403,8 @@ class _MovingView:
         column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
         gradient = self.radiance.new_zeros(pixels_at_crossings.shape[1])
         first_samples, second_samples = self.crossings.samples
-        # The pixels of both samples gain half of the difference each. The factor 1/2 is
+        # If the silhouette moves, the pixel of the first sample and the pixel of the second
+        # sample each gain half of the difference of the two radiances. The factor 1/2 is
         # already in `upstream`.
         for pixels in pixels_at_crossings:
             first_radiance = self._seen_radiance(first_samples, pixels)
