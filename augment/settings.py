@@ -174,7 +174,8 @@ class ObjectSettings(MeshSettings):
                 self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
             elif not isinstance(prop, PropSettings):
                 raise InputError(
-                    f"props[{index}] is {describe(prop)}: give a mapping or nb.PropSettings(...)",
+                    f"props[{index}] is {describe(prop)}: give a mapping, or an object "
+                    "of the class norm_balls.PropSettings",
                     "props",
                 )
 

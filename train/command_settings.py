@@ -548,7 +548,7 @@ class EvaluateSettings(ClassifierSettings):
         if self.classifier and self.model:
             raise InputError(
                 f"model={self.model} is for the network of run=FOLDER: "
-                "leave it out with classifier=NAME, or give run=FOLDER",
+                "leave model out with classifier=NAME, or give run=FOLDER",
                 "model",
             )
 

@@ -219,7 +219,7 @@ class Dropout(nn.Dropout):
         """Set random values to 0, and scale the others by 1 / (1 - p).
 
         Args:
-            x: Features of the shard of this process, of any shape.
+            x: Features of this process, which has a part of the batch. Any shape.
 
         Returns:
             Features of the same shape. In evaluation mode, they are unchanged.
@@ -230,7 +230,7 @@ class Dropout(nn.Dropout):
             return x * self._draw_factors(x)
         if distributed.world_size() == 1:
             return super().forward(x)
-        # Each process draws for the shards of all processes, and uses the draws of its own.
+        # Each process draws the numbers of the whole batch, and uses those of its own part.
         draws = torch.rand(distributed.world_size(), *x.shape, device=x.device)
         is_kept = draws[distributed.rank()] >= self.p
         return x * is_kept / (1 - self.p)

@@ -641,7 +641,7 @@ class ExperimentSettings(NetworkSettings):
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
                 raise InputError(
-                    f"{key} must name its class: give {{mesh: {item.mesh}, label: CLASS}}",
+                    f"{key} has no class: give {{mesh: {item.mesh}, label: CLASS}}",
                     key,
                 )
         missing = set(labels) - {item.label for item in objects.values()}

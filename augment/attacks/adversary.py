@@ -492,7 +492,7 @@ def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
         images = torch.from_numpy(read_numbers(path))
         require_bounded(images=images)
         if images.shape != shape:
-            raise InputError(f"its images have shape {tuple(images.shape)}, not {shape}")
+            raise InputError(f"the images have shape {tuple(images.shape)}, not {shape}")
     # A damaged file may raise many types of errors.
     except Exception as error:
         message = f"{path} cannot be read ({single_line(error)}): write the adversary again"

@@ -375,7 +375,7 @@ def require_result(result: object) -> None:
     Raises:
         InputError: If the value has another type.
     """
-    require_kind("result", result, AttackResult, "the result of nb.attack")
+    require_kind("result", result, AttackResult, "the result of norm_balls.attack")
 
 
 def attack(
@@ -453,7 +453,10 @@ def attack(
     require_seed("seed", seed)
     require_flag("force", force)
     if torch.is_inference_mode_enabled():
-        raise InputError("torch.inference_mode() has no gradients: call nb.attack outside of it")
+        raise InputError(
+            "torch.inference_mode() computes no gradients: "
+            "call norm_balls.attack outside of this mode"
+        )
     size = scene.settings.size
     device = scene.lights.device
     with gradient_flags_kept(classifier):

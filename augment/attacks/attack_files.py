@@ -212,7 +212,7 @@ def _versions(
         For each name of a version, a list with a dictionary for each example:
         its successes, predictions, and differences from the floats.
     """
-    # Images of all examples and views, shape (E, V, 3, size, size) in each version.
+    # Images of V views of each of the E examples, shape (E, V, 3, size, size).
     images = result.images_in_views.cpu()
     versions = {
         "float": images,

@@ -21,10 +21,6 @@ class AttackProblem:
     contains the values of the first parameter, then those of the second, and so
     on.
 
-    Args:
-        scene: Scene to attack.
-        parameters: Parameters to change, made for this scene.
-
     Attributes:
         scene: Scene to attack.
         parameters: Parameters to change, made for this scene.
@@ -35,7 +31,12 @@ class AttackProblem:
     """
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
-        """Join the initial values of all parameters. See the class for the arguments."""
+        """Join the initial values of all parameters.
+
+        Args:
+            scene: Scene to attack.
+            parameters: Parameters to change, made for this scene.
+        """
         self.scene = scene
         self.parameters = parameters
         self.group_size = scene.group_size

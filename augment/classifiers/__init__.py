@@ -92,8 +92,8 @@ def _load_python(name: str, weights: Path | None) -> Classifier:
     """
     if weights is not None:
         raise InputError(
-            f"weights={weights} cannot be combined with python:{name}, which loads its own "
-            "weights: remove weights",
+            f"weights={weights} cannot be combined with python:{name}, a function that "
+            "loads the weights itself: leave weights out",
             "weights",
         )
     return load_python(name)
@@ -187,8 +187,8 @@ def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
     if Path(name).suffix.lower() in SUFFIXES:
         if path is not None:
             raise InputError(
-                f"weights={path} cannot be combined with {name}, which contains its own weights: "
-                "remove weights",
+                f"weights={path} cannot be combined with {name}, a file that contains weights: "
+                "leave weights out",
                 "weights",
             )
         with progress_message(f"loading {name}"):

@@ -163,7 +163,7 @@ class NetworkCall:
             raise InputError(
                 f"{self.name} returned probabilities (values in [0, 1] that sum to 1) instead "
                 "of logits: "
-                "remove its softmax, or return its logarithm",
+                "remove the softmax of the network, or return the logarithms of the probabilities",
             )
 
 
@@ -225,7 +225,7 @@ class Classifier(nn.Module):
         name: str = "callable",
         normalize_light: NormalizeLight = None,
     ):
-        """Check the arguments, and freeze the function. See the class for the arguments."""
+        """Check the arguments, which the docstring of the class explains. Freeze the function."""
         super().__init__()
         require_kind("name", name, str, "a string for messages")
         require_kind(
@@ -276,10 +276,13 @@ class Classifier(nn.Module):
         # Lowest and highest value of all images. There are none if the batch is empty.
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
-        # Check the range after the call, because the check waits until the GPU is idle.
+        # Check the range of the images after the call of the network. The check waits until the
+        # GPU is idle.
         require_unit_range("images", *extremes)
         if not logits.is_floating_point() or not logits.isfinite().all():
-            raise InputError(f"{name} returned NaN or infinite logits: check its weights")
+            raise InputError(
+                f"{name} returned NaN or infinite logits: check the weights of the network"
+            )
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
             raise InputError(
                 f"{name} returned logits without a gradient: compute them in torch, "

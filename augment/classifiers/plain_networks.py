@@ -222,9 +222,11 @@ def require_evaluation_mode(network: object, argument: str) -> None:
     if "eval" in vars(network):
         raise InputError(
             f"{argument} is a module of torch.export, which has no eval(): save it by "
-            "torch.export.save, and give nb.load_classifier('network.pt2')"
+            "torch.export.save, and give norm_balls.load_classifier('network.pt2')"
         )
-    raise InputError(f"{argument} is a network in training mode: call its eval() first")
+    raise InputError(
+        f"{argument} is a network in training mode: call the method eval() of the network first"
+    )
 
 
 def device_of(network: object) -> torch.device:
@@ -281,7 +283,7 @@ def _preprocessed(
     if normalization is not None and not black <= min(mean) <= max(mean) <= white:
         raise InputError(
             f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
-            f"white, {white:g}: give it in these units, or the value_range of the network"
+            f"white, {white:g}: give the mean in the units of value_range, or another value_range"
         )
     # A value x in [0, 1] becomes (black + span · x - mean) / std for the network. This is equal to
     # (x - scaled_mean) / scaled_std, which `Normalized` computes.

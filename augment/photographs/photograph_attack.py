@@ -195,16 +195,7 @@ def attack_photographs(
 
 
 class _PhotographAttack:
-    """Attack a network through projected light on photographs, one batch after the other.
-
-    Args:
-        classifier: The attacked network.
-        photographs: Photographs, uint8, shape (N, 3, size, size).
-        settings: Settings of the searches.
-        success_settings: Sensor noise in which a change of the class must remain
-            to count as a success, and the batch size.
-        seed: Seed of all random numbers.
-    """
+    """Attack a network through projected light on photographs, one batch after the other."""
 
     def __init__(
         self,
@@ -214,7 +205,16 @@ class _PhotographAttack:
         success_settings: AttackSettings,
         seed: int,
     ):
-        """Prepare the attack. See the class for the arguments."""
+        """Prepare the attack.
+
+        Args:
+            classifier: The attacked network.
+            photographs: Photographs, uint8, shape (N, 3, size, size).
+            settings: Settings of the searches.
+            success_settings: Sensor noise in which a change of the class must
+                remain to count as a success, and the batch size.
+            seed: Seed of all random numbers.
+        """
         self.classifier = classifier
         self.photographs = photographs
         self.settings = settings

@@ -372,6 +372,9 @@ class DirectRenderer:
         Args:
             object_index: Index of the object.
             mesh: Mesh of the object, whose vertices may have moved.
+
+        Returns:
+            Radiance that shadows and bounces add to views of the mesh. It has no views yet.
         """
         return FrozenTransport(
             mesh, self.settings, self.objects[object_index].albedo_scale, self.basis
@@ -441,6 +444,7 @@ class _IndirectLight:
             self.example, self.object_index, self.camera, self.positions
         )
         added = frozen.radiance(self.camera, self.fragments, albedo, light)
+        # A view that is not needed again is removed, which saves memory.
         if not self.is_kept:
             del frozen.views[self.camera]
         return added

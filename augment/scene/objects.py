@@ -370,7 +370,7 @@ def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
     """
     name, _, seed = name_and_seed.partition(":")
     if seed and not seed.isdecimal():
-        raise InputError(f"{mesh_name}: its seed is {seed!r}, give a whole number")
+        raise InputError(f"{mesh_name} has the seed {seed!r}: give a whole number")
     try:
         return solid(name, int(seed or 0))
     except ValueError as error:

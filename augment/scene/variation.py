@@ -547,6 +547,7 @@ def _facing_irradiance(scene: Scene) -> Tensor:
     normals = torch.from_numpy(np.stack(directions))
     exposures = torch.tensor([example.exposure for example in scene.examples])[:, None]
     harmonics = harmonics_of(scene.basis)
+    # RGB coefficients of the K harmonics that the irradiance depends on, shape (E, K, 3).
     coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
     facing = torch.einsum("ek,ekc->ec", harmonics.irradiance(normals), coefficients) * exposures
     return facing.to(scene.backgrounds)[:, :, None, None]

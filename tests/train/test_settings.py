@@ -185,7 +185,7 @@ TWO_CLASSES = [
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         (
             [*TWO_CLASSES, "scene.meshes=[a.glb,'solid:pear']"],
-            "scene.meshes[0] must name its class",
+            "scene.meshes[0] has no class",
         ),
         (
             [

@@ -573,8 +573,8 @@ def _load_classifier(item: Any) -> Classifier:
     for key in values:
         if key not in ("classifier", "weights"):
             raise InputError(
-                f"transfer.classifiers: {key} is not a key of its entries: give the name of a "
-                "classifier, or {classifier: NAME, weights: FILE}",
+                f"transfer.classifiers has an entry with the unknown key {key}: "
+                "give the name of a classifier, or {classifier: NAME, weights: FILE}",
             )
     with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
         return load_network(str(values.get("classifier")), values.get("weights"))

@@ -154,7 +154,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if len(labels) > 1 and not has_class_folders:
         raise InputError(
             f"{folder} has no class folders, and label names several classes: "
-            "move its images into one subfolder per class",
+            "move the images of the folder into one subfolder per class",
         )
     rows = _read_table(folder / TABLE)
     _require_files_of_rows(folder / TABLE, rows, files, paths[0])
@@ -324,7 +324,7 @@ def _files(folder: Path) -> Iterator[PurePosixPath]:
             contains_parent = real_parent.is_relative_to(target)
             if not is_hidden(name) and not contains_parent:
                 to_visit.append(name)
-        # `os.walk` then visits only the subfolders that are left in its list.
+        # This changes the list of `os.walk`, which then visits only these subfolders.
         subfolders[:] = to_visit
         relative_parent = PurePosixPath(Path(parent).relative_to(folder).as_posix())
         yield from (relative_parent / name for name in files if not is_hidden(name))
@@ -362,8 +362,8 @@ def _has_class_folders(
             suggestions = nearest(name, classes)
             raise InputError(
                 f"{folder / name} is not named after a class of the network "
-                f"(such as {suggestions}): rename it to its class, or to {OTHER_PREFIX}{name} "
-                "if it shows hard negatives",
+                f"(such as {suggestions}): rename the folder to its class, or "
+                f"to {OTHER_PREFIX}{name} if it shows hard negatives",
             )
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
@@ -375,7 +375,7 @@ def _has_class_folders(
     if names and outside:
         raise InputError(
             f"{folder / outside[0]} lies beside class folders, not in one of them: "
-            "move it into the folder of its class",
+            "move the file into the folder of its class",
         )
     return bool(names)
 

@@ -33,7 +33,7 @@ from train.settings import label_names, published
 MAX_NAMED = 30
 # A method whose settings need a longer name than this is named by a number.
 LONGEST_NAME = 56
-# Method of a network with whose weights runs began.
+# Name of the method of a network with whose weights other runs began.
 INITIAL = "the initial network"
 # Names of two networks in tables: a network that was trained with renders, and the
 # network with whose weights it began.

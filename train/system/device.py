@@ -171,14 +171,15 @@ class MixedPrecision(nn.Module):
     """Wrapper of a network that computes in a chosen precision.
 
     Images and logits are float32. Between them, torch.autocast uses the chosen precision.
-
-    Args:
-        network: The network. Its weights are changed to the channels-last memory format.
-        precision: "bfloat16", "float16" or "float32".
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        """Wrap a network. The class explains the arguments."""
+        """Wrap a network.
+
+        Args:
+            network: The network. Its weights are changed to the channels-last memory format.
+            precision: "bfloat16", "float16" or "float32".
+        """
         super().__init__()
         self.network = network.to(memory_format=torch.channels_last)
         self.precision = precision

@@ -59,14 +59,6 @@ class Averages:
     over the steps, and a model soup, the mean of the weights after each epoch (Wortsman et al.
     2022, "Model soups"). With both, the soup is the mean of the moving averages.
 
-    Args:
-        model: Network in training.
-        ema_decay: Decay of the moving average in a step, in [0, 1). 0 for no moving average.
-        soup: Whether to compute the soup.
-        keeps_latest: Whether the network after the last epoch is kept, instead of the network of
-            the epoch with the highest validation accuracy. With a soup, the last one is always
-            kept, because it contains all epochs.
-
     Attributes:
         selected: Network that is validated after each epoch: the soup, the moving average, or
             else the network in training.
@@ -79,7 +71,16 @@ class Averages:
         soup: bool,
         keeps_latest: bool = False,
     ):
-        """Create the averages, which are empty at first. The class explains the arguments."""
+        """Create the averages, which are empty at first.
+
+        Args:
+            model: Network in training.
+            ema_decay: Decay of the moving average in a step, in [0, 1). 0 for no moving average.
+            soup: Whether to compute the soup.
+            keeps_latest: Whether the network after the last epoch is kept, instead of the network
+                of the epoch with the highest validation accuracy. With a soup, the last one is
+                always kept, because it contains all epochs.
+        """
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:

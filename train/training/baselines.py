@@ -26,20 +26,20 @@ PGD_STEPS = 3
 
 
 class Baseline:
-    """Augmentation of training images, chosen by its name.
-
-    Args:
-        name: "none", "pgd" (an adversarial attack on pixels), or a transform of torchvision:
-            "color_jitter" (with half the strength of Chen et al. 2020, as is usual for small
-            images), "trivial_augment", "augmix" or "color_jitter+augmix".
-        model: Network in training, which "pgd" attacks.
-        seed: Seed of the run.
-        absent: Indices of classes for "pgd". An image with a complementary label ("not of class
-            k") shows none of these classes either.
-    """
+    """Augmentation of training images, chosen by its name."""
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
-        """Create the augmentation. The class explains the arguments."""
+        """Create the augmentation.
+
+        Args:
+            name: "none", "pgd" (an adversarial attack on pixels), or a transform of torchvision:
+                "color_jitter" (with half the strength of Chen et al. 2020, as is usual for small
+                images), "trivial_augment", "augmix" or "color_jitter+augmix".
+            model: Network in training, which "pgd" attacks.
+            seed: Seed of the run.
+            absent: Indices of classes for "pgd". An image with a complementary label ("not of class
+                k") shows none of these classes either.
+        """
         self._name = name
         self._model = model
         self._seed = seed

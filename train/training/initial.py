@@ -228,7 +228,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     if not list(network.parameters()):
         raise InputError(
             f"train.init_from={name} is a network without weights that can be trained: "
-            "give its file of TorchScript or of torch.export",
+            "give a file of the network in the format of TorchScript or torch.export",
             "train.init_from",
         )
     # The absolute path of a file is recorded, so that it is found from any folder.
@@ -362,16 +362,16 @@ def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | N
 
 
 class CachedModel:
-    """Wrapper of a network that stores logits on disk, so that later runs need not compute them.
-
-    Args:
-        model: The network.
-        device: Device that computes.
-        cache: Cache on disk. The key of logits is a hash of the weights and the images.
-    """
+    """Wrapper of a network that stores logits on disk, so that later runs need not compute them."""
 
     def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
-        """Hash what decides the logits of an image. The class explains the arguments."""
+        """Hash what decides the logits of an image.
+
+        Args:
+            model: The network.
+            device: Device that computes.
+            cache: Cache on disk. The key of logits is a hash of the weights and the images.
+        """
         self._model = model
         self._cache = cache
         facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]

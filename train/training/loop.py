@@ -117,14 +117,6 @@ class Trainer:
 
     `fit` trains the network. To continue a run, call `resume` before `fit`.
 
-    Args:
-        settings: Settings of the training.
-        model: Network to train.
-        architecture: Description of the network, which is stored in checkpoints.
-        service: Service that renders the training renders anew in each round.
-        folder: Folder of the run.
-        labeled: Whether the labels of the data are known.
-
     Attributes:
         initial: Copy of the network before the training. None if the run begins
             with random weights. The copy is the teacher of a distillation loss,
@@ -147,7 +139,17 @@ class Trainer:
         folder: Path,
         labeled: bool = True,
     ):
-        """Check the settings, and build the optimizer. The class explains the arguments."""
+        """Check the settings, and build the optimizer.
+
+        Args:
+            settings: Settings of the training.
+            model: Network to train.
+            architecture: Description of the network, which is stored in
+                checkpoints.
+            service: Service that renders new training images in each round.
+            folder: Folder of the run.
+            labeled: Whether the labels of the data are known.
+        """
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(

@@ -20,14 +20,6 @@ class TrainingLoss:
       training;
     - consistency: divergence of the predictions for augmented images from the predictions of the
       teacher for the same images without augmentation.
-
-    Args:
-        model: Network in training, from images in [0, 1] to logits.
-        settings: Settings of the training.
-        positive_classes: Indices of the positive classes, for the ranking term. Empty without it.
-        teacher: Network before the training. None without distillation and consistency.
-        labeled: Whether the labels of the data are known. If not, only renders count in the cross
-            entropy, and correct predictions for other images are those of the teacher.
     """
 
     def __init__(
@@ -38,7 +30,17 @@ class TrainingLoss:
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
-        """Store the arguments, which the class explains."""
+        """Store the arguments.
+
+        Args:
+            model: Network in training, from images in [0, 1] to logits.
+            settings: Settings of the training.
+            positive_classes: Indices of the positive classes, for the ranking term. Empty if the
+                loss has no such term.
+            teacher: Network before the training. None without distillation and consistency.
+            labeled: Whether the labels of the data are known. If not, only renders count in the
+                cross entropy, and correct predictions for other images are those of the teacher.
+        """
         self._model = model
         self._settings = settings
         self._positive_classes = positive_classes

@@ -26,14 +26,6 @@ class RelitBatches:
     another image of the batch, and each of its color channels is multiplied by
     smooth factors. The factors are random, or are changed by gradient descent
     until the network predicts another class.
-
-    Args:
-        settings: Settings of the training.
-        model: Network in training, which the gradient descent attacks.
-        teacher: Network before the training. The attack leads away from the
-            class that it predicts for the image without the projector. None if
-            the factors are random.
-        seed: Seed of the run.
     """
 
     def __init__(
@@ -43,7 +35,16 @@ class RelitBatches:
         teacher: nn.Module | None,
         seed: int,
     ):
-        """Store the arguments, which the class explains."""
+        """Store the arguments.
+
+        Args:
+            settings: Settings of the training.
+            model: Network in training, which the gradient descent attacks.
+            teacher: Network before the training. The attack leads away from the
+                class that it predicts for the image without the projector. None if
+                the factors are random.
+            seed: Seed of the run.
+        """
         self._radius = math.log(settings.relight_gain)
         self._steps = settings.relight_steps
         self._model = model

@@ -78,14 +78,6 @@ class Run:
     The methods are called in this order: `load`, `fit`, `score`, `export`. Wrong
     input raises an error in `load`, so that several runs can be checked before
     the first one trains.
-
-    Args:
-        settings: Settings of the run.
-        data: Data set of the run.
-        folder: Folder to which the run writes its files.
-        initial: Network with whose weights the run begins. None for random
-            weights.
-        command: Command line that started the run, which config.yaml records.
     """
 
     trainer: Trainer
@@ -100,7 +92,16 @@ class Run:
         initial: Initial | None = None,
         command: str = "",
     ):
-        """Store the arguments, which the class explains. The method `load` checks them."""
+        """Store the arguments. The method `load` checks them.
+
+        Args:
+            settings: Settings of the run.
+            data: Data set of the run.
+            folder: Folder to which the run writes its files.
+            initial: Network with whose weights the run begins. None for random
+                weights.
+            command: Command line that started the run, which config.yaml records.
+        """
         self.settings = settings
         self.data = data
         self.folder = folder
@@ -154,7 +155,7 @@ class Run:
 
     def fit(self) -> None:
         """Score the initial network, if the run has one, and train to the last epoch."""
-        # Each run that is loaded sets the number of threads. It is set to that of this run.
+        # Another run that was loaded in between may have set another number of threads.
         torch.set_num_threads(self._threads)
         console.debug(
             "%d images, %d classes; %s, %s, threads: %d, processes: %d",

@@ -20,15 +20,6 @@ class LightParameter(Parameter):
     negative, the start is the nearest light without negative radiance that has
     the same mean. Each step then ends in the nearest coefficients that lie in
     the norm-ball and have no negative radiance.
-
-    Args:
-        scene: Scene to attack. Its other lights stay as they are.
-        settings: Norm-ball and steps of the attack.
-        rows: Rows of this light in the coefficients of all lights of the scene,
-            shape (size of the scene's basis, 3).
-        basis: Basis of this light.
-        nonnegative: Whether radiance must not be negative. It is always True for
-            projectors and lamps.
     """
 
     def __init__(
@@ -39,7 +30,17 @@ class LightParameter(Parameter):
         basis: Harmonics | LocalBasis,
         nonnegative: bool,
     ):
-        """Compute the light at which the attack starts. See the class for the arguments."""
+        """Compute the light at which the attack starts.
+
+        Args:
+            scene: Scene to attack. Its other lights stay as they are.
+            settings: Norm-ball and steps of the attack.
+            rows: Rows of this light in the coefficients of all lights of the scene,
+                shape (size of the scene's basis, 3).
+            basis: Basis of this light.
+            nonnegative: Whether radiance must not be negative. It is always True
+                for projectors and lamps.
+        """
         self._rows = rows
         self._basis = basis
         self._nonnegative = nonnegative or not basis.allow_negative

@@ -11,17 +11,18 @@ class LocalLight(LightParameter):
 
     A coefficient lies between 0 and the power of the light.
 
-    Args:
-        scene: Scene to attack.
-        settings: Norm-ball and steps of the attack.
-        name: Kind of light: "projector" or "lamps".
-
     Raises:
         InputError: If the scene has no such light.
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
-        """Find the light among the local lights of the scene. See the class for the arguments."""
+        """Find the light among the local lights of the scene.
+
+        Args:
+            scene: Scene to attack.
+            settings: Norm-ball and steps of the attack.
+            name: Kind of light: "projector" or "lamps".
+        """
         self.name = name
         for rows, basis in scene.basis.local_lights:
             if basis.name == name:

@@ -144,7 +144,7 @@ class Material(Parameter):
         Args:
             conditions: Light, shape and colors of the A examples.
             average_gloss: New averages of roughness, metallic and specular
-                factor over the faces of each object, shape (A, 3).
+                factor over the faces of the object of each example, shape (A, 3).
             objects: Index of the object of each example, shape (A,).
         """
         # Change of the averages of each example, shape (A, 3).

@@ -19,17 +19,18 @@ class MeshParameter(Parameter):
     vertices or faces that a smaller mesh lacks are not used. The mesh of an
     object also contains its props (meshes beside the object) and its table. The
     attack does not change these. The attack starts at zero.
-
-    Args:
-        scene: Scene to attack.
-        settings: Norm-ball and steps of the attack.
-        object_masks: One mask for each object of the scene. It marks the
-            vertices or faces of the mesh that belong to the object itself, not
-            to its props or table, shape (number of vertices or faces,).
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
-        """Find the values that each example uses. See the class for the arguments."""
+        """Find the values that each example uses.
+
+        Args:
+            scene: Scene to attack.
+            settings: Norm-ball and steps of the attack.
+            object_masks: One mask for each object of the scene. It marks the
+                vertices or faces of the mesh that belong to the object itself, not
+                to its props or table, shape (number of vertices or faces,).
+        """
         # One row for each object, one column for each of the N vertices or faces of the largest
         # mesh. Rows of smaller meshes end with False.
         masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)

@@ -56,10 +56,6 @@ class Pose(Parameter):
     vertices, it does so before. An object with props or a table keeps standing
     on the same ground.
 
-    Args:
-        scene: Scene to attack, with `ImageSettings.silhouettes`.
-        settings: Norm-ball, steps and units of the attack.
-
     Raises:
         InputError: If `ImageSettings.silhouettes` of the scene is False. Also
             if an object has no skin or lacks a named joint, which
@@ -70,7 +66,12 @@ class Pose(Parameter):
     fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: PoseSettings):
-        """Compute units and limits of the attack values. See the class for the arguments."""
+        """Compute units and limits of the attack values.
+
+        Args:
+            scene: Scene to attack, with `ImageSettings.silhouettes`.
+            settings: Norm-ball, steps and units of the attack.
+        """
         if not scene.settings.silhouettes:
             raise InputError(
                 "silhouettes=False: set silhouettes=True, since an attack on the pose needs them",
@@ -145,8 +146,8 @@ class Pose(Parameter):
         """Find the nearest values at which object and camera do not meet and joints can rotate.
 
         Args:
-            values: D attack values of each of A examples: its pose, divided by the units of the
-                settings, shape (A, D).
+            values: D attack values of each of A examples, shape (A, D). They are the pose of the
+                object and the camera, divided by the units of the settings.
             within: Norm-ball that must contain the result, or None.
 
         Returns:

@@ -18,10 +18,6 @@ class Positions(Parameter):
     Shadows are cast from the changed positions. The gradient treats shadows as
     fixed.
 
-    Args:
-        scene: Scene to attack.
-        settings: Norm-ball and steps of the attack.
-
     Raises:
         InputError: If the scene has no lamps.
     """
@@ -29,7 +25,12 @@ class Positions(Parameter):
     name = "positions"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        """Start at the positions of the lamps of the scene. See the class for the arguments."""
+        """Start at the positions of the lamps of the scene.
+
+        Args:
+            scene: Scene to attack.
+            settings: Norm-ball and steps of the attack.
+        """
         light = scene.basis.movable_light
         if light is None:
             kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)

@@ -32,16 +32,17 @@ class Skylight(Parameter):
     The sky replaces the environment lighting of the scene. It is multiplied by
     a constant factor, so that the initial sky has the mean luminance of the
     lighting that it replaces. Projector and lamps stay as they are.
-
-    Args:
-        scene: Scene to attack.
-        settings: Norm-ball, steps and initial sky of the attack.
     """
 
     name = "skylight"
 
     def __init__(self, scene: Scene, settings: SkylightSettings):
-        """Compute the initial sky and its brightness. See the class for the arguments."""
+        """Compute the initial sky and its brightness.
+
+        Args:
+            scene: Scene to attack.
+            settings: Norm-ball, steps and initial sky of the attack.
+        """
         self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
