@@ -49,8 +49,8 @@ class TrainCommand(Command):
             import_function("train.commands.sweep:run_in_sweep")(config)
             return
         if not config.train.resume:
-            # The import below takes seconds. This call reports mistakes in the
-            # settings before it.
+            # Report mistakes in the settings before the import of the module
+            # train.commands.experiment, which takes seconds.
             read_settings(self.settings, config)
         import_function("train.commands.experiment:train")(config, list(job.overrides.task))
 

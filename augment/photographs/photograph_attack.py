@@ -351,7 +351,8 @@ class _PhotographAttack:
             self.settings.steps,
             best,
         )
-        # Compare with the factors after the last step, which `descend_gain` has not classified.
+        # `descend_gain` has not classified the factors after its last step. Classify them here,
+        # and keep them if they are the best.
         with torch.no_grad():
             best.update(last, self.model(light.expose(albedo, last)), source)
         return best.log_gain.cpu()

@@ -87,7 +87,7 @@ def half(points: Tensor, shift: Tensor | float) -> Tensor:
         Mask of the points to the right of the line, shape (...).
     """
     is_greater = points > shift - 0.5
-    # The line depends on x only, which is row 0.
+    # The line is vertical, so only the coordinate x counts, which is row 0.
     return is_greater[0]
 
 

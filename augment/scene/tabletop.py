@@ -306,7 +306,7 @@ def _blocked_sky(
     is_on_wall = seen.is_on_wall[0]
     blocked = torch.zeros(len(points), 3, dtype=torch.float64)
     for surface in (TABLE, WALL):
-        # Pixels that show this surface.
+        # Indices of the pixels that show this surface, the table or the wall.
         pixels = torch.nonzero(is_on_wall == surface).squeeze(1)
         # Rays start slightly above the surface.
         starts = points[pixels] + room.rays.offset * normals[surface]

@@ -77,11 +77,13 @@ def load_network(
     folder = _find_run(Path(name))
     if folder is not None:
         raise InputError(
-            f"name={name} is a file of a training run: give name={RUN}{folder} instead", "name"
+            f"name={name} is a training run or a file of one: give name={RUN}{folder} instead",
+            "name",
         )
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
-        # Errors about the folder name the argument `name`, in which the user gave it.
+        # Error messages about the argument `run` begin with `name` instead, the argument of
+        # this function.
         with keyed(run="name"):
             classifier = load_run(name.removeprefix(RUN), weights)
         return classifier.normalizing_light(normalize_light)

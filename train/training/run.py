@@ -207,7 +207,7 @@ class Run:
             return
         path = self.folder / WEIGHTS
         export(path, self.trainer.selected.network)
-        # Python expression for the network that loads the weights.
+        # Name of the network of the user in the line of Python that is printed.
         network = "network"
         name = self.trainer.architecture["name"]
         if name.startswith(PYTHON):
