@@ -423,7 +423,8 @@ def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
     before = fmean(known)
     after = fmean(run.scores["test/accuracy"] for run in runs)
     images = runs[0].config.get("test_images", "the test images")
-    sentence = f"{method}: accuracy went from {before:.1%} to {after:.1%} on {images}."
+    title = method[0].upper() + method[1:]
+    sentence = f"{title}: accuracy went from {before:.1%} to {after:.1%} on {images}."
     has_photographs = any(map(_is_scored_on_photographs, runs))
     if OmegaConf.select(runs[0].config, "data.name") == "shapes" and not has_photographs:
         sentence += (
