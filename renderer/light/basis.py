@@ -165,7 +165,7 @@ class Harmonics(Basis):
 
     @property
     def environment(self) -> EnvironmentPart:
-        """This light itself. Its slice of the coefficients contains all coefficients."""
+        """Environment light of this basis. Its slice contains all coefficients."""
         return EnvironmentPart(slice(0, self.size), self)
 
     @property
@@ -221,8 +221,8 @@ class Harmonics(Basis):
         Returns:
             SH coefficients of the new lights, shape (..., size, 3).
         """
-        # This import stands here because it also imports SciPy's optimizers, which takes
-        # long.
+        # Only imported when it is needed, because it also imports SciPy's optimizers, which
+        # takes long.
         from renderer.light.nonnegative import project_nonnegative
 
         return project_nonnegative(coefficients)
@@ -248,9 +248,11 @@ class Harmonics(Basis):
         return nearest_nonnegative(coefficients, within)
 
 
-# Default basis of environment light, and its degree and number of coefficients.
+# Default basis of environment light.
 HARMONICS = Harmonics()
+# Degree of the default environment light.
 DEGREE = HARMONICS.degree
+# Number of SH coefficients of the default environment light.
 COEFFICIENTS = HARMONICS.size
 
 

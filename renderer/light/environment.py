@@ -47,8 +47,9 @@ LARGEST_MAP = 4096
 _RGBE_BITS = 8
 # Names of the channels of an .npy array for each possible number of channels. Y is gray.
 _CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
-# Names of alpha channels, and of red, green and blue channels, in lower case.
+# Possible names of an alpha channel, in lower case.
 _ALPHA_NAMES = ("a", "alpha")
+# Possible names of the three color channels, in lower case.
 _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 

@@ -163,7 +163,7 @@ def evaluate_harmonics(directions: Tensor, indices: Iterable[int]) -> list[Tenso
 
     Returns:
         For each index, the values of its harmonic in all directions, shape (...).
-        An index that occurs again is ignored.
+        An index that is given twice has one entry, at its first place.
     """
     x, y, z = directions
     # A dictionary keeps the order of the indices and removes repeated indices.

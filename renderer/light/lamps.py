@@ -70,7 +70,7 @@ class Lamps(LocalBasis):
                 f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
                 "each lamp, and no lamp at the origin"
             )
-        # A frozen dataclass can only be changed in this way.
+        # Plain assignment to a field of a frozen dataclass raises an error.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_field_types(self, "positions")
         for value in chain(*self.positions):

@@ -100,8 +100,8 @@ _FINE_SUBDIVISIONS = 5
 _COARSE_GRID_DEGREE = 10
 # Longest step on the unit sphere, in radians, in the search for a minimum of the radiance.
 _MAX_ANGLE = 0.1
-# Number of Newton steps from a vertex of the icosphere to the minimum of the radiance
-# beside it.
+# Number of Newton steps from a vertex of the icosphere to a local minimum of the radiance
+# near this vertex.
 _NEWTON_STEPS = 2
 
 
@@ -567,8 +567,8 @@ def _least_distance(
     if not len(harmonics):
         return original, harmonics
     size = len(original)
-    # The vector h is divided by this norm, so that the numbers are not much larger than 1.
-    # The result d is then divided by it, too.
+    # The right sides h of the constraints are divided by this norm, so that they are not much
+    # larger than 1. The result d is then divided by it, too.
     norm = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
@@ -577,7 +577,7 @@ def _least_distance(
     left_sides = np.concatenate([harmonics, axes, -axes])
     from_low = (low - original)[is_bounded]
     from_high = (original - high)[is_bounded]
-    # Vector h, with the entries in the order of the rows of G.
+    # Vector h of the constraints G d ≥ h, in the order of the rows of G.
     right_sides = np.concatenate([-harmonics @ original, from_low, from_high])
     # Matrix E of the problem of non-negative least squares.
     dual_matrix = np.concatenate([left_sides.T, right_sides[None] / norm])

@@ -121,7 +121,7 @@ def irradiance_weights(degree: int) -> Tensor:
     Returns:
         Positive weight of each coefficient, float64, shape ((degree + 1)²,).
     """
-    # The last degree is degree + 1, because it may have the smallest positive factor.
+    # Also compute the factor of degree + 1, because it may be the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
     weights = factors.clamp(min=smallest / 2) / factors[0]
@@ -145,7 +145,8 @@ def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray)
         Factors w_l, the first of which is 1, shape (degree + 1,).
     """
     degree = len(weight) - 1
-    # This import stands here because it also imports scipy.linalg, which takes 0.1 s.
+    # Only imported when it is needed, because it also imports scipy.linalg, which takes
+    # 0.1 s.
     from renderer.light.program import shortest
 
     # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.

@@ -150,8 +150,9 @@ class ViewFrame(NamedTuple):
     def _harmonics_in_sample_axes(self, lobes: Tensor, degree: int) -> Tensor:
         """Compute the SH coefficients of the lobe of each of S samples in its own sample axes.
 
-        In sample axes, the camera is in the direction of the z-axis. Let θ be the
-        polar angle and φ the azimuth of the normal. The coefficient of the
+        The lobe is the specular reflectance as a function of the direction to the
+        light. In sample axes, the camera is in the direction of the z-axis. Let θ be
+        the polar angle and φ the azimuth of the normal. The coefficient of the
         harmonic of degree l and order m ≥ 0 is c_lm sin^m θ cos mφ, with the lobe
         function c_lm. For order -m < 0, it is c_lm sin^m θ sin mφ.
 
@@ -174,6 +175,9 @@ class ViewFrame(NamedTuple):
     def to_world(self, coefficients: Tensor) -> Tensor:
         """Rotate SH coefficients from the intermediate axes of `harmonics` to world axes.
 
+        The intermediate axes are the view axes if `tilt` is None. Otherwise, they are
+        the view axes in the order y, z, x.
+
         Args:
             coefficients: SH coefficients, one function on the sphere per column,
                 shape (K, P) with K = (degree + 1)².
@@ -183,8 +187,8 @@ class ViewFrame(NamedTuple):
         """
         permutation = _axis_permutation(math.isqrt(len(coefficients)) - 1)
         axis = self.axis.for_columns(coefficients)
-        # With a tilt, `harmonics` permutes the axes cyclically two times. A third time
-        # restores their order.
+        # With a tilt, the function `harmonics` has permuted the axes cyclically two times. A
+        # third permutation restores the order x, y, z.
         if self.tilt is not None:
             coefficients = _multiply_bands(permutation, coefficients)
         # The rotation to world axes is R_z(azimuth) R_y(polar). With the permutation C of
@@ -195,7 +199,8 @@ class ViewFrame(NamedTuple):
     def from_world(self, coefficients: Tensor) -> Tensor:
         """Rotate SH coefficients from world axes to the intermediate axes of `harmonics`.
 
-        This is the inverse of `to_world`.
+        This is the inverse of `to_world`. The intermediate axes are the view axes if
+        `tilt` is None. Otherwise, they are the view axes in the order y, z, x.
 
         Args:
             coefficients: SH coefficients in world axes, one function on the sphere
@@ -301,8 +306,9 @@ class Tilt(NamedTuple):
     def along(directions: Components) -> Tilt:
         """Compute the rotations that take the z-axis (0, 0, 1) to given directions.
 
-        R_x(a) R_y(b) rotates (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The
-        angle b is chosen so that cos b ≥ 0.
+        A rotation by the angle b about the y-axis and then by the angle a about the
+        x-axis takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The angle b is
+        chosen so that cos b ≥ 0.
 
         Args:
             directions: Components of S unit vectors in view axes, shape (S,)
@@ -327,7 +333,8 @@ class Tilt(NamedTuple):
         Returns:
             Components in sample axes, shape (S,) each.
         """
-        # Undo the last rotation first.
+        # From sample axes to view axes, vectors rotate about y and then about x. The inverse
+        # rotates back about x first.
         rotated_about_x = _rotate_about_x(vectors, self.about_x.reversed())
         return _rotate_about_y(rotated_about_x, self.about_y.reversed())
 

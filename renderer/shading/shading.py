@@ -76,13 +76,14 @@ def radiance(
             shape (V, 3). None for flat shading with the normals of the faces.
 
     Returns:
-        Radiance times the coverage of the pixel, in the dtype of `vertices`,
-        shape (3, P).
+        Radiance, times the fraction of each pixel that the surface covers, in the
+        dtype of `vertices`, shape (3, P).
 
     Raises:
         InputError: If an argument holds NaN.
     """
-    # `area_vectors` checks the vertices, and `irradiance` checks the light.
+    # Only the albedo is checked here. `area_vectors` checks the vertices, and `irradiance`
+    # checks the light.
     require_bounded(albedo=albedo)
     # Float16 would lose too much precision.
     wide = torch.promote_types(vertices.dtype, torch.float32)
@@ -129,8 +130,8 @@ def glossy_radiance(
         gloss: Gloss at the samples (see `renderer.shading.gloss`).
 
     Returns:
-        Radiance times the coverage of the pixel, in the dtype of `vertices`,
-        shape (3, P).
+        Radiance, times the fraction of each pixel that the surface covers, in the
+        dtype of `vertices`, shape (3, P).
 
     Raises:
         InputError: If an argument holds NaN.
@@ -225,7 +226,8 @@ def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tens
     if len(gloss.roughness) == 1:
         reflected_light = (factor_coefficients @ polynomials) * light
         return gloss.specular_factor * _HarmonicSum.apply(normals, reflected_light)
-    # One reflected light for each polynomial, with 3 colors each, shape (K, R · 3).
+    # Light times the factors of one polynomial: one row for each SH coefficient, one column
+    # for each pair of polynomial and color.
     lights = (factor_coefficients[..., None] * light[:, None]).flatten(1)
     # Irradiance with the axes: polynomial, color, sample.
     irradiances = _HarmonicSum.apply(normals, lights).unflatten(0, (-1, COLORS))

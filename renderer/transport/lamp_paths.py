@@ -197,7 +197,8 @@ def local_radiance(
             `surface.fragments`.
 
     Returns:
-        Radiance of the P pixels, times their coverage, float64, shape (3, P).
+        Radiance of the P pixels, times the fraction of each pixel that the mesh
+        covers, float64, shape (3, P).
     """
     fragments = fragments or surface.fragments
     # Irradiance at the end of each path: one row for each path, one column for each color.
@@ -343,8 +344,8 @@ class LocalLightView:
                 pixels of the view.
 
         Returns:
-            Radiance of the P pixels, times their coverage, in the dtype and on
-            the device of the light, shape (3, P).
+            Radiance of the P pixels, times the fraction of each pixel that the mesh
+            covers, in the dtype and on the device of the light, shape (3, P).
         """
         fragments = None if fragments is None else fragments.to("cpu")
         if basis.is_movable and positions is not None:

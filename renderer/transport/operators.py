@@ -93,9 +93,9 @@ class TransferOperator:
         sparse: Nonzero entries of further rows of the matrix, in three channels.
             These are rows of projected patterns, which are mostly zero. None
             without such rows.
-        distinct: The D covered pixels that differ from each other, and their
-            copies. Products are computed for the distinct pixels alone. None if
-            most pixels differ. All pixels are then treated as distinct, and
+        distinct: D groups of covered pixels that are equal in every light.
+            Products are only computed for one pixel of each group, its distinct
+            pixel. None if most pixels differ. Each pixel is then a group, and
             D = P.
 
     Example:
@@ -492,8 +492,8 @@ class TransferOperator:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        # The copy treats all pixels as distinct. On a GPU, the gradients of equal pixels would
-        # be added up in a random order, so that results would differ between runs.
+        # The copy does not group equal pixels. On a GPU, the gradients of the pixels of a group
+        # would be added up in a random order, so that results would differ between runs.
         transfer = self.transfer.to(device)
         return replace(self, distinct_transfer=transfer, **tensors, sparse=sparse, distinct=None)
 
@@ -596,7 +596,8 @@ class _PreparedBackground(NamedTuple):
     Attributes:
         images: Background images, shape (..., 3, size²).
         term: Linear values of the background that are added to the radiance of
-            the D distinct covered pixels, shape (..., 3, D).
+            the D distinct pixels (one of each group of equal covered pixels),
+            shape (..., 3, D).
     """
 
     images: Tensor
@@ -616,7 +617,8 @@ class _Radiance(torch.autograd.Function):
             operator: Operator of the view.
 
         Returns:
-            Radiance times coverage, shape (..., 3, P).
+            Radiance, times the fraction of each pixel that the mesh covers,
+            shape (..., 3, P).
         """
         ctx.operator = operator
         radiance = operator._radiance(lights)
@@ -889,8 +891,9 @@ class _OperatorBuilder:
         distinct = None
         if self._is_uniform_on_faces(surface, channels):
             distinct = find_distinct_pixels(fragments, albedo)
-        # Rows of the matrix: as dense tensors, or as lists of nonzero entries.
+        # Rows of the matrix as dense tensors.
         dense = []
+        # Rows of the matrix as lists of their nonzero entries.
         sparse = []
         for local_light in self.basis.local_lights:
             entries = self._local_entries(local_light, surface, channels)
@@ -1048,8 +1051,8 @@ class _OperatorBuilder:
             channels: Channels and albedo of the transfer matrix.
 
         Returns:
-            Nonzero entries. Their basis functions are counted from the first
-            function of this light.
+            Nonzero entries. Their basis functions (lamps, or pixels of the
+            projector) are counted from the first function of this light.
         """
         return local_transfer(self.rays, surface, channels.sample_albedo, local_light.basis)
 
@@ -1060,8 +1063,8 @@ class _OperatorBuilder:
 
         Args:
             local_light: Local light of the basis.
-            entries: Nonzero entries. Their basis functions are counted from the
-                first function of this light.
+            entries: Nonzero entries of the transfer matrix of this light. Their
+                basis functions are counted from the first function of the light.
             surface: Samples of the view.
 
         Returns:
@@ -1077,8 +1080,8 @@ class _OperatorBuilder:
 
         Args:
             local_light: Local light of the basis.
-            entries: Nonzero entries. Their basis functions are counted from the
-                first function of this light.
+            entries: Nonzero entries of the transfer matrix of this light. Their
+                basis functions are counted from the first function of the light.
             channels: Channels and albedo of the transfer matrix.
 
         Returns:
@@ -1159,8 +1162,9 @@ def _box_filter(
             in a single channel.
         basis: SH basis, in which K functions change the irradiance.
         dtype: Data type of the result.
-        distinct: The D pixels that differ from each other, and their copies. This
-            needs flat normals and an albedo of 1. None computes all pixels.
+        distinct: D groups of pixels that are equal in every light. Only one pixel
+            of each group (the distinct pixel) is computed. This needs flat normals
+            and an albedo of 1. None computes all pixels.
 
     Returns:
         Radiance per unit of each of the K coefficients, shape (C, K, P), or
@@ -1175,10 +1179,12 @@ def _box_filter(
         face_values = basis.irradiance(surface.face_planes)
         if albedo is None and _are_pixels_mostly_filled(fragments):
             return _copy_from_faces(fragments, face_values, dtype, distinct)
-        # A pixel is a sum over entries. Here, an entry is all samples of one face in a pixel.
+        # The value of a pixel is a weighted sum of entries. With flat normals, all samples of
+        # the same face in the pixel are one entry.
         entry_to_pixel, entry_to_face, weights = _group_weights(fragments, albedo)
     else:
-        # A pixel is a sum over entries. With smooth normals, an entry is a sample.
+        # The value of a pixel is a weighted sum of entries. With smooth normals, each sample is
+        # an entry.
         entry_to_pixel = fragments.sample_to_pixel
         weights = _sample_weights(fragments, albedo)
     transfer = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
@@ -1222,8 +1228,9 @@ def _copy_from_faces(
         face_values: Irradiance A_l Y_lm(n) of each of the G faces from each of K
             harmonics, shape (G, K).
         dtype: Data type of the result.
-        distinct: The D pixels that differ from each other, and their copies. None
-            computes all pixels.
+        distinct: D groups of pixels that are equal in every light. Only one pixel
+            of each group (the distinct pixel) is computed. None computes all
+            pixels.
 
     Returns:
         Transfer matrix, shape (1, K, P) or (1, K, D).
@@ -1240,7 +1247,8 @@ def _copy_from_faces(
     values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
     # First give each pixel (column) the values of the face of its first group.
     transfer = values_by_function.index_select(1, group_to_face.index_select(0, first_group))
-    # Then replace the pixels that no single face fills. Their groups are called partial.
+    # Then replace the pixels that no single face fills. A group of samples is partial if it
+    # has fewer samples than a pixel.
     is_partial_group = sample_count < fragments.samples**2
     partial_groups = indices_of_true(is_partial_group)
     partial_to_face = group_to_face.index_select(0, partial_groups)

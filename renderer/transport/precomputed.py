@@ -102,7 +102,7 @@ class Patches:
         pieces = refine(mesh, patch_area)
         piece_count = len(pieces.faces)
         sides = [FRONT] if pieces.closed else [FRONT, BACK]
-        # One entry for each side: the fronts of all pieces first, then all backs.
+        # One entry for each side: the fronts of all small faces (pieces), then all backs.
         facing = np.repeat(sides, piece_count)[:, None]
         piece_of_side = np.tile(np.arange(piece_count), len(sides))
         cell_width = math.sqrt(patch_area)
@@ -171,10 +171,10 @@ class Patches:
             matrix, shape (B, N).
         """
         is_hit = hits.face_of_ray != rays.NO_FACE
-        # Pixel and direction of each ray that hits a piece and has a nonzero weight.
+        # Pixel and direction of each ray that hits a face and has a nonzero weight.
         pixel, direction = torch.nonzero(weights * is_hit, as_tuple=True)
         piece = hits.face_of_ray[pixel, direction]
-        # A ray hits the back of a piece if its direction is on the side of the outer normal.
+        # A ray hits the back of a face if it goes in the direction of the outer normal.
         is_back = (self._normals[piece] * directions[direction]).sum(1) > 0
         patch = self.patch_of_side[is_back.long(), piece]
         # `csr_matrix` adds up entries with the same pixel and patch.
@@ -238,7 +238,8 @@ class Transport:
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
         """Divide the mesh into patches, and compute the light that they send, if light bounces."""
-        # Patches are only needed for bounces. Rays then hit the pieces of the patches.
+        # Only bounces need patches. Rays then hit the small faces (pieces) of which the patches
+        # consist.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         self._directions = sphere(rays.DIRECTIONS)
@@ -262,8 +263,8 @@ class Transport:
 
         Returns:
             Change of the radiance of the P pixels per unit of each of the K
-            coefficients, times the coverage of the pixel, float64,
-            shape (C, K, P). None if no surface blocks light.
+            coefficients, times the fraction of the pixel that the mesh covers,
+            float64, shape (C, K, P). None if no surface blocks light.
         """
         change = None
         fragments = surface.fragments
@@ -390,8 +391,8 @@ class Transport:
             light: SH coefficients, shape (K, 3).
 
         Returns:
-            Change of the radiance of the P pixels, times their coverage, in the
-            dtype of the light, shape (3, P).
+            Change of the radiance of the P pixels, times the fraction of each pixel
+            that the mesh covers, in the dtype of the light, shape (3, P).
         """
         with torch.no_grad():
             change = self.change(surface, albedo.detach().cpu().double())
@@ -447,7 +448,7 @@ def _radiosity(
 
     Args:
         patches: Patches of the mesh.
-        rays: Rays among the pieces of the patches.
+        rays: Rays among the small faces (pieces) of the patches.
         settings: Settings of the image, with the number of bounces.
         albedo_scale: Factor for the albedo of the mesh.
         basis: SH basis of the environment light, with K coefficients.
@@ -496,7 +497,7 @@ class _PatchLinks:
 
         Args:
             patches: The N patches.
-            rays: Rays among the pieces of the patches.
+            rays: Rays among the small faces (pieces) of the patches.
             basis: SH basis of the environment light.
 
         Returns:

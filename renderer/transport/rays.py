@@ -260,7 +260,7 @@ class Rays:
         If all vertices lie in a plane, there is no hull, and all vertices are
         returned.
         """
-        # This import stands here because it takes long.
+        # Only imported when it is needed, because the import takes long.
         from scipy.spatial import ConvexHull, QhullError
 
         vertices = self._mesh.vertices[np.unique(self._mesh.faces)]

@@ -588,9 +588,9 @@ def _fragments_of_view(
     """
     size = settings.size
     samples = settings.samples
-    # View the ids of neighboring samples in the same row and pixel as one item of bytes,
-    # so that they move together below. Axes: row of a pixel, row in the pixel, column of a
-    # pixel.
+    # Neighboring samples in a row of the same pixel become one item, which is faster to
+    # move. Axes: row of the pixel in the image, row of the samples in the pixel, column of the
+    # pixel in the image.
     pixel_rows = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
     # All face ids of the first pixel, then all of the second pixel, and so on.
     ids_by_pixel = pixel_rows.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)

@@ -397,7 +397,7 @@ class _MovingView:
         # Two rows: pixels of the first samples, and pixels of the second samples.
         pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
         device = pixels_at_crossings.device
-        # Column of each pixel of the image in `upstream`, or -1.
+        # Index of the column of `upstream` for each pixel of the image, or -1 without a column.
         column_of_pixel = torch.full((self.fragments.size**2,), -1, device=device)
         upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
         column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
@@ -573,7 +573,7 @@ class _Silhouettes:
         # the same for all cuts between the same two samples.
         distance = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         visible = np.flatnonzero(is_visible)
-        # The nearest of all cuts between the same two samples is kept.
+        # Of all cuts between the same two samples, keep the one with the smallest distance.
         kept = visible[_smallest_in_groups(distance[visible], after[visible])]
         return (
             self.ends[:, edge[kept]],

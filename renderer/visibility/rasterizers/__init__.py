@@ -112,7 +112,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     if rasterizer == "numpy":
         return Rasterizer("numpy", "numpy")
     try:
-        # This import stands here because it also imports numba, which takes 0.5 s.
+        # Only imported when it is needed, because it also imports numba, which takes 0.5 s.
         from renderer.visibility.rasterizers import numba
 
         return Rasterizer("numba", f"numba ({numba.VERSION})")

@@ -21,7 +21,7 @@ from renderer.visibility.rasterizers.numpy import FAR, SUBSAMPLE_BITS, to_fixed_
 
 try:
     import numba
-except ImportError as error:  # numba also raises this if it does not support the version of NumPy.
+except ImportError as error:  # numba also raises ImportError for an unsupported NumPy.
     raise InputError(
         f"numba cannot be imported ({error}): pip install numba, or choose the rasterizer numpy"
     ) from error
