@@ -49,7 +49,7 @@ def progress(
         disable=not is_shown,
         initial=done,
     )
-    # tqdm would not show a bar before the first item is done.
+    # tqdm itself shows no bar before the first item is done. This timer shows the bar.
     timer = Timer(PATIENCE, _show, [bar])
     timer.daemon = True
     if is_shown:

@@ -350,7 +350,8 @@ class AugmentationService:
         if "scene" not in state or state.keys() - {"scene", "values"}:
             found = ", ".join(str(key) for key in state) or "nothing"
             raise InputError(
-                f"state has the keys {found}, which a service does not write: give {expected}"
+                f"state has the keys {found}, which are not those of a service: "
+                "give the result of state_dict of a service with the same scene"
             )
         values = state.get("values")
         if values is not None:

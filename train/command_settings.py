@@ -375,7 +375,7 @@ class LabSettings(Settings):
         if not sources or self.setups % len(sources):
             raise InputError(
                 f"setups={self.setups} must be a multiple of the {len(sources)} patterns and "
-                "environments: give as many setups to each of them",
+                "environments: choose a multiple, so that each of them gets equally many setups",
                 "setups",
             )
         repeated = [name for name in sources if sources.count(name) > 1]

@@ -422,7 +422,8 @@ class EvaluationSettings(Settings):
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
             raise InputError(
                 f"laboratory_setups={self.laboratory_setups} must be a multiple of "
-                f"{KEPT_ASIDE_PATTERNS}, the number of projected patterns",
+                f"{KEPT_ASIDE_PATTERNS}, the number of projected patterns: "
+                f"set it to {KEPT_ASIDE_PATTERNS} or {2 * KEPT_ASIDE_PATTERNS}, for example",
                 "laboratory_setups",
             )
         photos = self.photos
@@ -647,7 +648,8 @@ class ExperimentSettings(NetworkSettings):
         missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:
             raise InputError(
-                f"label={self.label} has no mesh of {min(missing)}: name one in scene.meshes",
+                f"label={self.label} has no mesh of {min(missing)}: "
+                "add a mesh of this class to scene.meshes",
                 "label",
             )
         return objects

@@ -780,7 +780,8 @@ def final_images(
     Args:
         problem: The attacked scene and the parameters that were changed.
         values: D attack values of each of A examples, shape (A, D).
-        examples: Index of each of the A examples in the scene, shape (A,).
+        examples: Index of each of the A examples, which are objects with their views, in the
+            scene, shape (A,).
         images: Images that the descent rendered with these values,
             shape (A, V, 3, size, size).
 

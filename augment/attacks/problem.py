@@ -50,7 +50,8 @@ class AttackProblem:
 
         Args:
             values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions of the A examples, differentiable with respect to the
@@ -66,7 +67,8 @@ class AttackProblem:
 
         Args:
             values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Images in [0, 1], shape (A, V, 3, size, size), differentiable with
@@ -113,7 +115,8 @@ class AttackProblem:
             values: D attack values of each of A examples, shape (A, D).
             gradient: Gradient of the cost with respect to the values,
                 shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
             length: Factor of the step of each example, shape (A, 1).
 
         Returns:
@@ -148,7 +151,8 @@ class AttackProblem:
 
         Args:
             values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Projected values, shape (A, D).

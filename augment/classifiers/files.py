@@ -180,8 +180,8 @@ def _read_exported(path: Path) -> Content:
     program = torch.export.load(path)
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
-    # The example value of the images has a shape: whole numbers for dimensions of fixed size, and
-    # symbols for the others.
+    # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
+    # whole numbers, and the others are symbols.
     sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
     return Content(Exported(program.module()), sizes)
 

@@ -319,7 +319,8 @@ class Scene:
 
         Args:
             conditions: Light, shape and colors of each of A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Images with values in [0, 1], shape (A, V, 3, size, size).
@@ -394,7 +395,8 @@ class Scene:
 
         Args:
             conditions: Light, shape and colors of A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Yields:
             Layers with the pixels of the A · V images. Image a · V + v of them is view v of the
@@ -415,7 +417,8 @@ class Scene:
 
         Args:
             light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Yields:
             One layer for each stack of operators, with the images that the stack renders.
@@ -436,7 +439,8 @@ class Scene:
         Args:
             light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
             positions: Positions of the L lamps, shape (A, L, 3).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Yields:
             One layer for each stack of transfer operators.
@@ -473,7 +477,8 @@ class Scene:
         Args:
             light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
             conditions: Shape, colors and cameras of the A examples. Their light is not used.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Yields:
             One layer for each of the A · V images.

@@ -170,7 +170,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if unknown:
         raise InputError(
             f"{folder / TABLE} names the source {min(unknown)!r} in the column hard_negatives, "
-            "but no image has this source: correct the name, or remove it",
+            "but no image has this source: correct or remove this name",
         )
     return photographs
 

@@ -395,7 +395,9 @@ def load_folder(
     empty_classes = set(range(len(classes))).difference(train.labels.tolist())
     if empty_classes:
         name = classes[min(empty_classes)]
-        raise InputError(f"{train_root / name} holds no image: put some there or remove the folder")
+        raise InputError(
+            f"{train_root / name} holds no image: put images there, or remove the folder"
+        )
     if split_names:
         test = _folder_split(root / "test", classes, size, skip_unreadable, workers)
         return DataSet(classes, train, test)

@@ -313,7 +313,8 @@ def _load_published(path: Path) -> dict[str, Any]:
 
     Returns:
         Mapping with the weights in single precision under "model", and with
-        those of the entries PUBLISHED_FACTS that the file has.
+        further entries if the file has them: "architecture", "settings",
+        "scores", "versions" and "operating_point".
 
     Raises:
         InputError: If the file is damaged.

@@ -69,7 +69,7 @@ def most_threads() -> int:
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
     except (OSError, ValueError):
-        # The file is missing or contains "max 100000" if there is no limit.
+        # Without a limit, the file of the container's quota is missing, or contains "max 100000".
         permitted = bound
     return min(THREADS, bound, permitted)
 

@@ -129,8 +129,8 @@ class SignalHandler:
         """Create the context manager. It handles signals when its block begins."""
         # Number of the first signal. None if there was no signal yet.
         self._number: int | None = None
-        # Number of processes with a signal at the last call of `requested`: a sum over the
-        # processes that may still be computed, and the tensor that receives it.
+        # The last call of `requested` began to count the processes with a signal. These are the
+        # operation, which may still run, and the tensor that receives the count.
         self._last_sum: tuple[dist.Work, Tensor] | None = None
         # Handlers that the signals had before the block.
         self._handlers: dict[int, Any] = {}

@@ -48,7 +48,7 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
     except InputError as error:
         argument = error.argument
         if argument not in keys:
-            # The key of "light" is used for "light.turbidity" and "light[0]".
+            # "light.turbidity" and "light[0]" are parts of the argument "light".
             argument = argument.partition(".")[0].partition("[")[0]
         if argument in keys:
             key = keys[argument]

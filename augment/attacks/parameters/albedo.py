@@ -33,7 +33,8 @@ class Albedo(MeshParameter):
             values: Linear RGB offsets of the F faces of the largest mesh in each of A examples,
                 shape (A, 3 F).
             conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions with the offsets, differentiable with respect to the values.

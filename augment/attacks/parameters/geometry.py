@@ -38,7 +38,8 @@ class Geometry(MeshParameter):
             values: Displacements of the N vertices of the largest mesh in each of A examples, in
                 world units, shape (A, 3 N).
             conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions with the vertices, differentiable with respect to the values.

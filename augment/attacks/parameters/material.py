@@ -116,7 +116,8 @@ class Material(Parameter):
                 the rotation of the hue. Each is divided by its unit in the
                 settings.
             conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions with the gloss and the hue of each face, differentiable

@@ -46,7 +46,8 @@ class MeshParameter(Parameter):
         Args:
             values: Attack values of A examples, three for each vertex or face,
                 shape (A, 3 N).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Offset of each of the N vertices or faces, shape (A, N, 3). It is

@@ -61,7 +61,8 @@ class Parameter(ABC):
             values: D values of the quantity in each of A examples, shape (A, D).
             conditions: Conditions of the A examples. Other parameters may have
                 changed them already.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions of the A examples, differentiable with respect to the
@@ -94,7 +95,8 @@ class Parameter(ABC):
             values: D values in each of A examples, shape (A, D).
             gradient: Gradient of the cost with respect to the values,
                 shape (A, D).
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
             length: Factor of the step of each example, shape (A, 1).
 
         Returns:
@@ -112,7 +114,8 @@ class Parameter(ABC):
         a radius, `STEPS_OF_SEARCH` times the step size takes its place.
 
         Args:
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Standard deviation of the random changes of each value, shape (A, D).
@@ -141,10 +144,9 @@ class Parameter(ABC):
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
 
         Args:
-            values: D attacked values of each of A examples, shape (A, D). An example is an
-                object with its views.
-            examples: Index of each of the A examples among all examples of the attacked scene,
-                shape (A,).
+            values: D attacked values of each of A examples, shape (A, D).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Projected values, shape (A, D).

@@ -123,7 +123,8 @@ class Pose(Parameter):
                 the units of the settings, shape (A, D).
             conditions: Conditions of the A examples. If another parameter has
                 displaced the vertices, the displaced vertices are moved.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions with moved vertices and cameras, differentiable with
@@ -137,7 +138,7 @@ class Pose(Parameter):
         moved_vertices = []
         for index, unmoved, change in zip(objects.tolist(), vertices, changes, strict=True):
             moved_vertices.append(self._movable_objects[index].move(unmoved, change))
-        # There is nothing to stack if A is 0.
+        # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
             vertices = torch.stack(moved_vertices)
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])

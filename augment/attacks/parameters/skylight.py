@@ -67,7 +67,8 @@ class Skylight(Parameter):
             values: Zenith angle, azimuth and turbidity of each of A examples,
                 divided by their units, shape (A, 3).
             conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples in the scene, shape (A,).
+            examples: Index of each of the A examples, which are objects with their views, in the
+                scene, shape (A,).
 
         Returns:
             Conditions with the light of the sky, differentiable with respect to

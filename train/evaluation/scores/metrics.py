@@ -662,7 +662,7 @@ def _draw_images(object_of_image: np.ndarray, generator: np.random.Generator) ->
     image_count = len(object_of_image)
     images_per_object = np.bincount(object_of_image)
     object_count = len(images_per_object)
-    # One row for each replicate, flattened to shape (BLOCK · objects,).
+    # Objects that are drawn for each of BLOCK replicates, as one list, shape (BLOCK · objects,).
     drawn_objects = generator.integers(object_count, size=(BLOCK, object_count)).ravel()
     replicate_of_draw = np.arange(BLOCK).repeat(object_count)
     if object_count == image_count:
@@ -674,7 +674,7 @@ def _draw_images(object_of_image: np.ndarray, generator: np.random.Generator) ->
         # `first_position` is the position in this list at which each object starts.
         images_by_object = object_of_image.argsort(kind="stable")
         first_position = images_per_object.cumsum() - images_per_object
-        # `repeat` gives each drawn object one entry for each of its images.
+        # An object with n images gets n random numbers below n.
         position_in_object = generator.integers(drawn_sizes.repeat(drawn_sizes))
         object_start = first_position[drawn_objects].repeat(drawn_sizes)
         drawn_images = images_by_object[object_start + position_in_object]
