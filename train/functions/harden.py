@@ -194,7 +194,8 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
     if not all(weight.is_leaf for weight in copy.parameters()):
         raise InputError(
             "network contains a module of torch.jit, whose copy cannot be trained: "
-            "write it with torch.jit.save to network.pt, and give norm_balls.load_classifier('network.pt')"
+            "write it with torch.jit.save to network.pt, and give "
+            "norm_balls.load_classifier('network.pt')"
         )
     return copy
 

@@ -126,7 +126,7 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
         (["fig/a.png"], "holds 1 class folders: give a folder with two or more"),
         (
             ["fig/a.png", "lime/.a.png"],
-            "data/lime holds no image: put some there or remove the folder",
+            "data/lime holds no image: put images there, or remove the folder",
         ),
         (
             ["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"],
