@@ -235,7 +235,7 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
 MISTAKES = [
     (["classifier=resnet18"], "classifier=resnet18"),
     (["transfer.classifiers=[resnet18]"], "transfer.classifiers=resnet18"),
-    (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network"),
+    (["transfer.classifiers=[{network: x}]"], "unknown key network"),
     (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
     (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
