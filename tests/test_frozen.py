@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 from torch import Tensor, nn
 
 import augment
@@ -544,6 +545,9 @@ def fingerprint() -> str:
         for found in distributions(name=name):
             versions[name] = found.version
     instructions = torch.backends.cpu.get_cpu_capability()
+    # OPENBLAS_CORETYPE changes the instructions that NumPy and SciPy use.
+    kernels = {info.get("architecture", "") for info in threadpool_info()} - {""}
+    versions["OpenBLAS"] = " ".join(sorted(kernels))
     return ", ".join([processor, instructions, *map(" ".join, versions.items())])
 
 
