@@ -4,7 +4,6 @@ A slide is linear light in [0, 1]. It shows a pattern in two colors (`augment.sc
 Voronoi cells, smooth random fields, or a photograph.
 """
 
-import math
 from collections.abc import Callable
 from functools import partial
 
@@ -13,11 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from augment.scene.patterns import (
-    MAX_ZOOM,
     draw_patterns,
+    draw_photograph_patterns,
     pixel_centers,
     random_colors,
-    show_photographs,
 )
 from renderer.image import decode, to_unit
 
@@ -161,19 +159,6 @@ def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Gene
     """
     # Index of the random photograph that each of the pictures shows, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)
-    # Three numbers in [0, 1] of each picture, shape (count,) each.
-    turn, zoom, saturation = torch.rand(3, count, generator=draws)
-    angle = 2 * math.pi * turn
-    scale = MAX_ZOOM ** (2 * zoom - 1)
-    cosine = scale * angle.cos()
-    sine = scale * angle.sin()
-    zero = torch.zeros(count)
-    first_row = torch.stack([cosine, -sine, zero], dim=1)
-    second_row = torch.stack([sine, cosine, zero], dim=1)
-    # Affine maps from positions in the pictures to positions in the photographs, (count, 2, 3).
-    maps = torch.stack([first_row, second_row], dim=1)
-    grid = F.affine_grid(maps, [count, 3, size, size], align_corners=False)
-
     chosen = photographs[rows.to(photographs.device)].cpu()
     linear = decode(to_unit(chosen), "srgb")
-    return show_photographs(linear, grid, saturation)
+    return draw_photograph_patterns(linear, pixel_centers(size), draws)

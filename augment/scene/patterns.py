@@ -230,6 +230,8 @@ def draw_patterns(
 def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.Generator) -> Tensor:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
+    Beyond its border, a photograph is mirrored.
+
     Args:
         photographs: Photographs as linear light in [0, 1], shape (N, 3, H, W).
         points: Coordinates x and y of the point of the pattern that each pixel
@@ -241,34 +243,16 @@ def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.G
         Linear light in [0, 1], shape (N, 3, size, size).
     """
     # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
-    turn, zoom, saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
+    turn, zoom, relative_saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
     angle = 2 * math.pi * turn
     scale = MAX_ZOOM ** (2 * zoom - 1)
     rotated = turned(points * scale, angle.cos(), angle.sin())
     # `grid_sample` needs the coordinates on the last axis, shape (N, size, size, 2).
     grid = rotated.permute(1, 2, 3, 0)
-    return show_photographs(photographs, grid, saturation[:, 0, 0])
-
-
-def show_photographs(photographs: Tensor, grid: Tensor, saturation: Tensor) -> Tensor:
-    """Sample photographs at given points, and change their saturation.
-
-    Beyond its border, a photograph is mirrored.
-
-    Args:
-        photographs: Photographs as linear light in [0, 1], shape (N, 3, H, W).
-        grid: Coordinates x and y of the point of the photograph that each pixel
-            shows, in [-1, 1], shape (N, size, size, 2).
-        saturation: Factor of the saturation of each photograph, divided by
-            `MAX_SATURATION`, shape (N,).
-
-    Returns:
-        Linear light in [0, 1], shape (N, 3, size, size).
-    """
     shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
     # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
-    factor = MAX_SATURATION * saturation[:, None, None, None]
+    factor = MAX_SATURATION * relative_saturation[:, None]
     return (gray + factor * (shown - gray)).clamp(0, 1)
 
 

@@ -55,22 +55,30 @@ def photographs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def settings_of(weights, photographs):
+def small(weights, photographs) -> list[str]:
+    """List the overrides of both experiments for a small network and few photographs."""
+    return [
+        f"train.init_from=torchvision:{NAME}",
+        f"weights={weights}",
+        f"data.path={photographs}",
+        f"data.size={SIZE}",
+        "data.test_fraction=0.25",
+        "data.validation=0.25",
+        "train.device=cpu",
+        "train.precision=float32",
+        "train.threads=1",
+        "train.batch_size=8",
+    ]
+
+
+@pytest.fixture(scope="module")
+def settings_of(small):
     """Return a function that reads the experiment with small sizes and other overrides."""
 
     def read(folder, *overrides):
         words = [
             "experiment=photographs",
-            f"train.init_from=torchvision:{NAME}",
-            f"weights={weights}",
-            f"data.path={photographs}",
-            f"data.size={SIZE}",
-            "data.test_fraction=0.25",
-            "data.validation=0.25",
-            "train.device=cpu",
-            "train.precision=float32",
-            "train.threads=1",
-            "train.batch_size=8",
+            *small,
             "train.epochs=2",
             "train.learning_rate=0.003",
             f"run={folder}",
@@ -161,27 +169,18 @@ def test_other_arms_run(settings_of, tmp_path, words):
 
 
 @pytest.fixture(scope="module")
-def chain(weights, photographs):
+def chain(small):
     """Return a function that trains on photographs first and then on renders, by one command."""
 
     def start(folder, *overrides):
         words = [
             "experiment=classifier",
-            f"train.init_from=torchvision:{NAME}",
-            f"weights={weights}",
-            f"data.path={photographs}",
-            f"data.size={SIZE}",
-            "data.test_fraction=0.25",
-            "data.validation=0.25",
+            *small,
             "label='950'",
             "scene.meshes=[solid:orange]",
             "scene.hard_negatives=[solid:lemon]",
             "scene.backgrounds=[0.5]",
             "scene.views=1",
-            "train.device=cpu",
-            "train.precision=float32",
-            "train.threads=1",
-            "train.batch_size=8",
             "train.epochs=1",
             "evaluate.laboratory_setups=0",
             "photographs_first=true",
