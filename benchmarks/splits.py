@@ -14,7 +14,8 @@ python -m benchmarks.splits test pretrained/best runs/mine --data DATA --splits 
 DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is a method:
 the table has the mean, the lowest and the highest score of its seeds. A network
 may also be efficientnet_lite0 or another classifier, for images of --size
-pixels.
+pixels. normalized:NETWORK is a network that normalizes the light of each image,
+such as normalized:pretrained/none.
 """
 
 import argparse
@@ -66,6 +67,8 @@ TEST = "test"
 LOGGED_NAME = "reporting"
 # Split that each command evaluates.
 SPLIT_OF_COMMAND = {"validate": VALIDATION, "test": TEST}
+# Beginning of the name of a network that normalizes the light of each image.
+NORMALIZED = "normalized:"
 
 LABEL = "orange"
 # Fraction of the training images of CIFAR-100 on the validation split.
@@ -354,12 +357,15 @@ def load(name: str, size: int) -> Classifier:
     """Load the network of a run, or a classifier that was trained elsewhere.
 
     Args:
-        name: Folder of a run, or name of a classifier.
+        name: Folder of a run, or name of a classifier. After NORMALIZED, the
+            network with normalized light is loaded.
         size: Pixels per side of the images of a classifier. A run has its own.
 
     Returns:
         The network.
     """
+    if name.startswith(NORMALIZED):
+        return load(name.removeprefix(NORMALIZED), size).normalizing_light()
     if not is_classifier(name):
         return load_run(name)
     classifier = build_classifier(name, size)
@@ -574,8 +580,8 @@ def pool(run: str, network: Classifier, predictions: list[Prediction]) -> Evalua
 
 
 def summarize_network(run: str) -> RunSummary:
-    """Return the summary of a run, or an empty one for a classifier."""
-    if is_classifier(run):
+    """Return the summary of a run, or an empty one for another network."""
+    if run.startswith(NORMALIZED) or is_classifier(run):
         return RunSummary(Path(run), run, {}, {}, None)
     return summarize(Path(run))
 
@@ -701,7 +707,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("command", choices=["make", "validate", "test"])
-    add("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
+    add(
+        "networks",
+        nargs="*",
+        help="run folders, folders of runs, names under pretrained/, or normalized:NETWORK",
+    )
     add("--data", type=Path)
     add("--splits", type=Path, required=True)
     add("--packages", type=Path)

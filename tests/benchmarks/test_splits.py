@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
+from augment.classifiers.normalized_light import normalize_light
+from augment.settings import NormalizedLightSettings
 from benchmarks import splits
 from train.evaluation.laboratory import lab_patterns as patterns
 
@@ -130,9 +133,20 @@ def test_the_splits_share_no_image_object_or_light_and_evaluations_are_logged(
     log = Path("log.csv")
     log.write_text(LOG_HEADER)
     monkeypatch.setattr(splits, "LOG", log)
-    arguments = ["pretrained/none", *ARGUMENTS, "--part", "photographs", "--table", "mine"]
-    for command, logged_count in (("validate", 0), ("test", 1), ("test", 2)):
+    networks = ["pretrained/none", "normalized:pretrained/none"]
+    arguments = [*networks, *ARGUMENTS, "--part", "photographs", "--table", "mine"]
+    for command, logged_count in (("validate", 0), ("test", 2), ("test", 4)):
         splits.main([command, *arguments])
         assert len(log.read_text().splitlines()) == 1 + logged_count
-        is_warned = "was evaluated for 'mine' before" in capsys.readouterr().out
-        assert is_warned == (logged_count == 2)
+        printed = capsys.readouterr().out
+        assert ("was evaluated for 'mine' before" in printed) == (logged_count == 4)
+    assert {row["network"] for row in csv.DictReader(log.read_text().splitlines())} == set(networks)
+
+
+def test_a_network_with_normalized_light_sees_dark_images_brighter():
+    network = splits.load("pretrained/none", 32)
+    normalizing = splits.load("normalized:pretrained/none", 32)
+    dark = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0)) / 4
+    with torch.inference_mode():
+        assert normalizing(dark).equal(network(normalize_light(dark, NormalizedLightSettings())))
+        assert not normalizing(dark).allclose(network(dark))
