@@ -73,8 +73,8 @@ OBJECTS = {
             {"mesh": "solid:lemon:3002", "label": "lemon"},
         ),
         UNTRAINED: (
-            {"mesh": "solid:bottle:3001", "label": "water bottle"},
-            {"mesh": "solid:bottle:3002", "label": "water bottle"},
+            {"mesh": "solid:cup:3001", "label": "coffee mug"},
+            {"mesh": "solid:cup:3002", "label": "coffee mug"},
             {"mesh": "solid:lamp:3001", "label": "table lamp"},
             {"mesh": "solid:lamp:3002", "label": "table lamp"},
         ),
@@ -86,13 +86,16 @@ OBJECTS = {
             {"mesh": "orange_leaf.glb", "label": "orange"},
             {"mesh": "lemon.obj", "label": "lemon"},
             {"mesh": "solid:lemon:2001", "label": "lemon"},
+            {"mesh": "solid:lemon:2002", "label": "lemon"},
         ),
         UNTRAINED: (
             # ImageNet has no other class of apples.
             {"mesh": "apple_scan.glb", "label": "Granny Smith"},
             {"mesh": "bread.obj", "label": "French loaf"},
-            {"mesh": "cereal.obj", "label": "packet"},
             {"mesh": "mug.obj", "label": "coffee mug"},
+            {"mesh": "solid:cup:2001", "label": "coffee mug"},
+            {"mesh": "solid:lamp:2001", "label": "table lamp"},
+            {"mesh": "solid:lamp:2002", "label": "table lamp"},
         ),
     },
 }
@@ -101,15 +104,15 @@ PATTERNS = {"validation": ["rings", "colors"], TEST: ["window", "leaves", "text"
 MAPS = {"validation": ["city", "studio"], TEST: ["forest", "night"]}
 SEEDS = {"validation": 11, TEST: 12}
 # Renders of each class in each light. A group with fewer classes has more.
-RENDERS = 12
+RENDERS = 18
 FACTORS = {SAME: 1, OTHERS: 2, UNTRAINED: 1}
 # Directions, surroundings and materials that are drawn for each render.
 SURROUNDINGS = {
-    "ambient": [0.03, 0.15],
+    "ambient": [0.1, 0.25],
     "albedo": [0.04, 0.5],
     "walls": 0.5,
     "roughness": [0.3, 0.9],
-    "brightness": [0.5, 2.5],
+    "brightness": [0.6, 1.2],
 }
 # Pixels per side of the renders. The networks see them enlarged to their size.
 SIZE = 160
@@ -266,6 +269,7 @@ class Renders:
         labels: Class of each render.
         setups: Number of the light, camera and pose of each render, shape (N,).
             Each has as many renders as the group has classes.
+        objects: Mesh of each render, shape (N,).
     """
 
     group: str
@@ -273,6 +277,23 @@ class Renders:
     paths: Sequence[Path]
     labels: Sequence[str]
     setups: np.ndarray
+    objects: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScoredGroup:
+    """Hits of networks on the renders of a group of objects in a kind of light.
+
+    Attributes:
+        hits: 1 for each render whose class a network names, otherwise 0, shape
+            (S, N) with S seeds, by the name of the network.
+        setups: See `Renders`, shape (N,).
+        objects: See `Renders`, shape (N,).
+    """
+
+    hits: Mapping[str, np.ndarray]
+    setups: np.ndarray
+    objects: np.ndarray
 
 
 def find_renders(folder: Path) -> list[Renders]:
@@ -291,8 +312,9 @@ def find_renders(folder: Path) -> list[Renders]:
         paths = [table.parent / row["path"] for row in rows]
         labels = [path.parent.name for path in paths]
         setups = np.array([int(row["setup"]) for row in rows])
+        objects = np.array([row["mesh"] for row in rows])
         light = table.parent
-        found.append(Renders(light.parent.name, light.name, paths, labels, setups))
+        found.append(Renders(light.parent.name, light.name, paths, labels, setups, objects))
     return found
 
 
@@ -372,48 +394,72 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
     return networks
 
 
-def mean_with_interval(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Estimate:
-    """Return the mean of groups of values with its 95% bootstrap interval over setups and seeds.
+def mean_with_interval(parts: Sequence[ScoredGroup], name: str, other: str | None) -> Estimate:
+    """Return a mean over groups with its 95% bootstrap interval over objects, setups and seeds.
+
+    Objects, setups and seeds are drawn independently, and an image counts as
+    often as its object, its setup and its seed together (Owen 2007, "The
+    pigeonhole bootstrap").
 
     Args:
-        parts: For each group, the value of each image, shape (N,), or for
-            several seeds (S, N), and the number of the setup of each image,
-            shape (N,). Groups have the same weight and setups of their own.
+        parts: Groups of images with objects and setups of their own. They have
+            the same weight.
+        name: Network whose hits are averaged.
+        other: Network whose hits are subtracted. None subtracts nothing. It has
+            one seed, or as many seeds as the first network.
     """
     means = []
     resampled = []
-    for number, (values, setups) in enumerate(parts):
-        by_seed = np.atleast_2d(values)
-        by_setup = np.stack([by_seed[:, setups == one].mean(1) for one in np.unique(setups)])
-        setup_count, seed_count = by_setup.shape
+    for number, part in enumerate(parts):
+        values = part.hits[name] - (0 if other is None else part.hits[other])
+        seeds = np.arange(len(values))
         # All groups have the same draws of the seeds.
-        seed_draws = np.random.default_rng(0)
-        columns = seed_draws.integers(seed_count, size=(RESAMPLES, 1, seed_count))
-        setup_draws = np.random.default_rng([1, number])
-        rows = setup_draws.integers(setup_count, size=(RESAMPLES, setup_count, 1))
-        means.append(by_setup.mean())
-        resampled.append(by_setup[rows, columns].mean((1, 2)))
-    low, high = np.quantile(np.mean(resampled, axis=0), [0.025, 0.975])
+        seed_weights = draw_weights(seeds, np.random.default_rng(0))
+        rng = np.random.default_rng([1, number])
+        image_weights = draw_weights(part.objects, rng) * draw_weights(part.setups, rng)
+        sums = np.einsum("rs,rn,sn->r", seed_weights, image_weights, values)
+        # Each draw has as many seeds as there are. A draw may have no image.
+        with np.errstate(invalid="ignore"):
+            resampled.append(sums / (image_weights.sum(1) * len(seeds)))
+        means.append(values.mean())
+    low, high = np.nanquantile(np.mean(resampled, axis=0), [0.025, 0.975])
     return Estimate(float(np.mean(means)), float(low), float(high))
 
 
-def compare(parts: Sequence[tuple[dict[str, np.ndarray], np.ndarray]]) -> list[str]:
+def draw_weights(units: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw as many units as there are with replacement, and count how often each was drawn.
+
+    Args:
+        units: Unit of each of N images, such as its object, shape (N,).
+        rng: Random number generator.
+
+    Returns:
+        How often the unit of each image was drawn, shape (RESAMPLES, N).
+    """
+    names, unit_of_image = np.unique(units, return_inverse=True)
+    chances = np.full(len(names), 1 / len(names))
+    return rng.multinomial(len(names), chances, size=RESAMPLES)[:, unit_of_image]
+
+
+def compare(parts: Sequence[ScoredGroup], control: str | None) -> list[str]:
     """Write the cells of a row: the accuracy of each network, and its gain.
 
     Args:
-        parts: For each group of images, the hits of each network by name, and
-            the number of the setup of each image, shape (N,). Hits are 1 for
-            each image that a network is right about, otherwise 0, shape (S, N)
-            with S seeds. The gain is that over the first network, which has one
-            seed.
+        parts: Groups of images. The gain of a network is that over the first
+            network.
+        control: Network over which the gain is also written. None for no such
+            gain.
     """
-    first, *others = parts[0][0]
-    cells = [format_interval(mean_with_interval([(hits[first], setups) for hits, setups in parts]))]
+    first, *others = parts[0].hits
+    cells = [format_interval(mean_with_interval(parts, first, None))]
     for name in others:
-        accuracy = mean_with_interval([(hits[name], setups) for hits, setups in parts])
-        gains = [(hits[name] - hits[first], setups) for hits, setups in parts]
-        gain = format_interval(mean_with_interval(gains), "+")
-        cells.append(f"{accuracy.value:.3f} ({gain})")
+        accuracy = mean_with_interval(parts, name, None)
+        gain = format_interval(mean_with_interval(parts, name, first), "+")
+        cell = f"{accuracy.value:.3f} ({gain})"
+        if control not in (None, name):
+            over_control = format_interval(mean_with_interval(parts, name, control), "+")
+            cell += f" ({over_control} over {control})"
+        cells.append(cell)
     return cells
 
 
@@ -433,17 +479,18 @@ def score(options: argparse.Namespace) -> None:
         folders = [part.paths[0].parents[1] for part in parts]
         log_evaluations([Method("all", each_seed)], folders, options.table)
     rows = []
-    # Hits and setups of each group, by the kind of light.
-    by_light: dict[str, list[tuple[dict[str, np.ndarray], np.ndarray]]] = {}
+    by_light: dict[str, list[ScoredGroup]] = {}
     for part in parts:
         images = read_images(part.paths, options.network_size)
-        scored = (find_hits(networks, images, part.labels), part.setups)
-        rows.append([part.group, part.light, len(part.labels), *compare([scored])])
+        hits = find_hits(networks, images, part.labels)
+        scored = ScoredGroup(hits, part.setups, part.objects)
+        cells = compare([scored], options.control)
+        rows.append([part.group, part.light, len(part.labels), *cells])
         by_light.setdefault(part.light, []).append(scored)
     for light, groups in by_light.items():
-        count = sum(len(setups) for _, setups in groups)
-        rows.append(["all", light, count, *compare(groups)])
-    title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups and seeds"
+        count = sum(len(group.setups) for group in groups)
+        rows.append(["all", light, count, *compare(groups, options.control)])
+    title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over objects, setups, seeds"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:
         paths = sorted(options.photographs.iterdir())
@@ -518,13 +565,14 @@ def make_parser() -> argparse.ArgumentParser:
     making.add_argument("--splits", nargs="+", choices=[*OBJECTS], default=[*OBJECTS])
     making.add_argument("--renders", type=int, default=RENDERS, help="of each class and light")
     making.add_argument("--size", type=int, default=SIZE, help="pixels per side")
-    making.add_argument("--spp", type=int, default=16, help="paths per pixel and light")
+    making.add_argument("--spp", type=int, default=32, help="paths per pixel and light")
     scoring = commands.add_parser("score", help="score networks; the first one is the original")
     scoring.set_defaults(body=score)
     scoring.add_argument("networks", nargs="+", help="a classifier, and folders of runs")
     scoring.add_argument("--objects", type=Path, required=True, help="--out of make")
     scoring.add_argument("--split", choices=[*OBJECTS], default="validation")
     scoring.add_argument("--photographs", type=Path, help="folder of photographs INDEX_NAME.jpg")
+    scoring.add_argument("--control", help="column over which gains are written, too")
     scoring.add_argument("--interpolate", nargs="*", type=float, default=[], help="factors")
     scoring.add_argument("--network-size", type=int, default=224)
     scoring.add_argument("--table", default="", help="test: name of the table of the scores")

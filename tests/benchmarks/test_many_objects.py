@@ -1,4 +1,4 @@
-"""Networks are scored on objects that no training shows, and intervals are over setups."""
+"""Networks are scored on objects that no training shows. Intervals are over objects and setups."""
 
 import csv
 import zipfile
@@ -15,6 +15,7 @@ from augment.classifiers import Classifier
 from benchmarks import many_objects, splits
 from train.data.photographs import TABLE
 from train.evaluation.laboratory import lab_patterns
+from train.evaluation.tables import Estimate
 
 CLASSES = ["orange", "lemon", "packet"]
 
@@ -78,11 +79,24 @@ def test_a_hard_slide_has_two_complementary_saturated_colors_and_black():
     assert np.allclose(np.add(first, second), 255, atol=1)
 
 
+def one_group(values, setups=None, objects=None) -> many_objects.ScoredGroup:
+    """Make a group of N images with the hits (S, N), by default of one object in N setups."""
+    hits = np.atleast_2d(values)
+    count = hits.shape[1]
+    setups = np.arange(count) if setups is None else setups
+    objects = np.zeros(count) if objects is None else objects
+    return many_objects.ScoredGroup({"network": hits}, setups, objects)
+
+
+def mean_of(*groups) -> Estimate:
+    return many_objects.mean_with_interval(groups, "network", None)
+
+
 def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
     values = np.random.default_rng(0).integers(0, 2, 50).astype(float)
-    alone = many_objects.mean_with_interval([(values, np.arange(50))])
-    repeated = many_objects.mean_with_interval([(values.repeat(4), np.arange(50).repeat(4))])
-    assert repeated == alone
+    alone = mean_of(one_group(values))
+    repeated = mean_of(one_group(values.repeat(4), setups=np.arange(50).repeat(4)))
+    assert (repeated.low, repeated.high) == pytest.approx((alone.low, alone.high))
     # The interval of the normal approximation.
     error = 1.96 * values.std() / np.sqrt(50)
     assert alone.high - alone.low == pytest.approx(2 * error, rel=0.15)
@@ -91,17 +105,36 @@ def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
 def test_the_interval_of_equal_images_is_that_over_seeds():
     # The mean of two seeds that are drawn anew is 0, 0.5 or 1, with 1/4, 1/2 and 1/4.
     values = np.array([[0.0] * 9, [1.0] * 9])
-    found = many_objects.mean_with_interval([(values, np.arange(9))] * 2)
+    found = mean_of(one_group(values), one_group(values))
     assert (found.low, found.value, found.high) == (0.0, 0.5, 1.0)
+
+
+def test_the_interval_has_the_variance_of_objects_and_of_setups():
+    rng = np.random.default_rng(0)
+    of_objects = rng.normal(size=30)
+    of_setups = 2 * rng.normal(size=40)
+    objects, setups = np.divmod(np.arange(30 * 40), 40)
+    values = of_objects[objects] + of_setups[setups]
+    found = mean_of(one_group(values, setups, objects))
+    # The variance of a mean over two crossed random effects.
+    error = 1.96 * np.sqrt(of_objects.var() / 30 + of_setups.var() / 40)
+    assert found.high - found.low == pytest.approx(2 * error, rel=0.1)
 
 
 def test_groups_have_the_same_weight_and_draws_of_their_own():
     many = np.random.default_rng(0).integers(0, 2, 400).astype(float)
     few = np.random.default_rng(1).integers(0, 2, 100).astype(float)
-    found = many_objects.mean_with_interval([(many, np.arange(400)), (few, np.arange(100))])
+    found = mean_of(one_group(many), one_group(few))
     assert found.value == pytest.approx((many.mean() + few.mean()) / 2)
     error = 1.96 * np.sqrt(many.var() / 400 + few.var() / 100) / 2
     assert found.high - found.low == pytest.approx(2 * error, rel=0.15)
+
+
+def test_a_gain_is_between_the_same_images():
+    hits = {"first": np.array([[0.0, 1.0] * 50]), "second": np.array([[0.0, 1.0] * 50] * 2)}
+    group = many_objects.ScoredGroup(hits, np.arange(100), np.arange(100) % 5)
+    gain = many_objects.mean_with_interval([group], "second", "first")
+    assert (gain.low, gain.value, gain.high) == (0.0, 0.0, 0.0)
 
 
 def test_weights_between_two_networks_of_one_layer_give_logits_between():
@@ -132,7 +165,7 @@ def test_each_look_at_the_test_split_is_recorded(monkeypatch, tmp_path, capsys):
     folder = tmp_path / "test" / "objects" / "patterns"
     (folder / "orange").mkdir(parents=True)
     Image.new("RGB", (4, 4), (200, 100, 0)).save(folder / "orange" / "a.png")
-    (folder / TABLE).write_text("path,setup\norange/a.png,0\n")
+    (folder / TABLE).write_text("path,setup,mesh\norange/a.png,0,ball\n")
     log = tmp_path / "log.csv"
     log.write_text("date,commit,table,network,weights,parts,images\n")
     monkeypatch.setattr(splits, "LOG", log)
