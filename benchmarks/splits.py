@@ -357,8 +357,9 @@ def load(name: str, size: int) -> Classifier:
     """Load the network of a run, or a classifier that was trained elsewhere.
 
     Args:
-        name: Folder of a run, or name of a classifier. After NORMALIZED, the
-            network with normalized light is loaded.
+        name: Folder of a run, or name of a classifier, which may end in =WEIGHTS,
+            a file of its weights. After NORMALIZED, the network with normalized
+            light is loaded.
         size: Pixels per side of the images of a classifier. A run has its own.
 
     Returns:
@@ -366,10 +367,11 @@ def load(name: str, size: int) -> Classifier:
     """
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED), size).normalizing_light()
+    name, _, weights = name.partition("=")
     if not is_classifier(name):
         return load_run(name)
     classifier = build_classifier(name, size)
-    classifier.load_state_dict(load_network(name).state_dict())
+    classifier.load_state_dict(load_network(name, weights or None).state_dict())
     return classifier
 
 
