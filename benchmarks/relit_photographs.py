@@ -6,8 +6,8 @@ The name of each photograph begins with the index of its class, such as
     python -m benchmarks.relit_photographs FOLDER efficientnet_lite0 run:runs/relit
 
 A row of the table is a network, or the mean over the seeds of a training, whose
-networks are separated by commas. Differences are from the first row, with 95%
-intervals of a bootstrap over photographs and seeds.
+networks are separated by commas. Differences are from the first row, and from the
+row `--control`, with 95% intervals of a bootstrap over photographs and seeds.
 """
 
 import argparse
@@ -15,19 +15,20 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import norm_balls as nb
 from augment.classifiers import Classifier
+from benchmarks.many_objects import ScoredGroup, mean_with_interval
 from renderer.image import to_unit
 from train.data.photographs import find_unlabeled, load_photographs
+from train.evaluation.tables import Estimate, format_interval
 from train.runs.saved_networks import load_network
 
 # Photographs per pass.
 BATCH = 32
-# Draws of the bootstrap.
-DRAWS = 10_000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -35,23 +36,39 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of photographs")
     parser.add_argument("networks", nargs="+", help="the original, and NETWORK or NETWORK,NETWORK")
+    parser.add_argument(
+        "--control", help="one of the rows, from which differences are written, too"
+    )
     parser.add_argument("--every", type=int, default=10, help="classes whose index it divides")
     parser.add_argument("--slides", type=int, default=4, help="random slides of each photograph")
     parser.add_argument("--passes", type=int, default=11, help="passes of each search")
     parser.add_argument("--seed", type=int, default=1000, help="seed of the light")
     parser.add_argument("--scores", type=Path, help="folder of scores that later calls read")
     options = parser.parse_args(arguments)
-    original = options.networks[0]
-    first: dict[str, Tensor] = {}
-    for row in options.networks:
-        seeds = [load_or_score(name, original, options) for name in row.split(",")]
-        columns = {title: torch.stack([seed[title] for seed in seeds]) for title in seeds[0]}
-        if not first:
-            first = columns
-            print(f"|network|{'|'.join(columns)}|")
-            print("|-" * (1 + len(columns)) + "|")
-        cells = [cell(column, first[title]) for title, column in columns.items()]
-        print(f"|{row}|{'|'.join(cells)}|", flush=True)
+    rows = {row: score_row(row, options) for row in options.networks}
+    first = rows[options.networks[0]]
+    print(f"|network|{'|'.join(first)}|")
+    print("|-" * (1 + len(first)) + "|")
+    for row, columns in rows.items():
+        cells = []
+        for title, column in columns.items():
+            control = rows[options.control][title] if options.control else None
+            cells.append(cell(column, first[title], control))
+        print(f"|{row}|{'|'.join(cells)}|")
+
+
+def score_row(row: str, options: argparse.Namespace) -> dict[str, Tensor]:
+    """Score the networks of a row, or read the scores of an earlier call.
+
+    Args:
+        row: Names of the networks, separated by commas.
+        options: Options of the command line.
+
+    Returns:
+        Numbers in [0, 1] by column, shape (S, N) each for S networks.
+    """
+    seeds = [load_or_score(name, options.networks[0], options) for name in row.split(",")]
+    return {title: torch.stack([seed[title] for seed in seeds]) for title in seeds[0]}
 
 
 def load_or_score(name: str, original: str, options: argparse.Namespace) -> dict[str, Tensor]:
@@ -154,40 +171,36 @@ def predict(classifier: Classifier, photographs: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
-def cell(columns: Tensor, first: Tensor) -> str:
-    """Write a mean, and its difference from the first row with an interval.
+def cell(columns: Tensor, first: Tensor, control: Tensor | None) -> str:
+    """Write a mean, and its differences from other rows with intervals.
 
     Args:
         columns: Numbers of the photographs for each seed, shape (S, N).
         first: Numbers of the first row, shape (1, N).
+        control: Numbers of the control, shape (S, N) or (1, N). None for no
+            such difference.
 
     Returns:
-        Text such as "0.710, +0.050 [0.010, 0.090]".
+        Text such as "0.710, +0.050 [+0.010, +0.090]".
     """
     text = f"{columns.mean():.3f}"
-    difference = columns - first
-    if not difference.any():
-        return text
-    low, high = interval(difference)
-    return f"{text}, {difference.mean():+.3f} [{low:.3f}, {high:.3f}]"
+    if (columns - first).any():
+        text += f", {format_interval(interval(columns - first), '+')}"
+    if control is not None and (columns - control).any():
+        text += f" ({format_interval(interval(columns - control), '+')} over the control)"
+    return text
 
 
-def interval(values: Tensor) -> tuple[float, float]:
-    """Return the 95% interval of a mean, by a bootstrap over photographs and seeds.
+def interval(values: Tensor) -> Estimate:
+    """Return a mean with its 95% interval, by a bootstrap over photographs and seeds.
 
     Args:
         values: Numbers of the photographs for each seed, shape (S, N).
     """
-    draws = torch.Generator().manual_seed(0)
-    seed_count, count = values.shape
-    means = []
-    for _ in range(DRAWS):
-        seeds = torch.randint(seed_count, (seed_count,), generator=draws)
-        rows = torch.randint(count, (count,), generator=draws)
-        means.append(values[seeds][:, rows].mean())
-    ends = torch.tensor([0.025, 0.975], dtype=torch.float64)
-    low, high = torch.stack(means).quantile(ends).tolist()
-    return low, high
+    count = values.shape[1]
+    # Each photograph is an object of its own.
+    part = ScoredGroup({"": values.numpy()}, setups=np.zeros(count), objects=np.arange(count))
+    return mean_with_interval([part], "", None)
 
 
 if __name__ == "__main__":

@@ -202,12 +202,13 @@ def test_relit_photographs_are_scored_for_each_network(tmp_path, capsys):
         pixels = rng.integers(0, 256, (40, 40, 3)).astype(np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{index:03d}_thing.png")
     none, best = "run:pretrained/none", "run:pretrained/best"
-    relit_photographs.main([str(tmp_path), none, best, "--slides=2", "--passes=3"])
+    arguments = [str(tmp_path), none, best, f"--control={none}", "--slides=2", "--passes=3"]
+    relit_photographs.main(arguments)
     _, separator, *rows = capsys.readouterr().out.splitlines()
     assert separator.count("|") == 1 + 8
     assert [row.split("|")[1] for row in rows] == [none, best]
     for row in rows:
-        values = [float(cell.split(",")[0]) for cell in row.split("|")[2:-1]]
+        values = [float(cell.split()[0].rstrip(",")) for cell in row.split("|")[2:-1]]
         unchanged, _, _, _, one_slide, random_search, gradient = values
         assert gradient <= one_slide <= unchanged
         assert random_search <= one_slide
@@ -218,7 +219,7 @@ def test_the_intervals_of_relit_photographs_are_those_of_scipy():
 
     draws = torch.Generator().manual_seed(1)
     column, first = torch.randint(0, 2, (2, 60), generator=draws).double()
-    text = relit_photographs.cell(column[None], first[None])
+    text = relit_photographs.cell(column[None], first[None], None)
     low, high = (float(end) for end in text.partition("[")[2].rstrip("]").split(","))
     difference = (column - first).numpy()
     expected = bootstrap((difference,), np.mean, method="percentile", rng=0).confidence_interval
@@ -231,7 +232,7 @@ def test_the_intervals_of_relit_photographs_contain_the_variation_between_seeds(
     from scipy.stats import bootstrap
 
     means = torch.linspace(0, 1, 12, dtype=torch.float64) ** 2
-    low, high = relit_photographs.interval(means[:, None].expand(-1, 20))
+    found = relit_photographs.interval(means[:, None].expand(-1, 20))
     expected = bootstrap((means.numpy(),), np.mean, method="percentile", rng=0).confidence_interval
-    assert low == pytest.approx(expected.low, abs=0.02)
-    assert high == pytest.approx(expected.high, abs=0.02)
+    assert found.low == pytest.approx(expected.low, abs=0.02)
+    assert found.high == pytest.approx(expected.high, abs=0.02)
