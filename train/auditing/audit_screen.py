@@ -127,7 +127,7 @@ def screen_of_one(
             f"If an attacker controls {KINDS[kind].title}, it still recognizes {remaining_count} "
             f"of the {correct_count} views that it recognizes before the attack."
         )
-    false_positive_rate = pool.over_objects("false_positive_rate") if pool else None
+    false_positive_rate = pool.metrics.false_positive_rate if pool else None
     if false_positive_rate is not None and false_positive_rate.value is not None:
         title = f"Other objects called {in_words(label)}"
         numbers.append(

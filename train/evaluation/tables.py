@@ -23,7 +23,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Proportion(Estimate):
-    """Fraction of images that meet a condition, with its 95% Wilson interval.
+    """Fraction of images that meet a condition, with its 95% interval.
 
     Attributes:
         hits: Number of images that meet the condition.

@@ -224,7 +224,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
     values: list[float] = []
     for evaluation in evaluations:
         pool = evaluation.pools.get(subset)
-        metric = pool.over_objects(name) if pool is not None else None
+        metric = pool.metrics.find(name) if pool is not None else None
         if metric is not None and metric.value is not None:
             known.append(metric)
             values.append(metric.value)

@@ -255,9 +255,7 @@ class Pool:
     @cached_property
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
-        proportions = {}
-        for name, outcome in self.outcomes.items():
-            proportions[name] = fraction(sum(outcome.hits), len(outcome.hits))
+        proportions = {name: fraction_of_hits(outcome) for name, outcome in self.outcomes.items()}
         auc, *recalls = self._roc_estimates()
         top_accuracies = self._top_estimates()
         auc_with_counts = AreaUnderCurve(
@@ -356,40 +354,42 @@ class Pool:
         negative_objects = _object_indices(self.for_roc.negatives)
         return bootstrap(statistic, positive_objects, negative_objects)
 
-    def over_objects(self, name: str) -> Estimate | None:
-        """Return a metric with a 95% interval over objects and images.
-
-        The Wilson interval of a fraction in `metrics` treats each image as a
-        different object. If some object is shown in several images, it is too
-        narrow. It is then replaced by the interval of the bootstrap.
-
-        Args:
-            name: Name of the metric in `METRICS`, or "top5".
-
-        Returns:
-            The metric. None if it was not computed.
-        """
-        metric = self.metrics.find(name)
-        if not isinstance(metric, Proportion) or metric.value is None:
-            return metric
-        object_count = _count_objects(self.outcomes[name].predictions)
-        if object_count == metric.n:
-            return metric
-        return _estimate_or_wilson(metric.value, self.replicates[name], object_count)
-
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
         """For each metric that is known, its bootstrap replicates, shape (REPLICATES,)."""
         replicates = {}
         for name, outcome in self.outcomes.items():
             if outcome.hits:
-                statistic = partial(weighted_mean, np.array(outcome.hits))
-                replicates[name] = bootstrap(statistic, _object_indices(outcome.predictions))
+                replicates[name] = _replicates(outcome)
         if self._has_roc_curve:
             replicates.update(zip(ROC_METRICS, self._roc_replicates, strict=True))
         if self.classified:
             replicates.update(zip(TOP_RANKS, self._top_replicates, strict=True))
         return replicates
+
+
+def fraction_of_hits(outcome: Outcome) -> Proportion:
+    """Return the fraction of hits with its 95% interval.
+
+    Wilson's interval treats each image as a different object. If some object is
+    shown in several images, it is too narrow. The interval is then that of the
+    bootstrap over objects and images.
+
+    Args:
+        outcome: Predictions, and which of them are hits.
+    """
+    proportion = fraction(sum(outcome.hits), len(outcome.hits))
+    object_count = _count_objects(outcome.predictions)
+    if proportion.value is None or object_count == proportion.n:
+        return proportion
+    interval = _estimate_or_wilson(proportion.value, _replicates(outcome), object_count)
+    return replace(proportion, low=interval.low, high=interval.high)
+
+
+def _replicates(outcome: Outcome) -> np.ndarray:
+    """Return the bootstrap replicates of the fraction of hits, shape (REPLICATES,)."""
+    statistic = partial(weighted_mean, np.array(outcome.hits))
+    return bootstrap(statistic, _object_indices(outcome.predictions))
 
 
 def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:

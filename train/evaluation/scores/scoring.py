@@ -30,8 +30,10 @@ from train.evaluation.scores.metrics import (
     ROC_METRICS,
     TOP_RANKS,
     Metrics,
+    Outcome,
     Pool,
     Pooled,
+    fraction_of_hits,
     metric_title,
     thresholds,
 )
@@ -43,7 +45,7 @@ from train.evaluation.scores.predictions import (
     write_predictions,
 )
 from train.evaluation.scores.sheet import contact_sheet, write_roc
-from train.evaluation.tables import Proportion, Table, format_fraction, format_interval, fraction
+from train.evaluation.tables import Proportion, Table, format_fraction, format_interval
 from train.settings import GROUPS
 
 SUMMARY = "summary.json"
@@ -229,9 +231,9 @@ def score(
 ) -> Scores:
     """Score predictions for photographs.
 
-    Fractions of images have 95% Wilson intervals. All other metrics have
-    bootstrap intervals, which draw images, and objects if photos.csv names
-    them.
+    All metrics have 95% intervals over images, and also over objects if
+    photos.csv names them. Those of fractions of images that show different
+    objects are Wilson's. All others come from a bootstrap.
 
     Args:
         predicted: Predictions for the photographs of a folder.
@@ -304,14 +306,15 @@ def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> Cl
         labels: Names of the positive classes.
     """
     # `true_rank` is None for all photographs if the model lacks the class.
+    known = [item for item in predictions if item.true_rank is not None]
     ranks = [item.true_rank for item in predictions if item.true_rank is not None]
     wrong_classes = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
     is_predicted_label = [item.predicted in labels for item in predictions]
     return ClassScores(
         n=len(predictions),
-        recall=fraction(ranks.count(1), len(ranks)),
-        top5=fraction(sum(rank <= 5 for rank in ranks), len(ranks)),
-        predicted_label=fraction(sum(is_predicted_label), len(predictions)),
+        recall=fraction_of_hits(Outcome(known, [rank == 1 for rank in ranks])),
+        top5=fraction_of_hits(Outcome(known, [rank <= 5 for rank in ranks])),
+        predicted_label=fraction_of_hits(Outcome(predictions, is_predicted_label)),
         most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
     )
 
@@ -443,7 +446,7 @@ def format_scores(scores: Scores) -> str:
     paragraphs = [
         f"{positives} images of {scores.label}, {negatives} negatives{each}",
         str(_fraction_table(scores)),
-        str(_bootstrap_table(scores)),
+        str(_ranking_table(scores)),
         str(_class_table(scores)),
         *_notes(scores),
     ]
@@ -467,7 +470,7 @@ def format_overall(scores: Scores) -> str:
     title = f"{positives} images of {scores.label}, {negatives} negatives"
     details = {metric_title(name) for name in DETAILS}
     rows = []
-    for table in (_fraction_table(scores), _bootstrap_table(scores)):
+    for table in (_fraction_table(scores), _ranking_table(scores)):
         # The first row is about all images. Its first cell is the title of the row.
         metric_titles = table.header[1:]
         cells = table.rows[0][1:]
@@ -497,27 +500,25 @@ def _fraction_table(scores: Scores) -> Table:
     for title, metrics in _metrics_of_rows(scores):
         proportions: list[Proportion] = [getattr(metrics, name) for name in names]
         rows.append([title, *map(format_fraction, proportions)])
-    return Table("95% intervals over images", ["", *map(metric_title, names)], rows)
+    return Table(_title_of_intervals(scores), ["", *map(metric_title, names)], rows)
 
 
-def _bootstrap_table(scores: Scores) -> Table:
-    """Make the table of the metrics that have bootstrap intervals, such as the AUC.
-
-    The title tells whether the bootstrap draws only images, or also objects.
-    """
-    auc = scores.overall.auc
+def _ranking_table(scores: Scores) -> Table:
+    """Make the table of the metrics that depend on a ranking of images or classes."""
     names = (*ROC_METRICS, *TOP_RANKS)
-    resampled = "images"
-    if auc.has_repeated_objects:
-        counts = (
-            f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} hard negatives"
-        )
-        resampled = f"objects and images ({counts})"
     rows = []
     for title, metrics in _metrics_of_rows(scores):
         rows.append([title, *(format_interval(metrics.find(name)) for name in names)])
-    header = ["", *map(metric_title, names)]
-    return Table(f"95% intervals over {resampled}", header, rows)
+    return Table(_title_of_intervals(scores), ["", *map(metric_title, names)], rows)
+
+
+def _title_of_intervals(scores: Scores) -> str:
+    """Write whether the intervals are only over images, or also over objects."""
+    auc = scores.overall.auc
+    if not auc.has_repeated_objects:
+        return "95% intervals over images"
+    counts = f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} hard negatives"
+    return f"95% intervals over objects and images ({counts})"
 
 
 def _class_table(scores: Scores) -> Table:

@@ -226,7 +226,7 @@ def test_the_interval_of_a_recall_is_over_objects(second_is_found, low):
     ]
     logits = torch.tensor([[1.0, 0.0]] * 20 + [[float(second_is_found), 0.5]] * 20)
     scored = pool(rank_classes(photographs, logits, classes, ["orange"]))
-    metric = scored.over_objects("recall")
+    metric = scored.metrics.recall
     assert metric.value == (1.0 if second_is_found else 0.5)
     assert (metric.low, metric.high) == pytest.approx((low, 1.0), abs=1e-5)
 
@@ -238,6 +238,6 @@ def test_the_interval_of_a_recall_is_wilsons_if_each_image_shows_another_object(
     ]
     logits = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]] * 5)
     scored = pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
-    metric = scored.over_objects("recall")
+    metric = scored.metrics.recall
     wilson = binomtest(3, 8).proportion_ci(method="wilson")
     assert (metric.low, metric.high) == pytest.approx((wilson.low, wilson.high))
