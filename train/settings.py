@@ -247,6 +247,13 @@ class TrainSettings(Settings):
         choices=OPTIMIZERS,
     )
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
+    feature_norm: float | None = setting(
+        None,
+        "Norm of the features for which learning_rate is meant, if only the last layer learns. "
+        "With other features, the rate is divided by the ratio of the norms. null: never.",
+        above=0,
+        maximum=MAX_SCALE,
+    )
     momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
     weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=MAX_SCALE)
     clip_gradient: float | None = setting(

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from augment.classifiers.adapter import nearest
+from augment.model_passes import eval_mode
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 
@@ -159,3 +161,70 @@ def freeze(network: nn.Module, stage: str) -> None:
     frozen_count = names.index(chosen[-1]) + 1
     for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)
+
+
+def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Tensor) -> float:
+    """Adapt the learning rate of the last layer to the norm of its features.
+
+    A step with a clipped gradient changes the weights of the layer by at most
+    the learning rate. It then changes a logit by at most the learning rate
+    times the norm of the features. With the adapted rate, this product is the
+    same for all networks.
+
+    Args:
+        settings: Settings of the training.
+        network: Network from images in [0, 1] to logits.
+        images: Some images of the training in [0, 1], shape (N, 3, H, W).
+
+    Returns:
+        The learning rate. That of the settings if more than the last layer
+        learns, or if `settings.feature_norm` is None.
+
+    Raises:
+        InputError: If all features are 0.
+    """
+    # TorchScript has no hooks.
+    has_script = any(isinstance(module, torch.jit.ScriptModule) for module in network.modules())
+    if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST or has_script:
+        return settings.learning_rate
+    norm = feature_norm(network, images)
+    if not norm:
+        raise InputError(
+            f"feature_norm={settings.feature_norm:g} has no meaning for this network, whose last "
+            "layer gets only zeros: set feature_norm=null",
+            "feature_norm",
+        )
+    return settings.learning_rate * settings.feature_norm / norm
+
+
+@torch.no_grad()
+def feature_norm(network: nn.Module, images: Tensor) -> float:
+    """Compute the root mean square norm of the features that the last layer of a network gets.
+
+    A convolution as the last layer gets features at several positions, of which
+    networks such as SqueezeNet average the logits. The norm is that of the mean
+    feature over the positions.
+
+    Args:
+        network: Network from images in [0, 1] to logits.
+        images: Images in [0, 1], shape (N, 3, H, W).
+
+    Example:
+        >>> network = nn.Sequential(nn.Flatten(), nn.Linear(12, 2))
+        >>> round(feature_norm(network, torch.full((5, 3, 2, 2), 0.5)), 3)
+        1.732
+    """
+    stored: list[Tensor] = []
+
+    def store_features(_: nn.Module, inputs: tuple[Any, ...]) -> None:
+        stored.append(inputs[0].float())
+
+    layer = network.get_submodule(last_layer(network))
+    hook = layer.register_forward_pre_hook(store_features)
+    with eval_mode(network):
+        network(images)
+    hook.remove()
+    features = stored[-1]
+    # Mean over all dimensions after the channels, shape (N, C).
+    vectors = features.flatten(2).mean(2) if features.ndim > 2 else features
+    return float(vectors.square().sum(1).mean().sqrt())

@@ -25,6 +25,7 @@ from augment.classifiers.adapter import (
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
+from renderer.image import to_unit
 from train import console
 from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
@@ -64,12 +65,14 @@ from train.training.interpolation import (
     predict,
 )
 from train.training.loop import Trainer, evaluate
-from train.training.recipe import freeze, learning_rate
+from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.renders import build_service
 
 # If the training images are on disk, the mean and the standard deviation of their color
 # channels are estimated from this number of images.
 SAMPLED = 1000
+# Number of training images with which the norm of the features of a network is measured.
+NORM_IMAGES = 64
 
 
 class Run:
@@ -667,6 +670,11 @@ def build_trainer(
     recipe = settings.train
     if recipe.eval_mode is None:
         recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
+    with keyed(**keys):
+        rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
+    if rate != recipe.learning_rate:
+        console.info("learning rate %.3g, by the norm of the features of the network", rate)
+        recipe = replace(recipe, learning_rate=rate)
     description = describe(without_normalized_light(network), **facts, validation=validation.record)
     service = build_service(settings, data, device)
     with keyed(**keys):

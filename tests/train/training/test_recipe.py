@@ -1,6 +1,7 @@
 """Schedules, losses and augmentations against their formulas."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,13 @@ from train.networks import WideResNet
 from train.settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.baselines import PGD, Baseline
 from train.training.loss import TrainingLoss
-from train.training.recipe import SCHEDULE_FACTORS, freeze
+from train.training.recipe import (
+    SCHEDULE_FACTORS,
+    build_optimizer,
+    feature_norm,
+    freeze,
+    scale_learning_rate,
+)
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
@@ -220,3 +227,69 @@ def test_a_network_of_one_layer_learns_in_it():
     network = nn.Sequential(nn.Flatten(), nn.Linear(4, 2))
     freeze(network, "all_but_last")
     assert all(parameter.requires_grad for parameter in network.parameters())
+
+
+class Scaled(nn.Module):
+    """Classifier whose features are multiplied by a factor, and the weights of the layer divided.
+
+    Its logits do not depend on the factor.
+    """
+
+    def __init__(self, factor: float):
+        super().__init__()
+        self.factor = factor
+        self.head = nn.Linear(12, 4, bias=False)
+        weights = torch.randn(4, 12, generator=torch.Generator().manual_seed(1))
+        self.head.weight.data = weights / factor
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.head(self.factor * F.adaptive_avg_pool2d(images, 2).flatten(1))
+
+
+def test_the_norm_of_the_features_is_that_of_the_pooled_image(images):
+    units = to_unit(images)
+    pooled = F.avg_pool2d(units, 8).flatten(1)
+    expected = pooled.square().sum(1).mean().sqrt().item()
+    assert feature_norm(Scaled(3.0), units) == pytest.approx(3 * expected, rel=1e-6)
+
+
+def test_a_convolution_as_the_last_layer_has_the_norm_of_the_mean_over_positions(images):
+    units = to_unit(images)
+    network = nn.Sequential(nn.Conv2d(3, 4, 1), nn.AdaptiveAvgPool2d(1), nn.Flatten())
+    expected = units.mean((2, 3)).square().sum(1).mean().sqrt().item()
+    assert feature_norm(network, units) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.1, 30.0])
+def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_layer(images, factor):
+    units = to_unit(images)
+    settings = TrainSettings(
+        freeze="all_but_last", feature_norm=5.0, learning_rate=3.0, weight_decay=0.0
+    )
+    logits = []
+    for network in (Scaled(1.0), Scaled(factor)):
+        rate = scale_learning_rate(settings, network, units)
+        optimizer = build_optimizer(network, replace(settings, learning_rate=rate))
+        for _ in range(5):
+            optimizer.zero_grad()
+            F.cross_entropy(network(units), LABELS).backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 0.001)
+            optimizer.step()
+        logits.append(network(units).detach())
+    torch.testing.assert_close(logits[1], logits[0], rtol=1e-3, atol=1e-3)
+    assert not torch.allclose(logits[0], Scaled(1.0)(units), atol=0.1)
+
+
+@pytest.mark.parametrize("changes", [{"feature_norm": None}, {"freeze": None}])
+def test_the_learning_rate_is_that_of_the_settings_without_a_norm_or_a_frozen_network(
+    images, changes
+):
+    settings = TrainSettings(**{"freeze": "all_but_last", "feature_norm": 5.0, **changes})
+    rate = scale_learning_rate(settings, Scaled(9.0), to_unit(images))
+    assert rate == settings.learning_rate
+
+
+def test_features_of_zeros_have_no_learning_rate(images):
+    settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
+    with pytest.raises(InputError, match="feature_norm"):
+        scale_learning_rate(settings, Scaled(9.0), 0 * to_unit(images))
