@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from statistics import fmean
 
 import torch
 from torch import Tensor, nn
@@ -183,9 +183,7 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
     Raises:
         InputError: If all features are 0.
     """
-    # TorchScript has no hooks.
-    has_script = any(isinstance(module, torch.jit.ScriptModule) for module in network.modules())
-    if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST or has_script:
+    if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
     norm = feature_norm(network, images)
     if not norm:
@@ -197,16 +195,18 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
     return settings.learning_rate * settings.feature_norm / norm
 
 
-@torch.no_grad()
 def feature_norm(network: nn.Module, images: Tensor) -> float:
     """Compute the root mean square norm of the features that the last layer of a network gets.
 
-    A convolution as the last layer gets features at several positions, of which
-    networks such as SqueezeNet average the logits. The norm is that of the mean
-    feature over the positions.
+    For a linear layer, the features of an image are the gradient of a logit with
+    respect to its weights. This gradient is computed for the predicted class. For
+    a convolution whose outputs are averaged, as in SqueezeNet, it is the mean of
+    the features over the positions. It also exists for networks of TorchScript
+    and torch.export, which have no hooks.
 
     Args:
-        network: Network from images in [0, 1] to logits.
+        network: Network from images in [0, 1] to logits. Its last layer must
+            require gradients.
         images: Images in [0, 1], shape (N, 3, H, W).
 
     Example:
@@ -214,17 +214,11 @@ def feature_norm(network: nn.Module, images: Tensor) -> float:
         >>> round(feature_norm(network, torch.full((5, 3, 2, 2), 0.5)), 3)
         1.732
     """
-    stored: list[Tensor] = []
-
-    def store_features(_: nn.Module, inputs: tuple[Any, ...]) -> None:
-        stored.append(inputs[0].float())
-
     layer = network.get_submodule(last_layer(network))
-    hook = layer.register_forward_pre_hook(store_features)
+    weights = [parameter for parameter in layer.parameters() if parameter.ndim > 1]
+    squares = []
     with eval_mode(network):
-        network(images)
-    hook.remove()
-    features = stored[-1]
-    # Mean over all dimensions after the channels, shape (N, C).
-    vectors = features.flatten(2).mean(2) if features.ndim > 2 else features
-    return float(vectors.square().sum(1).mean().sqrt())
+        for image in images.split(1):
+            gradients = torch.autograd.grad(network(image).max(), weights)
+            squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
+    return math.sqrt(fmean(squares))

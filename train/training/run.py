@@ -72,7 +72,7 @@ from train.training.renders import build_service
 # channels are estimated from this number of images.
 SAMPLED = 1000
 # Number of training images with which the norm of the features of a network is measured.
-NORM_IMAGES = 64
+NORM_IMAGES = 16
 
 
 class Run:
