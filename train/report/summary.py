@@ -486,7 +486,7 @@ def _title_of(group: Scored) -> str:
     if len(labels) > 1:
         title += COUNTED_EACH
     if auc.has_repeated_objects:
-        title += "; intervals of recall and FPR are over images, the others over objects and images"
+        title += "; intervals are over objects and images"
     return title
 
 
