@@ -175,7 +175,8 @@ class RocPredictions(NamedTuple):
     negatives: Sequence[Prediction]
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True)
+class Outcome:
     """Predictions, and which of them are hits. A metric is the fraction of hits.
 
     Attributes:
@@ -185,6 +186,43 @@ class Outcome(NamedTuple):
 
     predictions: Sequence[Prediction]
     hits: Sequence[bool]
+
+    @cached_property
+    def proportion(self) -> Proportion:
+        """Fraction of hits with its 95% interval.
+
+        Wilson's interval treats each image as a different object. If some object
+        is shown in several images, it is too narrow. The interval is then that of
+        the bootstrap over objects and images.
+        """
+        proportion = fraction(sum(self.hits), len(self.hits))
+        object_count = _count_objects(self.predictions)
+        if proportion.value is None or object_count == proportion.n:
+            return proportion
+        interval = _estimate_or_wilson(proportion.value, self.replicates, object_count)
+        return replace(proportion, low=interval.low, high=interval.high)
+
+    @cached_property
+    def replicates(self) -> np.ndarray:
+        """Bootstrap replicates of the fraction of hits, shape (REPLICATES,)."""
+        statistic = partial(weighted_mean, np.array(self.hits))
+        return bootstrap(statistic, _object_indices(self.predictions))
+
+
+def within_rank(predictions: Sequence[Prediction], max_rank: int) -> Outcome:
+    """Find the predictions whose true class is among the most probable classes.
+
+    Args:
+        predictions: Predictions for photographs.
+        max_rank: Largest rank of the true class that counts as a hit.
+
+    Returns:
+        All given predictions, and whether each is a hit.
+    """
+    # `true_rank` is None if the network lacks the class. No prediction is then a hit, because
+    # infinity is above every rank.
+    hits = [(prediction.true_rank or np.inf) <= max_rank for prediction in predictions]
+    return Outcome(predictions, hits)
 
 
 @dataclass(frozen=True)
@@ -222,16 +260,13 @@ class Pool:
         negatives = np.array([prediction.log_odds for prediction in self.for_roc.negatives])
         return positives, negatives
 
-    @property
+    @cached_property
     def outcomes(self) -> dict[str, Outcome]:
         """Hits and misses for each metric that is a fraction of images, such as recall."""
-        # `true_rank` is None if the network lacks the class. No prediction is then a
-        # hit, because infinity is above every rank.
-        ranks = [prediction.true_rank or np.inf for prediction in self.positives]
         false_positives = [item.predicted == item.label for item in self.negatives]
         outcomes = {
-            "recall": Outcome(self.positives, [rank == 1 for rank in ranks]),
-            "top5": Outcome(self.positives, [rank <= 5 for rank in ranks]),
+            "recall": within_rank(self.positives, 1),
+            "top5": within_rank(self.positives, 5),
             "false_positive_rate": Outcome(self.negatives, false_positives),
         }
         if self.thresholds:
@@ -255,7 +290,7 @@ class Pool:
     @cached_property
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
-        proportions = {name: fraction_of_hits(outcome) for name, outcome in self.outcomes.items()}
+        proportions = {name: outcome.proportion for name, outcome in self.outcomes.items()}
         auc, *recalls = self._roc_estimates()
         top_accuracies = self._top_estimates()
         auc_with_counts = AreaUnderCurve(
@@ -360,36 +395,12 @@ class Pool:
         replicates = {}
         for name, outcome in self.outcomes.items():
             if outcome.hits:
-                replicates[name] = _replicates(outcome)
+                replicates[name] = outcome.replicates
         if self._has_roc_curve:
             replicates.update(zip(ROC_METRICS, self._roc_replicates, strict=True))
         if self.classified:
             replicates.update(zip(TOP_RANKS, self._top_replicates, strict=True))
         return replicates
-
-
-def fraction_of_hits(outcome: Outcome) -> Proportion:
-    """Return the fraction of hits with its 95% interval.
-
-    Wilson's interval treats each image as a different object. If some object is
-    shown in several images, it is too narrow. The interval is then that of the
-    bootstrap over objects and images.
-
-    Args:
-        outcome: Predictions, and which of them are hits.
-    """
-    proportion = fraction(sum(outcome.hits), len(outcome.hits))
-    object_count = _count_objects(outcome.predictions)
-    if proportion.value is None or object_count == proportion.n:
-        return proportion
-    interval = _estimate_or_wilson(proportion.value, _replicates(outcome), object_count)
-    return replace(proportion, low=interval.low, high=interval.high)
-
-
-def _replicates(outcome: Outcome) -> np.ndarray:
-    """Return the bootstrap replicates of the fraction of hits, shape (REPLICATES,)."""
-    statistic = partial(weighted_mean, np.array(outcome.hits))
-    return bootstrap(statistic, _object_indices(outcome.predictions))
 
 
 def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:

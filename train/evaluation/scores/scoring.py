@@ -33,9 +33,9 @@ from train.evaluation.scores.metrics import (
     Outcome,
     Pool,
     Pooled,
-    fraction_of_hits,
     metric_title,
     thresholds,
+    within_rank,
 )
 from train.evaluation.scores.predictions import (
     PREDICTIONS,
@@ -232,8 +232,8 @@ def score(
     """Score predictions for photographs.
 
     All metrics have 95% intervals over images, and also over objects if
-    photos.csv names them. Those of fractions of images that show different
-    objects are Wilson's. All others come from a bootstrap.
+    photos.csv names them. If each image shows another object, the intervals of
+    fractions of images are Wilson's. All other intervals come from a bootstrap.
 
     Args:
         predicted: Predictions for the photographs of a folder.
@@ -307,14 +307,13 @@ def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> Cl
     """
     # `true_rank` is None for all photographs if the model lacks the class.
     known = [item for item in predictions if item.true_rank is not None]
-    ranks = [item.true_rank for item in predictions if item.true_rank is not None]
     wrong_classes = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
     is_predicted_label = [item.predicted in labels for item in predictions]
     return ClassScores(
         n=len(predictions),
-        recall=fraction_of_hits(Outcome(known, [rank == 1 for rank in ranks])),
-        top5=fraction_of_hits(Outcome(known, [rank <= 5 for rank in ranks])),
-        predicted_label=fraction_of_hits(Outcome(predictions, is_predicted_label)),
+        recall=within_rank(known, 1).proportion,
+        top5=within_rank(known, 5).proportion,
+        predicted_label=Outcome(predictions, is_predicted_label).proportion,
         most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
     )
 
