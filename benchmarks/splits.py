@@ -367,11 +367,12 @@ def load(name: str, size: int) -> Classifier:
     """
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED), size).normalizing_light()
-    name, _, weights = name.partition("=")
-    if not is_classifier(name):
+    source, _, weights = name.partition("=")
+    if not is_classifier(source):
+        # The name of a folder may contain "=".
         return load_run(name)
-    classifier = build_classifier(name, size)
-    classifier.load_state_dict(load_network(name, weights or None).state_dict())
+    classifier = build_classifier(source, size)
+    classifier.load_state_dict(load_network(source, weights or None).state_dict())
     return classifier
 
 

@@ -273,7 +273,8 @@ class Run:
         Args:
             planned: Number of epochs in the settings of the earlier run.
         """
-        settings = self.settings.train
+        # The trainer may have adapted the learning rate to the network.
+        settings = self.trainer.settings
         # Each epoch of a model soup has the whole schedule. Then the number of epochs does
         # not change the learning rate.
         if settings.epochs == planned or settings.soup:
