@@ -36,9 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of photographs")
     parser.add_argument("networks", nargs="+", help="the original, and NETWORK or NETWORK,NETWORK")
-    parser.add_argument(
-        "--control", help="one of the rows, from which differences are written, too"
-    )
+    parser.add_argument("--control", help="row from which differences are also written")
     parser.add_argument("--every", type=int, default=10, help="classes whose index it divides")
     parser.add_argument("--slides", type=int, default=4, help="random slides of each photograph")
     parser.add_argument("--passes", type=int, default=11, help="passes of each search")

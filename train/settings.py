@@ -249,8 +249,9 @@ class TrainSettings(Settings):
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
-        "Norm of the features for which learning_rate is meant, if only the last layer learns. "
-        "With other features, the rate is divided by the ratio of the norms. null: never.",
+        "Norm of the features for which learning_rate is meant. If only the last layer learns, "
+        "the rate is multiplied by it and divided by the norm of the features of the network. "
+        "null: the rate does not change.",
         above=0,
         maximum=MAX_SCALE,
     )

@@ -177,8 +177,8 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
         images: Some images of the training in [0, 1], shape (N, 3, H, W).
 
     Returns:
-        The learning rate. That of the settings if more than the last layer
-        learns, or if `settings.feature_norm` is None.
+        The learning rate. It is not changed if more than the last layer learns,
+        or if `settings.feature_norm` is None.
 
     Raises:
         InputError: If all features are 0.
@@ -201,8 +201,8 @@ def feature_norm(network: nn.Module, images: Tensor) -> float:
     For a linear layer, the features of an image are the gradient of a logit with
     respect to its weights. This gradient is computed for the predicted class. For
     a convolution whose outputs are averaged, as in SqueezeNet, it is the mean of
-    the features over the positions. It also exists for networks of TorchScript
-    and torch.export, which have no hooks.
+    the features over the positions. The gradient also exists for networks of
+    TorchScript and torch.export, in which no hook can read the features.
 
     Args:
         network: Network from images in [0, 1] to logits. Its last layer must
