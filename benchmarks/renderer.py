@@ -65,7 +65,7 @@ SAMPLES_PER_SIDE = (1, 2, 4, 8, 16)
 # Samples per side of a pixel in the whole light steps.
 WHOLE_STEP_SAMPLES = (2, 8)
 # Plain autograd by the vertices takes at most so many samples per side of a
-# pixel. With the renderer's default of 8, it has 64 times the work of one.
+# pixel. With the 8 of pnb-train, it has 64 times the work of one.
 MAX_AUTOGRAD_SAMPLES = 2
 PANELS_PER_ROW = 4
 
@@ -316,8 +316,9 @@ PANELS = {
     ),
 }
 
-# Names of the contenders that are the renderer's defaults but for SAMPLES.
-DEFAULT_SETTINGS = {
+# Names of the contenders that pnb-train uses by default, with SAMPLES per side
+# of a pixel. nb.render has fewer samples.
+TRAINING_SETTINGS = {
     "operator",
     f"degree {DEGREE}, float32",
     f"{ANALYTIC}, rasterized in every step",
@@ -364,7 +365,7 @@ def describe_contender(contender: Contender, panel: str, size: int) -> Row:
         panel: Title of the panel with the size.
         size: Pixels per side of the image.
     """
-    is_default = contender.samples == SAMPLES and contender.setting in DEFAULT_SETTINGS
+    of_training = contender.samples == SAMPLES and contender.setting in TRAINING_SETTINGS
     return {
         "panel": panel,
         "setting": contender.setting,
@@ -373,7 +374,7 @@ def describe_contender(contender: Contender, panel: str, size: int) -> Row:
         "degree": contender.degree,
         "samples": contender.samples**2,
         "size": size,
-        "default": is_default,
+        "pnb-train": of_training,
     }
 
 
@@ -420,7 +421,7 @@ class Style:
     layer: int
 
 
-STYLES = {"front": Style("k-", 5, 3), "default": Style("r*", 14, 3)}
+STYLES = {"front": Style("k-", 5, 3), "pnb-train": Style("r*", 14, 3)}
 OTHER_STYLE = Style("o", 5, 2)
 
 
@@ -432,7 +433,7 @@ def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
         panels: Rows of each panel.
     """
     row_count = -(-len(panels) // PANELS_PER_ROW)
-    figure = Figure(figsize=(24, 6 * row_count))
+    figure = Figure(figsize=(24, 6 * row_count), layout="constrained")
     all_axes = figure.subplots(row_count, PANELS_PER_ROW, squeeze=False)
     for axes, rows in zip(all_axes.flat, panels, strict=False):
         draw_panel(axes, rows)
@@ -447,11 +448,11 @@ def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
         rows: Rows of the panel.
     """
     has_degrees = len({row["degree"] for row in rows}) > 1
-    # The front and the defaults come first in the legend.
-    points: dict[str, list[tuple[float, float]]] = {"front": [], "default": []}
+    # The front and the settings of pnb-train come first in the legend.
+    points: dict[str, list[tuple[float, float]]] = {"front": [], "pnb-train": []}
     for row in sorted(rows, key=lambda row: row["time_ms"]):
         groups = [f"degree {row['degree']}" if has_degrees else row["setting"]]
-        groups += [mark for mark in ("front", "default") if row[mark]]
+        groups += [mark for mark in ("front", "pnb-train") if row[mark]]
         for group in groups:
             points.setdefault(group, []).append((row["time_ms"], error_of(row)))
     for group, group_points in points.items():

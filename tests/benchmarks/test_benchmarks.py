@@ -68,7 +68,7 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     for panel in panels:
         in_panel = [row for row in panel_rows if row["panel"] == panel]
         assert any(row["front"] == "True" for row in in_panel)
-        assert sum(row["default"] == "True" for row in in_panel) == 1
+        assert sum(row["pnb-train"] == "True" for row in in_panel) == 1
     assert (tmp_path / "renderer_pareto.png").read_bytes().startswith(PNG_SIGNATURE)
 
 

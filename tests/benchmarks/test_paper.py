@@ -139,11 +139,20 @@ def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path,
     assert row.split()[:4] == ["|", "lighting", "|", "1"]
 
 
-def test_the_change_of_light_is_drawn_over_the_epochs_that_have_attacks(tmp_path):
-    lines = []
-    for epoch in (1, 2):
-        measures = {f"augment/{name}": epoch / 2 for name in light_change.MEASURES}
-        lines.append({"epoch": epoch, **measures})
+def test_the_change_of_light_is_a_mean_over_the_renders_that_are_attacked(tmp_path):
+    # Renders that are misclassified before the attack count as successes in the
+    # log, with a change and steps of 0.
+    before_after_change_steps = [(1.0, 1.0, 0.0, 0.0), (0.25, 1.0, 0.3, 6.0), (0.0, 0.5, 0.4, 9.0)]
+    lines = [
+        {
+            "epoch": epoch,
+            "augment/attack_success_before": before,
+            "augment/attack_success": after,
+            "augment/light_change": change,
+            "augment/steps": steps,
+        }
+        for epoch, (before, after, change, steps) in enumerate(before_after_change_steps, 1)
+    ]
     lines.append({"test/accuracy": 0.5})
     text = "".join(json.dumps(line) + "\n" for line in lines)
     (tmp_path / "metrics.jsonl").write_text(text)
@@ -151,8 +160,9 @@ def test_the_change_of_light_is_drawn_over_the_epochs_that_have_attacks(tmp_path
     light_change.main([str(tmp_path), "--out", str(tmp_path / "figure.png")])
 
     assert (tmp_path / "figure.png").read_bytes().startswith(PNG_SIGNATURE)
-    _, *rows = (tmp_path / "figure.csv").read_text().splitlines()
-    assert rows == ["1,0.5,0.5,0.5", "2,1.0,1.0,1.0"]
+    header, *rows = (tmp_path / "figure.csv").read_text().splitlines()
+    assert header == "epoch,clean_correct,light_change,steps,success"
+    assert rows == ["2,0.75,0.4,8,1", "3,1,0.4,9,0.5"]
 
 
 @pytest.mark.parametrize(("fraction_of_radius", "success"), [(0.9, True), (1.1, False)])
