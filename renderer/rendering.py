@@ -161,6 +161,7 @@ def render(
         like = local_lights[0][1]
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
+    is_moved = vertices is not None
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
     # Rasterizing and ray tracing have no gradients, so they take
     # a mesh and cameras with plain numbers instead of tensors.
@@ -172,7 +173,7 @@ def render(
         fixed_cameras,
         settings,
         _choose(rasterizer),
-        closed=mesh.closed,
+        closed=moved_mesh.closed if is_moved else mesh.closed,
     )
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
     # Object that computes bounces and shadows

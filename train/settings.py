@@ -39,9 +39,12 @@ KEPT_ASIDE = "kept_aside"
 LABORATORY = "laboratory"
 # Number of different patterns that projectors throw in the test renders of a run.
 KEPT_ASIDE_PATTERNS = 5
+# Sub-folder for a first training on photographs, which the setting `photographs_first`
+# asks for.
+PHOTOGRAPHS_FIRST = "photographs_first"
 # Names that the setting evaluate.photos must not give to folders of photographs,
 # because a training run has other sub-folders or scores of these names.
-RESERVED = ("renders", "test", "before", KEPT_ASIDE)
+RESERVED = ("renders", "test", "before", KEPT_ASIDE, PHOTOGRAPHS_FIRST)
 # Default of model.name.
 WIDERESNET = "wideresnet"
 # Training settings that need a network with whose weights the training begins.

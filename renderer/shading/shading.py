@@ -98,7 +98,8 @@ def radiance(
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
-        incoming = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
+        shading_normals = smooth_normals(fragments, normals.to(wide), vertices)
+        incoming = irradiance(shading_normals.T, light, wide)
     reflected = incoming * weights.T
     # Each column of `reflected` is a pixel already if a pixel has one sample.
     if fragments.samples > 1:
@@ -143,7 +144,7 @@ def glossy_radiance(
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
         shading_normals = unit(face_normals).T[fragments.sample_to_seen_face].to(wide)
     else:
-        shading_normals = unit(smooth_normals(fragments, normals.to(wide)).T).T
+        shading_normals = unit(smooth_normals(fragments, normals.to(wide), vertices).T).T
     to_camera = toward_camera(fragments, vertices.to(wide))
     albedo = albedo.to(wide)
     light = light.to(wide)
@@ -604,15 +605,20 @@ def normals_in_sight(
     return zeros.index_copy(0, used_vertices, normals)
 
 
-def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
+def smooth_normals(
+    fragments: Fragments, normals: Float[Tensor, "V 3"], vertices: Float[Tensor, "V 3"]
+) -> Float[Tensor, "S 3"]:
     """Interpolate vertex normals at the samples of a view.
 
     The normals of faces that are seen from behind are reversed, so that they
-    point to the side of the camera.
+    point to the side of the camera. A vertex normal is zero if the normals of
+    the faces around it cancel, as in a leaf with a front and a back. Each of
+    these faces then has its own normal there.
 
     Args:
         fragments: The S samples of the view that show the mesh.
         normals: Vertex normals, shape (V, 3).
+        vertices: Vertex positions, shape (V, 3).
 
     Returns:
         Interpolated normals, which are not of unit length, shape (S, 3).
@@ -620,6 +626,10 @@ def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float
     corner_vertices = fragments.corners.T.flatten()
     # Vertex normals with the axes: component, corner, seen face.
     corner_normals = normals.T.index_select(1, corner_vertices).unflatten(1, (3, -1))
+    is_canceled = (corner_normals == 0).all(0)
+    if is_canceled.any():
+        face_normals = unit(area_vectors(vertices, fragments.corners)).to(corner_normals)
+        corner_normals = torch.where(is_canceled, face_normals[:, None], corner_normals)
     facing_normals = corner_normals * fragments.facing.T.to(normals)
     # `interpolate` takes the axes in the order: seen face, corner, component.
     return fragments.interpolate(facing_normals.permute(2, 1, 0))

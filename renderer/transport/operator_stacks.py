@@ -214,11 +214,13 @@ class TransferOperators(Sequence[TransferOperator]):
         """Stacks of at most `_operators_per_stack` operators, which hold all operators."""
         device = self._operators[0].distinct_transfer.device
         stacks = []
-        for start in range(0, len(self), self._operators_per_stack):
-            operators = self._operators[start : start + self._operators_per_stack]
-            # Image i of a stack shows operator i.
-            operator_of_image = torch.arange(len(operators))
-            stacks.append(OperatorStack(operators, operator_of_image, device))
+        # The stacks are kept, and later calls may need gradients.
+        with torch.inference_mode(False):
+            for start in range(0, len(self), self._operators_per_stack):
+                operators = self._operators[start : start + self._operators_per_stack]
+                # Image i of a stack shows operator i.
+                operator_of_image = torch.arange(len(operators))
+                stacks.append(OperatorStack(operators, operator_of_image, device))
         return stacks
 
     def _image_by_image(self, lights: Tensor, background: Tensor) -> Tensor:

@@ -451,11 +451,14 @@ class TransferOperator:
             images = as_background(background, self.settings.size, lights)
             return self._prepare_background_images(images, lights)
         key = (background, lights.dtype, lights.device)
-        if self._background_cache.get("key") != key:
+        # Other threads may replace the cached pair meanwhile.
+        cached = self._background_cache.get("last")
+        if cached is None or cached[0] != key:
             images = as_background(background, self.settings.size, lights)
             prepared = self._prepare_background_images(images, lights)
-            self._background_cache.update(key=key, prepared=prepared)
-        return self._background_cache["prepared"]
+            cached = key, prepared
+            self._background_cache["last"] = cached
+        return cached[1]
 
     def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
         """Flatten background images, and compute what they add to the covered pixels.
@@ -556,8 +559,8 @@ class TransferOperator:
         return values.index_select(-1, self.distinct.distinct)
 
     @cached_property
-    def _background_cache(self) -> dict[str, Any]:
-        """Cache for the background of the last call: its arguments ("key"), and "prepared"."""
+    def _background_cache(self) -> dict[str, tuple[Any, _PreparedBackground]]:
+        """Cache for the background of the last call ("last"): its arguments and the result."""
         return {}
 
     @cached_property

@@ -115,7 +115,7 @@ class Surface:
             faces = torch.from_numpy(self.mesh.faces)
             vertex_normals = normals_in_sight(self.fragments, self.vertices, faces)
         # The function `unit` takes vectors with their components along the first axis.
-        return unit(smooth_normals(self.fragments, vertex_normals).T).T
+        return unit(smooth_normals(self.fragments, vertex_normals, self.vertices).T).T
 
     @cached_property
     def points(self) -> Tensor:

@@ -107,6 +107,30 @@ def test_vertices_replace_those_of_the_mesh(stone, light):
     assert torch.equal(found, expected)
 
 
+def test_vertices_that_turn_a_mesh_inside_out_show_its_inside(stone, light):
+    mirrored = replace(stone, vertices=stone.vertices * [-1, 1, 1])
+    expected = renderer.render(mirrored, CAMERAS, light, **SMALL)
+    vertices = torch.from_numpy(mirrored.vertices)
+    found = renderer.render(stone, CAMERAS, light, vertices=vertices, **SMALL)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("gloss", [None, renderer.Gloss(0.5)])
+@pytest.mark.parametrize("shadows", [False, True])
+def test_a_leaf_with_two_sides_has_the_image_of_a_leaf_with_one(light, shadows, gloss):
+    """The normals of both sides cancel at each vertex. A single side is shaded on both sides."""
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0.5], [-1, 1, 0]])
+    front = np.array([[0, 1, 2], [0, 2, 3]])
+    one_side = renderer.Mesh.plain(corners[front].reshape(-1, 3), np.arange(6).reshape(2, 3))
+    two_sides = renderer.Mesh.plain(corners, np.concatenate([front, front[:, ::-1]]))
+    options = {"shadows": shadows, "gloss": gloss} | SMALL
+    expected = renderer.render(one_side, CAMERAS, light, **options)
+    found = renderer.render(two_sides, CAMERAS, light, **options)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    operators = renderer.precompute_transfer(two_sides, CAMERAS, **options)
+    torch.testing.assert_close(operators.image(light.float()), found.float(), rtol=0, atol=1e-5)
+
+
 def test_an_albedo_per_face_replaces_the_colors_of_the_mesh(stone, light):
     expected = renderer.render(stone, CAMERAS, light, **SMALL)
     white = renderer.Mesh.plain(stone.vertices, stone.faces)

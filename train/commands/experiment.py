@@ -28,7 +28,7 @@ from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
 from train.runs.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.runs.run_lock import sole_writer
-from train.settings import ExperimentSettings
+from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import is_verbose
@@ -40,9 +40,6 @@ from train.training.run import load_runs
 CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
-# Subfolder for a first training on photographs, which the setting `photographs_first`
-# asks for.
-PHOTOGRAPHS = "photographs"
 # The first training on photographs takes these settings from the main training.
 SHARED = ("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light")
 SHARED_IN_TRAIN = (
@@ -113,7 +110,7 @@ def _train_on_photographs(
         Settings of the main training, which starts from the network of the
         first training.
     """
-    first = folder / PHOTOGRAPHS
+    first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
     changes = {name: values[name] for name in SHARED}
     changes["run"] = str(first)

@@ -289,12 +289,12 @@ def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.M
         trained: Network after the training, of the same architecture.
 
     Returns:
-        Copy of `classifier` if the caller gave a classifier. Otherwise a copy of
-        the plain network.
+        Classifier if the caller gave a classifier. It has no operating points,
+        because its logits differ. Otherwise a copy of the plain network.
     """
     if isinstance(network, Classifier):
-        copy: nn.Module = deepcopy(classifier)
-        target = cast(Classifier, copy).function
+        target = deepcopy(classifier.function)
+        copy: nn.Module = Classifier(target, classifier.size, classifier.classes, classifier.name)
     else:
         copy = deepcopy(network)
         target = copy

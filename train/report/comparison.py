@@ -372,9 +372,8 @@ def difference(
     if change.low == change.high:
         # All bootstrap replicates of the difference are equal, because both methods
         # agree on every image. The true difference can still be up to the upper end
-        # of the Wilson interval (Wilson 1927) for 0 differences among the images.
-        image_count = min(len(pools[0].positives), len(pools[0].negatives))
-        margin = fraction(0, max(1, image_count)).high or 0.0
+        # of the Wilson interval (Wilson 1927) for 0 differences among the objects.
+        margin = fraction(0, pools[0].object_count(name)).high or 0.0
     return Difference(
         value=change.value,
         low=max(-1.0, change.low - margin),

@@ -309,7 +309,7 @@ def _read_run(folder: Path) -> RunSummary:
         before = RunSummary(
             folder=path,
             method=INITIAL,
-            settings={"train.init_from": config.train.init_from},
+            settings=_initial_settings(config),
             photographs=read_summaries(path),
             accuracy=scores["test/accuracy_before"],
         )
@@ -325,6 +325,17 @@ def _read_run(folder: Path) -> RunSummary:
         scores=scores,
         before=before,
     )
+
+
+def _initial_settings(config: DictConfig) -> dict[str, Any]:
+    """Return the settings of a run that determine its initial network.
+
+    Args:
+        config: Settings of the run.
+    """
+    keys = ("weights", "classes", "normalization", "normalize_light", "data.size")
+    others = {key: OmegaConf.select(config, key) for key in keys}
+    return {"train.init_from": config.train.init_from, **others}
 
 
 def read_summaries(folder: Path) -> dict[str, PhotographScores]:

@@ -19,6 +19,7 @@ from renderer.rendering import light_sphere
 from train.runs.checkpoint import BEST, LAST, PREVIOUS
 from train.runs.run_config import opened_text, parse_object
 from train.runs.run_lock import FAILURE
+from train.runs.saved_networks import WEIGHTS
 
 METRICS = "metrics.jsonl"
 # Sub-folder of a run with images of the training renders of some epochs.
@@ -65,13 +66,13 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 def remove_run(folder: Path) -> None:
     """Remove the results of a run, before another run starts in its folder.
 
-    The scores on photographs, the log and the report are not removed, because
-    the new run replaces them.
+    The scores on photographs are not removed. The log and the report are not
+    either, because the new run replaces them.
 
     Args:
         folder: Folder of the run.
     """
-    for name in (LAST, PREVIOUS, BEST, METRICS, FAILURE):
+    for name in (LAST, PREVIOUS, BEST, WEIGHTS, METRICS, FAILURE):
         (folder / name).unlink(missing_ok=True)
     for events in folder.glob("events.out.tfevents.*"):
         events.unlink()

@@ -39,7 +39,7 @@ from train.system.user_errors import keyed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
-from train.training.recipe import build_optimizer, learning_rate
+from train.training.recipe import build_optimizer, learning_rate, set_training_mode
 from train.training.relit_batches import RelitBatches
 from train.training.shared_teacher import share_layers
 
@@ -374,7 +374,7 @@ class Trainer:
                 state.diagnostics.append(state.renders.diagnostics)
             with self.phases("training"):
                 renders = Split(to_bytes(state.renders.images), state.renders.labels)
-                self.model.train(not self.settings.eval_mode)
+                set_training_mode(self.model, self.settings)
                 # Number of the steps of this round that were taken before.
                 first = state.step - sum(plan.steps[:index])
                 batches = training_batches(

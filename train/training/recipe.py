@@ -114,16 +114,45 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
 
 
 def last_layer(network: nn.Module) -> str:
-    """Return the name of the last layer of a network: the module that has the last parameter.
+    """Return the name of the last layer that learns: the module that has the last such parameter.
 
     Args:
-        network: Network with parameters.
+        network: Network with parameters that are not frozen.
 
     Returns:
         Name, such as "head.fc". Empty if the network itself is the layer.
     """
-    names = [name for name, _ in network.named_parameters()]
+    names = [name for name, parameter in network.named_parameters() if parameter.requires_grad]
     return _module_of(names[-1])
+
+
+def _last_called_layer(network: nn.Module, size: int) -> str:
+    """Return the name of the layer that a network calls last.
+
+    The order of the calls may differ from the order of the parameters, which is
+    that of the definitions.
+
+    Args:
+        network: Network with parameters.
+        size: Pixels per side of its images.
+
+    Returns:
+        Name of the layer. A network of TorchScript or torch.export calls no
+        modules, so it is the module that has the last parameter.
+    """
+    called: list[str] = []
+    hooks = []
+    for name, module in network.named_modules():
+        own = list(module.parameters(recurse=False))
+        is_layer = own and len(own) == len(list(module.parameters()))
+        if is_layer and not isinstance(module, torch.jit.ScriptModule):
+            hooks.append(module.register_forward_hook(lambda *_, name=name: called.append(name)))
+    device = next(network.parameters()).device
+    with eval_mode(network), torch.no_grad():
+        network(torch.full((1, 3, size, size), 0.5, device=device))
+    for hook in hooks:
+        hook.remove()
+    return called[-1] if called else last_layer(network)
 
 
 def _module_of(parameter: str) -> str:
@@ -131,27 +160,26 @@ def _module_of(parameter: str) -> str:
     return parameter.rpartition(".")[0]
 
 
-def freeze(network: nn.Module, stage: str) -> None:
+def freeze(network: nn.Module, stage: str, size: int) -> None:
     """Freeze the parameters of a network from its first parameter to the last one of a module.
 
     Args:
         network: Network, which is changed.
         stage: Name of the module, such as "blocks.5". "all_but_last" freezes all
-            parameters before the last layer.
+            parameters but those of the layer that the network calls last.
+        size: Pixels per side of the images of the network.
 
     Raises:
         InputError: If there is no module of this name, or if it has no
             parameters.
     """
-    names = [name for name, _ in network.named_parameters()]
     if stage == ALL_BUT_LAST:
-        last = last_layer(network)
-        chosen = [name for name in names if _module_of(name) != last]
-        if not chosen:
-            # The network has only one layer, so nothing is frozen.
-            return
-    else:
-        chosen = [name for name in names if name.startswith(f"{stage}.")]
+        last = _last_called_layer(network, size)
+        for name, parameter in network.named_parameters():
+            parameter.requires_grad_(_module_of(name) == last)
+        return
+    names = [name for name, _ in network.named_parameters()]
+    chosen = [name for name in names if name.startswith(f"{stage}.")]
     if not chosen:
         examples = nearest(stage, sorted({_module_of(name) for name in names}))
         raise InputError(
@@ -161,6 +189,24 @@ def freeze(network: nn.Module, stage: str) -> None:
     frozen_count = names.index(chosen[-1]) + 1
     for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)
+
+
+def set_training_mode(network: nn.Module, settings: TrainSettings) -> None:
+    """Put a network in training mode, except the modules that should not change.
+
+    Modules of frozen parameters stay in evaluation mode, so that the statistics
+    of their batch normalization do not change either.
+
+    Args:
+        network: Network, which is changed.
+        settings: Settings of the training. With `eval_mode`, the whole network
+            is put in evaluation mode.
+    """
+    network.train(not settings.eval_mode)
+    for module in network.modules():
+        parameters = list(module.parameters())
+        if parameters and not any(parameter.requires_grad for parameter in parameters):
+            module.eval()
 
 
 def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Tensor) -> float:

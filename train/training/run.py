@@ -35,7 +35,7 @@ from train.evaluation.laboratory.kept_aside import kept_aside_settings
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import METRICS
 from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
-from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
+from train.evaluation.scores.scoring import SUMMARY, Scores, evaluate_photographs, format_scores
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.runs import checkpoint
 from train.runs.run_config import require_same_run, write_config
@@ -294,6 +294,9 @@ class Run:
         """Write config.yaml with the settings and the hardware of the run to its folder."""
         if self.settings.overwrite and not self.settings.train.resume:
             remove_run(self.folder)
+            # The new run may score its network on other photographs.
+            for summary in self.folder.glob(f"*/{SUMMARY}"):
+                summary.unlink()
         hardware = {
             "device": str(self.trainer.device),
             "precision": self.trainer.model.precision,
@@ -317,10 +320,12 @@ class Run:
             model: The initial network.
         """
         settings = self.settings
-        # The logits of a network that a function of the user builds are not cached,
-        # because its code may have changed.
-        is_function = settings.model.name.startswith(PYTHON)
-        cache = TensorCache(None if is_function else cache_folder(settings.train.cache))
+        # The logits of a network with code of the user are not cached, because this
+        # code may have changed.
+        has_own_code = self.initial is not None and (
+            self.initial.network is not None or self.initial.name.startswith(PYTHON)
+        )
+        cache = TensorCache(None if has_own_code else cache_folder(settings.train.cache))
         cached_model = CachedModel(model, self.trainer.device, cache)
         predictions = self._predict_classes(cached_model, self.data.test)
         self._initial_predictions = predictions
@@ -663,7 +668,7 @@ def build_trainer(
         network = with_normalized_light(network, light)
     if settings.train.freeze:
         with keyed(stage="train.freeze"):
-            freeze(unwrapped(network), settings.train.freeze)
+            freeze(unwrapped(network), settings.train.freeze, data.size)
     with keyed(**keys):
         precision = choose_precision(settings.train.precision, device, network)
     model = MixedPrecision(network.to(device), precision)

@@ -233,3 +233,15 @@ def test_no_operators_and_operators_of_different_sizes_are_refused():
         TransferOperators([])
     with pytest.raises(InputError, match=r"^operators"):
         TransferOperators([*scene_operators("colors"), *operators_of(size=4)])
+
+
+def test_views_that_are_first_rendered_in_inference_mode_have_gradients_later():
+    operators = operators_of(PLAIN)
+    light = draw(49, 3)
+    with torch.inference_mode():
+        expected = operators.image(light)
+    light.requires_grad_()
+    images = operators.image(light)
+    assert torch.equal(images, expected)
+    images.sum().backward()
+    assert light.grad.any()

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
+from augment.classifiers.adapter import OperatingPoint
 from tests.runs import completed_run
 from train.__main__ import main
 
@@ -126,6 +127,17 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     assert all(value.equal(expected[name]) for name, value in hardened.state_dict().items())
     written = torch.load(tmp_path / "hardened" / "weights.pt")
     assert all(value.equal(expected[name]) for name, value in written.items())
+
+
+def test_a_hardened_classifier_has_no_threshold_of_the_original(network, photographs):
+    classifier = nb.Classifier(network, SIZE, CLASSES, name="mine")
+    classifier.operating_points = [OperatingPoint("orange", 0.5, 0.05, "lab", "", 20)]
+    hardened = harden(classifier, photographs, classes=None, size=None)
+    assert isinstance(hardened, nb.Classifier)
+    assert hardened.name == "mine"
+    assert not hardened.operating_points
+    images = torch.rand(2, 3, SIZE, SIZE)
+    assert not torch.equal(hardened(images), classifier(images))
 
 
 def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photographs, tmp_path):

@@ -3,6 +3,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from shutil import copytree
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -221,6 +222,18 @@ class TestAHardenedNetwork:
             ["adversarial", "0", "0.765"],
         ]
 
+    def test_has_an_initial_network_of_its_own_if_it_began_with_other_weights(self, hardened):
+        config = hardened[1] / "config.yaml"
+        text = config.read_text()
+        assert text.startswith("weights: null")
+        config.write_text(text.replace("weights: null", "weights: other.pth", 1))
+        tables = compare(hardened)
+        _, *rows = tables[""]
+        assert [row[0].startswith("the initial network") for row in rows].count(True) == 2
+        pairs = [title.partition(" (")[0] for title in tables if "minus the initial" in title]
+        assert len(pairs) == 2
+        assert all("weights=other.pth" in pair for pair in pairs if pair.startswith("adversarial"))
+
     def test_alone_is_named_by_the_hardening(self, hardened):
         _, *rows = compare(hardened[:1])[""]
         assert [row[0] for row in rows] == ["before hardening", "after hardening"]
@@ -351,6 +364,17 @@ def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(meth
         assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.
         # The ends vary by chance by up to 0.02, with 1,000 replicates.
         assert (low, high) == pytest.approx(tuple(interval), abs=0.02)
+
+
+def test_networks_that_agree_on_n_oranges_differ_by_at_most_wilsons_limit_for_0_of_n(scored_run):
+    scores = {"web": ([1] * 100, [0])}
+    tables = compare([scored_run("none", scores), scored_run("adversarial", scores)])
+    (table,) = [table for title, table in tables.items() if "minus" in title]
+    header, overall = table[0], table[1]
+    _, low, high = read_interval(overall[header.index("recall")])
+    z = NormalDist().inv_cdf(0.975)
+    limit = z**2 / (100 + z**2)
+    assert (low, high) == pytest.approx((-limit, limit), abs=5e-4)
 
 
 def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run):

@@ -262,11 +262,12 @@ def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
 )
 def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trained):
     network = WideResNet(3, 10, 1, dropout=0.0)
-    before = {name: value.clone() for name, value in network.named_parameters()}
-    freeze(network, stage)
+    # The statistics of batch normalization are in the state dict, too.
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    freeze(network, stage, size=8)
     fit_noise(make_trainer(tmp_path, network, epochs=1))
     changed = set()
-    for name, value in network.named_parameters():
+    for name, value in network.state_dict().items():
         if not torch.equal(value, before[name]):
             changed.add(name)
     assert changed == {name for name in before if name.startswith(trained)}
@@ -274,7 +275,7 @@ def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trai
 
 def test_a_stage_that_the_network_lacks_is_refused():
     with pytest.raises(InputError, match=r"^stage=group\.1\b.*groups"):
-        freeze(WideResNet(3, 10, 1, dropout=0.0), "group.1")
+        freeze(WideResNet(3, 10, 1, dropout=0.0), "group.1", size=8)
 
 
 @pytest.mark.parametrize("training", [True, False])

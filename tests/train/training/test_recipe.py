@@ -224,9 +224,41 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
 
 
 def test_a_network_of_one_layer_learns_in_it():
-    network = nn.Sequential(nn.Flatten(), nn.Linear(4, 2))
-    freeze(network, "all_but_last")
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 2))
+    freeze(network, "all_but_last", size=2)
     assert all(parameter.requires_grad for parameter in network.parameters())
+
+
+class HeadFirst(nn.Module):
+    """Network that defines its layers in another order than it calls them."""
+
+    def __init__(self):
+        super().__init__()
+        self.head = nn.Linear(5, 2)
+        self.body = nn.Linear(12, 5)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.head(self.body(images.flatten(1)))
+
+
+def test_the_layer_that_is_called_last_learns_even_if_it_is_defined_first():
+    network = HeadFirst()
+    freeze(network, "all_but_last", size=2)
+    learning = [name for name, value in network.named_parameters() if value.requires_grad]
+    assert learning == ["head.weight", "head.bias"]
+    images = torch.full((1, 3, 2, 2), 0.5)
+    features = network.body(images.flatten(1))
+    assert feature_norm(network, images) == pytest.approx(features.norm().item(), rel=1e-6)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning"
+)
+def test_only_the_last_layer_of_a_script_learns():
+    network = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
+    freeze(network, "all_but_last", size=2)
+    learning = [name for name, value in network.named_parameters() if value.requires_grad]
+    assert learning == ["2.weight", "2.bias"]
 
 
 class Scaled(nn.Module):

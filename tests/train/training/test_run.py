@@ -282,6 +282,13 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(
     assert modification_times(finished) == before
 
 
+def test_a_new_run_in_the_same_folder_has_no_scores_of_the_earlier_one(tiny, photos, tmp_path):
+    completed_run(tiny(*WITHOUT_RENDERS, f"evaluate.photos={photos}"), tmp_path)
+    assert summarize(tmp_path).photographs
+    completed_run(tiny(*WITHOUT_RENDERS, "overwrite=true"), tmp_path)
+    assert not summarize(tmp_path).photographs
+
+
 class TestThreads:
     @pytest.fixture(autouse=True)
     def restored_count(self):

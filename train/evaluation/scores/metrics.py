@@ -334,10 +334,9 @@ class Pool:
         if not self.classified:
             return {}
         values = self._top_statistic(np.ones(len(self.classified)))
-        object_count = _count_objects(self.classified)
         estimates = {}
         for name, value, replicates in zip(TOP_RANKS, values, self._top_replicates, strict=True):
-            estimates[name] = _estimate_or_wilson(float(value), replicates, object_count)
+            estimates[name] = _estimate_or_wilson(float(value), replicates, self.object_count(name))
         return estimates
 
     @property
@@ -368,13 +367,27 @@ class Pool:
         """
         if not self._has_roc_curve:
             return [Estimate() for _ in ROC_METRICS]
-        positives, negatives = self.for_roc
-        object_count = min(_count_objects(positives), _count_objects(negatives))
         values = auc_and_recalls(*self.scores)
         estimates = []
-        for value, replicates in zip(values, self._roc_replicates, strict=True):
-            estimates.append(_estimate_or_wilson(float(value), replicates, object_count))
+        for name, value, replicates in zip(ROC_METRICS, values, self._roc_replicates, strict=True):
+            estimates.append(_estimate_or_wilson(float(value), replicates, self.object_count(name)))
         return estimates
+
+    def object_count(self, name: str) -> int:
+        """Count the different objects in the photographs on which a metric depends.
+
+        Args:
+            name: Name of a metric that has bootstrap replicates.
+
+        Returns:
+            Number of objects. For a metric of the ROC curve, it is the number of
+            positive or of negative objects, whichever is smaller.
+        """
+        if name in self.outcomes:
+            return _count_objects(self.outcomes[name].predictions)
+        if name in TOP_RANKS:
+            return _count_objects(self.classified)
+        return min(_count_objects(predictions) for predictions in self.for_roc)
 
     @property
     def _has_roc_curve(self) -> bool:
