@@ -14,7 +14,7 @@ from renderer.errors import InputError
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.commands.experiment import PHOTOGRAPHS, train
+from train.commands.experiment import PHOTOGRAPHS_FIRST, train
 from train.report.report_page import PAGE
 from train.runs.checkpoint import BEST, LAST, PREVIOUS, load
 from train.runs.run_log import read_metrics
@@ -199,12 +199,12 @@ def test_one_command_trains_on_photographs_and_then_the_last_layer_on_renders(
     folder = tmp_path / "run"
     chain(folder)
     original = torch.load(weights)
-    relit = torch.load(folder / PHOTOGRAPHS / "weights.pt")
+    relit = torch.load(folder / PHOTOGRAPHS_FIRST / "weights.pt")
     hardened = torch.load(folder / "weights.pt")
-    first_epochs = [line for line in read_metrics(folder / PHOTOGRAPHS) if "epoch" in line]
+    first_epochs = [line for line in read_metrics(folder / PHOTOGRAPHS_FIRST) if "epoch" in line]
     assert len(first_epochs) == train_command.compose(["experiment=photographs"]).train.epochs
-    factor = load(folder / PHOTOGRAPHS / BEST)[INTERPOLATION]
-    trained = load(folder / PHOTOGRAPHS / LAST)["model"]
+    factor = load(folder / PHOTOGRAPHS_FIRST / BEST)[INTERPOLATION]
+    trained = load(folder / PHOTOGRAPHS_FIRST / LAST)["model"]
     changed = set()
     for name, value in original.items():
         if value.is_floating_point():
@@ -214,9 +214,9 @@ def test_one_command_trains_on_photographs_and_then_the_last_layer_on_renders(
             changed.add(name)
     assert changed == {"fc.weight", "fc.bias"}
     page = (folder / PAGE).read_text()
-    for stage in (folder / PHOTOGRAPHS, folder):
+    for stage in (folder / PHOTOGRAPHS_FIRST, folder):
         assert f"{stage}:" in page
-    after = read_metrics(folder / PHOTOGRAPHS)[-1]["test/relit_agreement_after"]
+    after = read_metrics(folder / PHOTOGRAPHS_FIRST)[-1]["test/relit_agreement_after"]
     assert f"{after:.1%} of the predictions" in page
 
 
@@ -241,9 +241,9 @@ def test_a_command_that_was_stopped_in_its_first_training_ends_as_one_that_was_n
     for name, value in torch.load(stopped / "weights.pt").items():
         assert torch.equal(value, expected[name])
     # Both trainings are finished. The command repeats neither.
-    trained_at = (stopped / PHOTOGRAPHS / LAST).stat().st_mtime_ns
+    trained_at = (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns
     chain(stopped, "train.resume=true")
-    assert (stopped / PHOTOGRAPHS / LAST).stat().st_mtime_ns == trained_at
+    assert (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns == trained_at
 
 
 def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
