@@ -241,9 +241,14 @@ def compare_networks(
         The first screen. None if recall, false-positive rate or AUC is unknown.
     """
     label = compared.label
+    false_positive_title = f"Other objects called {label}"
+    if compared.has_several_classes:
+        false_positive_title = (
+            "Images called a class that they do not show, mean over these classes"
+        )
     titles = [
         ("recall", f"Images of {label} recognized", "higher is better"),
-        ("false_positive_rate", f"Other objects called {label}", "lower is better"),
+        ("false_positive_rate", false_positive_title, "lower is better"),
         ("auc", "Ranking quality (AUC)", "higher is better; 0.5 is chance"),
     ]
     if compared.has_several_classes:
@@ -291,11 +296,21 @@ def _describe_images(compared: Compared) -> str:
     Returns:
         One or two sentences.
     """
-    auc = compared.after[0].pools[compare.ALL].metrics.auc
+    pool = compared.after[0].pools[compare.ALL]
+    auc = pool.metrics.auc
     sentence = (
         f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
         f"objects) and {auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
     )
+    if compared.has_several_classes:
+        labels = {prediction.label for prediction in pool.positives}
+        photographs = {item.photograph.path: item.photograph for item in pool.negatives}
+        others = [shown for shown in photographs.values() if shown.label not in labels]
+        sentence = (
+            f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
+            f"objects) and {len(others):,} of other objects. For each class, the images of the "
+            "other classes count as other objects, too."
+        )
     if auc.has_repeated_objects and len(compared.after) == 1:
         sentence += " The intervals are over objects and images."
     if compared.trained_objects:
@@ -378,16 +393,7 @@ def _sentences(
         f"{compared.place}, {original} recognizes {recall.before:.0%} of the images of {label}; "
         f"{hardened}, {recall.after:.0%}."
     ]
-    before = f"{false_positives.before:.0%}"
-    after = f"{false_positives.after:.0%}"
-    if _direction(false_positives) > 0:
-        price = f"The price: {hardened} calls {after} of the images of other objects “{label}”"
-        sentences.append(f"{price}, instead of {before}.")
-    else:
-        sentences.append(
-            f"Of the images of other objects, {original} calls {before} “{label}”; "
-            f"{hardened}, {after}."
-        )
+    sentences.append(_describe_false_positives(compared, false_positives))
     equal = compared.difference(EQUAL_RATE)
     if equal is not None:
         text = "At an equal rate of 10% false positives, recall"
@@ -397,6 +403,32 @@ def _sentences(
         text = "Among all classes of the network, top-1 (the mean over classes)"
         sentences.append(gain_sentence(text, top1))
     return sentences
+
+
+def _describe_false_positives(compared: Compared, change: compare.Difference) -> str:
+    """Say how the false-positive rate changed. A proven increase is called the price.
+
+    With several classes, the rate is a mean over the classes, and the images of
+    one class count as other objects for the others.
+
+    Args:
+        compared: Evaluations of both networks.
+        change: Difference of the false-positive rate between both networks.
+    """
+    original, hardened = compared.subjects
+    before, after = f"{change.before:.0%}", f"{change.after:.0%}"
+    is_worse = _direction(change) > 0
+    if compared.has_several_classes:
+        error = "of the images without a class for this class (mean over these classes)"
+        if is_worse:
+            return f"The price: {hardened} mistakes {after} {error}, instead of {before}."
+        return (
+            f"{original[0].upper()}{original[1:]} mistakes {before} {error}; {hardened}, {after}."
+        )
+    others, answer = "of the images of other objects", f"“{compared.label}”"
+    if is_worse:
+        return f"The price: {hardened} calls {after} {others} {answer}, instead of {before}."
+    return f"O{others[1:]}, {original} calls {before} {answer}; {hardened}, {after}."
 
 
 def gain_sentence(subject: str, change: compare.Difference) -> str:

@@ -105,3 +105,18 @@ def test_top_1_is_shown_if_several_classes_are_under_study(labels):
     # Both networks lack the class of the cups.
     expected = [((1 / 2 + 1 / 2) / 2, (2 / 2 + 0 / 2) / 2)] if len(labels) > 1 else []
     assert [(number.before.value, number.after.value) for number in shown] == expected
+
+
+def test_an_image_of_no_class_under_study_is_counted_once_for_all_classes():
+    compared = Compared(
+        label="banana or mug",
+        before=[evaluation(BEFORE, LABELS)],
+        after=[evaluation(AFTER, LABELS)],
+        names=("before", "after"),
+        subjects=NETWORKS,
+        place="Here",
+    )
+    counts = re.findall(r"\d+", compare_networks(compared, {}).images)
+    others = [shown for shown in SHOWN if shown not in LABELS]
+    assert int(counts[0]) == len(SHOWN) - len(others)
+    assert int(counts[2]) == len(others)

@@ -466,7 +466,8 @@ def format_overall(scores: Scores) -> str:
     """
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
-    title = f"{positives} images of {scores.label}, {negatives} negatives"
+    each = COUNTED_EACH if scores.by_label else ""
+    title = f"{positives} images of {scores.label}, {negatives} negatives{each}"
     details = {metric_title(name) for name in DETAILS}
     rows = []
     for table in (_fraction_table(scores), _ranking_table(scores)):
