@@ -83,7 +83,7 @@ class Initial:
     @property
     def name(self) -> str:
         """Name of the architecture, such as "torchvision:resnet18"."""
-        return self.architecture["name"]
+        return self.architecture.get("name", WIDERESNET)
 
     @property
     def normalize_light(self) -> dict[str, float] | None:
