@@ -280,8 +280,8 @@ def build_network(
     classes: Sequence[str],
     size: int,
     name: str = WIDERESNET,
-    mean: Color = MEAN,
-    std: Color = STD,
+    mean: Color | None = None,
+    std: Color | None = None,
     classifier: bool = False,
     **shape: Any,
 ) -> nn.Module:
@@ -294,7 +294,8 @@ def build_network(
             Python function returns a network, the size of its images and its
             classes. This network normalizes images itself.
         mean: Mean of the pixels of the data, RGB. Images are normalized with it.
-        std: Standard deviation of the pixels of the data, RGB.
+            None for 0.5. A classifier that is not from a file has its own mean.
+        std: Standard deviation of the pixels of the data, RGB. None for 0.25.
         classifier: Whether `augment.build_classifier` builds the network, with
             pretrained weights. It then takes `name`.
         **shape: `depth`, `width` and `dropout` of "wideresnet".
@@ -308,8 +309,11 @@ def build_network(
             images of this size or has other classes.
     """
     if classifier:
-        module = cast(nn.Module, build_classifier(name, size, classes).function)
+        normalization = None if mean is None or std is None else (mean, std)
+        built = build_classifier(name, size, classes, normalization)
+        module = cast(nn.Module, built.function)
         return module.requires_grad_(True)
+    mean, std = mean or MEAN, std or STD
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
     network: nn.Module | None = None

@@ -198,7 +198,12 @@ def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
     raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
 
 
-def build_classifier(name: str, size: int, classes: Sequence[str] | None = None) -> Classifier:
+def build_classifier(
+    name: str,
+    size: int,
+    classes: Sequence[str] | None = None,
+    normalization: Normalization = None,
+) -> Classifier:
     """Build a classifier with random weights.
 
     A Python function of the user chooses weights and size itself, and a file
@@ -208,11 +213,13 @@ def build_classifier(name: str, size: int, classes: Sequence[str] | None = None)
         name: Name of a classifier, as for `load_classifier`.
         size: Pixels per side of the images.
         classes: Names of the classes. None for those of the source.
+        normalization: Mean and standard deviation of the channels, before the
+            network of a file. All other sources have their own normalization.
     """
     facts = as_facts(classes)
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
-        return build_file(name, size, facts)
+        return build_file(name, size, as_facts(classes, normalization=normalization))
     known = SOURCES[source + colon]
     arguments: list[Any] = [model, size] if colon else [size]
     if known.takes_facts:

@@ -653,7 +653,10 @@ def build_trainer(
         network = deepcopy(initial.network).requires_grad_(True)
     else:
         with keyed(**keys_of("model", settings.model)):
-            network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
+            # A classifier has a normalization of its own, which does not depend on the data.
+            is_classifier = initial is not None and initial.is_classifier
+            statistics: dict[str, Any] = {} if is_classifier else {"mean": mean, "std": std}
+            network = build_network(data.classes, data.size, **statistics, **shape)
     facts = {
         "classes": list(data.classes),
         "size": data.size,
@@ -709,7 +712,8 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
             f"model.name={name} is not the architecture of train.init_from={initial.source}: "
             "leave model.name out",
         )
-    return {"name": initial.name, CLASSIFIER: True}
+    statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
+    return {"name": initial.name, CLASSIFIER: True, **statistics}
 
 
 def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:

@@ -29,8 +29,10 @@ from tests.train.own_networks import (
 )
 from train.__main__ import main as train_command
 from train.auditing import audit
+from train.networks import build_network
 from train.runs.saved_networks import load_run
-from train.training.initial import with_label
+from train.training.initial import load_initial, with_label
+from train.training.run import _network_shape
 
 OWN = [
     f"classifier=torchvision:{NAME}",
@@ -220,6 +222,26 @@ def test_the_index_of_a_class_is_replaced_by_its_name(here, monkeypatch):
 def save_torchscript(network: nn.Module) -> str:
     torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)).save("mine.ts")
     return "mine.ts"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.parametrize("normalization", ["imagenet", "null"])
+def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
+    here, monkeypatch, normalization
+):
+    monkeypatch.chdir(here)
+    network = trained_network().eval()
+    words = [f"train.init_from={save_torchscript(network)}", f"normalization={normalization}"]
+    words += ["classes=classes.txt", f"data.size={SIZE}", "data.path=photos"]
+    scene = ["scene.meshes=[solid:orange]", "label=Orange"]
+    settings = train_command.read(["experiment=classifier", *words, *scene])
+    initial = load_initial(settings)
+    shape = _network_shape(settings, initial)
+    built = build_network(initial.classes, SIZE, **shape)
+    initial.copy_to(built, shape | {"classes": list(initial.classes), "size": SIZE})
+    images = renders()[0][:4]
+    given = images if normalization == "null" else Normalize(MEAN, STD)(images)
+    torch.testing.assert_close(built(images), network(given), **ROUNDING)
 
 
 def save_exported(network: nn.Module) -> str:

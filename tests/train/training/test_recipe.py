@@ -251,9 +251,7 @@ def test_the_layer_that_is_called_last_learns_even_if_it_is_defined_first():
     assert feature_norm(network, images) == pytest.approx(features.norm().item(), rel=1e-6)
 
 
-@pytest.mark.filterwarnings(
-    "ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning"
-)
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_only_the_last_layer_of_a_script_learns():
     network = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
     freeze(network, "all_but_last", size=2)
