@@ -65,7 +65,7 @@ SAMPLES_PER_SIDE = (1, 2, 4, 8, 16)
 # Samples per side of a pixel in the whole light steps.
 WHOLE_STEP_SAMPLES = (2, 8)
 # Plain autograd by the vertices takes at most so many samples per side of a
-# pixel. With the 8 of pnb-train, it has 64 times the work of one.
+# pixel. With the 8 samples of pnb-train, it has 64 times the work of one.
 MAX_AUTOGRAD_SAMPLES = 2
 PANELS_PER_ROW = 4
 

@@ -216,12 +216,11 @@ def build_classifier(
         normalization: Mean and standard deviation of the channels, before the
             network of a file. All other sources have their own normalization.
     """
-    facts = as_facts(classes)
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
         return build_file(name, size, as_facts(classes, normalization=normalization))
     known = SOURCES[source + colon]
     arguments: list[Any] = [model, size] if colon else [size]
     if known.takes_facts:
-        arguments.append(facts)
+        arguments.append(as_facts(classes))
     return known.build(*arguments)

@@ -298,18 +298,19 @@ def _describe_images(compared: Compared) -> str:
     """
     pool = compared.after[0].pools[compare.ALL]
     auc = pool.metrics.auc
-    sentence = (
-        f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
-        f"objects) and {auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
-    )
+    positives = f"{auc.positives:,} images of {compared.label} ({auc.positive_objects:,} objects)"
     if compared.has_several_classes:
         labels = {prediction.label for prediction in pool.positives}
         photographs = {item.photograph.path: item.photograph for item in pool.negatives}
         others = [shown for shown in photographs.values() if shown.label not in labels]
         sentence = (
-            f"Scored on {auc.positives:,} images of {compared.label} ({auc.positive_objects:,} "
-            f"objects) and {len(others):,} of other objects. For each class, the images of the "
-            "other classes count as other objects, too."
+            f"Scored on {positives} and {len(others):,} of other objects. For each class, the "
+            "images of the other classes count as other objects, too."
+        )
+    else:
+        sentence = (
+            f"Scored on {positives} and {auc.negatives:,} of other objects "
+            f"({auc.negative_objects:,} objects)."
         )
     if auc.has_repeated_objects and len(compared.after) == 1:
         sentence += " The intervals are over objects and images."
@@ -419,16 +420,25 @@ def _describe_false_positives(compared: Compared, change: compare.Difference) ->
     before, after = f"{change.before:.0%}", f"{change.after:.0%}"
     is_worse = _direction(change) > 0
     if compared.has_several_classes:
-        error = "of the images without a class for this class (mean over these classes)"
+        mean = "(mean over these classes)"
         if is_worse:
-            return f"The price: {hardened} mistakes {after} {error}, instead of {before}."
+            return (
+                f"The price: of the images that do not show a class, {hardened} mistakes {after} "
+                f"for it, instead of {before} {mean}."
+            )
         return (
-            f"{original[0].upper()}{original[1:]} mistakes {before} {error}; {hardened}, {after}."
+            f"Of the images that do not show a class, {original} mistakes {before} for it; "
+            f"{hardened}, {after} {mean}."
         )
-    others, answer = "of the images of other objects", f"“{compared.label}”"
     if is_worse:
-        return f"The price: {hardened} calls {after} {others} {answer}, instead of {before}."
-    return f"O{others[1:]}, {original} calls {before} {answer}; {hardened}, {after}."
+        return (
+            f"The price: {hardened} calls {after} of the images of other objects "
+            f"“{compared.label}”, instead of {before}."
+        )
+    return (
+        f"Of the images of other objects, {original} calls {before} “{compared.label}”; "
+        f"{hardened}, {after}."
+    )
 
 
 def gain_sentence(subject: str, change: compare.Difference) -> str:

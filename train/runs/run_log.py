@@ -66,8 +66,8 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 def remove_run(folder: Path) -> None:
     """Remove the results of a run, before another run starts in its folder.
 
-    The scores on photographs are not removed. The log and the report are not
-    either, because the new run replaces them.
+    The caller removes the scores on photographs. The log and the report stay,
+    because the new run replaces them.
 
     Args:
         folder: Folder of the run.

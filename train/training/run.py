@@ -653,10 +653,9 @@ def build_trainer(
         network = deepcopy(initial.network).requires_grad_(True)
     else:
         with keyed(**keys_of("model", settings.model)):
-            # A classifier has a normalization of its own, which does not depend on the data.
-            is_classifier = initial is not None and initial.is_classifier
-            statistics: dict[str, Any] = {} if is_classifier else {"mean": mean, "std": std}
-            network = build_network(data.classes, data.size, **statistics, **shape)
+            # The shape of a classifier has the normalization of the classifier.
+            arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
+            network = build_network(data.classes, data.size, **arguments)
     facts = {
         "classes": list(data.classes),
         "size": data.size,

@@ -90,16 +90,21 @@ def evaluation(predicted: tuple[str, ...], labels: tuple[str, ...]) -> Evaluatio
     return Evaluation(RunSummary(Path("run"), "", {}, {}, None), pools_of(pooled))
 
 
-@pytest.mark.parametrize("labels", [LABELS, LABELS[:1]])
-def test_top_1_is_shown_if_several_classes_are_under_study(labels):
-    compared = Compared(
-        label="banana",
+def compare_on(labels: tuple[str, ...]) -> Compared:
+    """Compare both networks on the images, for some positive classes."""
+    return Compared(
+        label="banana or mug",
         before=[evaluation(BEFORE, labels)],
         after=[evaluation(AFTER, labels)],
         names=("before", "after"),
         subjects=NETWORKS,
         place="Here",
     )
+
+
+@pytest.mark.parametrize("labels", [LABELS, LABELS[:1]])
+def test_top_1_is_shown_if_several_classes_are_under_study(labels):
+    compared = compare_on(labels)
     screen = compare_networks(compared, {})
     shown = [number for number in screen.numbers if number.title.startswith("Top-1")]
     # Both networks lack the class of the cups.
@@ -108,14 +113,7 @@ def test_top_1_is_shown_if_several_classes_are_under_study(labels):
 
 
 def test_an_image_of_no_class_under_study_is_counted_once_for_all_classes():
-    compared = Compared(
-        label="banana or mug",
-        before=[evaluation(BEFORE, LABELS)],
-        after=[evaluation(AFTER, LABELS)],
-        names=("before", "after"),
-        subjects=NETWORKS,
-        place="Here",
-    )
+    compared = compare_on(LABELS)
     counts = re.findall(r"\d+", compare_networks(compared, {}).images)
     others = [shown for shown in SHOWN if shown not in LABELS]
     assert int(counts[0]) == len(SHOWN) - len(others)

@@ -439,17 +439,26 @@ def format_scores(scores: Scores) -> str:
     Returns:
         Text of several paragraphs, without a newline at the end.
     """
-    positives = len(scores.pooled.all.positives)
-    negatives = len(scores.pooled.all.negatives)
-    each = COUNTED_EACH if scores.by_label else ""
     paragraphs = [
-        f"{positives} images of {scores.label}, {negatives} negatives{each}",
+        _count_images(scores),
         str(_fraction_table(scores)),
         str(_ranking_table(scores)),
         str(_class_table(scores)),
         *_notes(scores),
     ]
     return "\n\n".join(paragraphs)
+
+
+def _count_images(scores: Scores) -> str:
+    """Say how many positive and negative images were scored.
+
+    Args:
+        scores: Scores of a model on photographs.
+    """
+    positives = len(scores.pooled.all.positives)
+    negatives = len(scores.pooled.all.negatives)
+    each = COUNTED_EACH if scores.by_label else ""
+    return f"{positives} images of {scores.label}, {negatives} negatives{each}"
 
 
 def format_overall(scores: Scores) -> str:
@@ -464,10 +473,6 @@ def format_overall(scores: Scores) -> str:
         A line with the numbers of images, the table, and notes about thresholds
         and about files that were not scored.
     """
-    positives = len(scores.pooled.all.positives)
-    negatives = len(scores.pooled.all.negatives)
-    each = COUNTED_EACH if scores.by_label else ""
-    title = f"{positives} images of {scores.label}, {negatives} negatives{each}"
     details = {metric_title(name) for name in DETAILS}
     rows = []
     for table in (_fraction_table(scores), _ranking_table(scores)):
@@ -477,7 +482,7 @@ def format_overall(scores: Scores) -> str:
         for metric, cell in zip(metric_titles, cells, strict=True):
             if metric not in details:
                 rows.append((metric, cell))
-    overall_table = Table(f"{title}; 95% intervals", ["metric", scores.label], rows)
+    overall_table = Table(f"{_count_images(scores)}; 95% intervals", ["metric", scores.label], rows)
     return "\n".join([str(overall_table), *_notes(scores)])
 
 
