@@ -43,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1000, help="seed of the light")
     parser.add_argument("--scores", type=Path, help="folder of scores that later calls read")
     options = parser.parse_args(arguments)
+    if options.control and options.control not in options.networks:
+        parser.error(f"--control {options.control} is none of the networks")
     rows = {row: score_row(row, options) for row in options.networks}
     first = rows[options.networks[0]]
     print(f"|network|{'|'.join(first)}|")

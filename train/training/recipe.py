@@ -227,15 +227,16 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
         or if `settings.feature_norm` is None.
 
     Raises:
-        InputError: If all features are 0.
+        InputError: If all features are 0, or if the network returns NaN.
     """
     if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
     norm = feature_norm(network, images)
-    if not norm:
+    if not 0 < norm < math.inf:
         raise InputError(
-            f"feature_norm={settings.feature_norm:g} has no meaning for this network, whose last "
-            "layer gets only zeros: set feature_norm=null",
+            f"feature_norm={settings.feature_norm:g} has no meaning for this network, since the "
+            f"norm of the features of its last layer is {norm:g}: check the weights, or set "
+            "feature_norm=null",
             "feature_norm",
         )
     return settings.learning_rate * settings.feature_norm / norm

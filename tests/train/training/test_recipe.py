@@ -319,7 +319,9 @@ def test_the_learning_rate_is_that_of_the_settings_without_a_norm_or_a_frozen_ne
     assert rate == settings.learning_rate
 
 
-def test_features_of_zeros_have_no_learning_rate(images):
+@pytest.mark.parametrize("brightness", [0.0, math.nan, math.inf])
+def test_features_without_a_finite_positive_norm_have_no_learning_rate(images, brightness):
     settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
+    features = torch.full_like(to_unit(images), brightness)
     with pytest.raises(InputError, match="feature_norm"):
-        scale_learning_rate(settings, Scaled(9.0), 0 * to_unit(images))
+        scale_learning_rate(settings, Scaled(9.0), features)
