@@ -38,10 +38,31 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
     """
     # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
     require_known(source.clamp(min=0), logits)
-    cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
+    cost = _log_probability(logits, source)
     if target is not None:
         cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
     return cost
+
+
+def _log_probability(logits: Tensor, classes: Tensor) -> Tensor:
+    """Compute the logarithm of the probability of a class, which is minus the cross entropy.
+
+    It is log σ(o), where σ is the logistic function and o are the log-odds of the class. Its
+    gradient is accurate even if the probability rounds to 1. The gradient of `cross_entropy` then
+    loses the term of the class.
+
+    Args:
+        logits: Logits of N images, shape (N, classes).
+        classes: Class of each image, int64, shape (N,). The result for NO_CLASS is 0.
+
+    Returns:
+        Logarithms, shape (N,).
+    """
+    is_class = classes != NO_CLASS
+    columns = torch.where(is_class, classes, 0)[:, None]
+    other_logits = logits.scatter(1, columns, -torch.inf)
+    odds = logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
+    return torch.where(is_class, F.logsigmoid(odds), 0)
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:

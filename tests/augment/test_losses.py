@@ -33,6 +33,20 @@ def test_a_complementary_label_costs_the_negative_log_probability_of_all_other_c
     torch.testing.assert_close(loss, expected, rtol=0, atol=32 * EPS)
 
 
+@pytest.mark.parametrize("gap", [0, 5, 17, 30, 80])
+def test_the_gradient_in_float32_is_exact_if_the_network_is_certain(gap):
+    logits = torch.tensor([[0.5, 2.0 + gap, 2.0, 0.0]], requires_grad=True)
+    probabilities = torch.from_numpy(softmax(logits.detach().double().numpy(), axis=1))
+    # The gradient of log p is onehot − softmax. Float64 rounds 1 − p to 0 at a gap of 80, but not
+    # the equal sum of the other probabilities.
+    expected = -probabilities
+    expected[0, 1] = probabilities[0, [0, 2, 3]].sum()
+    adversarial_cost(logits, torch.tensor([1]), torch.tensor([NO_CLASS])).sum().backward()
+    # The difference of two logits has an error of up to 82 / 2 · ε, which the exponential keeps.
+    rtol = 82 * torch.finfo(torch.float32).eps
+    torch.testing.assert_close(logits.grad.double(), expected, rtol=rtol, atol=0)
+
+
 def test_label_smoothing_leaves_complementary_labels_as_they_are():
     smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
     assert torch.equal(smoothed, label_loss(LOGITS, EXCLUDED))
