@@ -31,7 +31,7 @@ from augment.classifiers.plain_networks import (
 )
 from augment.classifiers.remembered import remembering
 from augment.losses import logit_gap
-from augment.model_passes import BatchSize
+from augment.model_passes import BatchSize, eval_mode
 from augment.parameter_settings import StepSettings
 from augment.progress import Phases, progress
 from augment.random_streams import generator
@@ -631,7 +631,7 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     """Compute the logits of all views of examples, batch by batch.
 
     Args:
-        model: Classifier with its preprocessing.
+        model: Classifier with its preprocessing. It is in eval mode meanwhile.
         images: Images in [0, 1] of V views of E examples, shape (E, V, 3, H, W).
         batch_size: Number of images of a batch. It is reduced if memory runs out.
 
@@ -640,7 +640,8 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     """
     all_images = images.flatten(0, 1)
     batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
-    logits = torch.cat(list(progress(batches, "predictions")))
+    with eval_mode(model):
+        logits = torch.cat(list(progress(batches, "predictions")))
     return logits.unflatten(0, images.shape[:2])
 
 

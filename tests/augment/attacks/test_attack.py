@@ -1,13 +1,16 @@
 """`augment.attack` lowers the cost of what it may change, and refuses impossible requests."""
 
+from copy import deepcopy
+
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import augment
 from augment.losses import adversarial_cost
 from augment.parameter_settings import PARAMETER_NAMES
 from renderer.errors import InputError
+from renderer.image import to_bytes, to_unit
 from renderer.light.nonnegative import project_nonnegative
 from renderer.light.presets import directional
 
@@ -155,6 +158,23 @@ def test_success_counts_only_for_examples_that_were_classified_correctly_before(
     result = attacked("lighting", scene, classifier, force=True, max_steps=30)
     assert result.clean_correct.tolist() == [True, False]
     assert result.success.tolist() == [True, False]
+
+
+def test_a_network_in_training_mode_is_scored_in_eval_mode_and_stays_as_it_was(tmp_path):
+    network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Flatten(), nn.Linear(144, 3))
+    classifier = augment.Classifier(network, 8, ("orange", "lime", "sky"))
+    other = augment.Classifier(deepcopy(network), 8, classifier.classes)
+    network.train()
+    state = deepcopy(network.state_dict())
+    settings = augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=2)
+    result = augment.attack(classifier, orange_labeled("orange"), settings=settings, force=True)
+    torch.testing.assert_close(result.logits_before, other(to_unit(to_bytes(result.images_before))))
+    augment.check(result)
+    augment.transfer(result, [classifier])
+    augment.save(result, tmp_path)
+    assert all(module.training for module in network.modules())
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, state[name]), name
 
 
 # --------------------------------------------------------------- refusals and warnings
