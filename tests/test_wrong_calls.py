@@ -1530,14 +1530,13 @@ def test_gradients_reach_fields_of_cameras_and_lists_of_tensors():
 
 
 def test_logits_are_not_taken_for_probabilities():
-    """A single image, values outside [0, 1], sums of 2 and single classes prove no softmax."""
+    """A single image, values outside [0, 1] and sums of 2 prove no softmax."""
     one_image = augment.Classifier(probabilities, SIZE, CLASSES)
     one_image(IMAGES[:1])
     with pytest.raises(InputError, match="logits"):
         one_image(IMAGES[:1])  # the second image proves it
     returning(torch.tensor([[0.2, 0.8], [0.3, 0.9], [0.2, 0.8]]))(IMAGES)
     returning(torch.tensor([[1.2, -0.2]] * 3))(IMAGES)
-    augment.Classifier(lambda images: torch.ones(len(images), 1), SIZE, ["orange"])(IMAGES)
     returning(bright_or_dark(IMAGES).log_softmax(1))(IMAGES)
 
 

@@ -199,8 +199,8 @@ class Classifier(nn.Module):
             `torch.nn.Module`, it is frozen, put in evaluation mode and moved
             with the classifier.
         size: Pixels per side of the images, from 1 to 4,096.
-        classes: Names of the C classes in the order of the logits. Each name
-            occurs once, because labels are found by name.
+        classes: Names of the C classes in the order of the logits, at least
+            two. Each name occurs once, because labels are found by name.
         name: Name of the classifier in messages.
         normalize_light: How the light of each image is normalized before the
             network sees it: True for the defaults, or a mapping with fields of
@@ -211,8 +211,8 @@ class Classifier(nn.Module):
             Empty if the network has none.
 
     Raises:
-        InputError: If a class name occurs twice, if there is no class, or if
-            the size is out of range.
+        InputError: If a class name occurs twice, if there are fewer than two
+            classes, or if the size is out of range.
     """
 
     operating_points: Sequence[OperatingPoint] = ()
@@ -239,7 +239,12 @@ class Classifier(nn.Module):
         self.classes = as_class_names(f"classifier {name}: classes", classes)
         self.name = name
         self._call_network = NetworkCall(f"classifier {name}")
-        if not 0 < len(set(self.classes)) == len(self.classes):
+        if len(self.classes) < 2:
+            raise InputError(
+                f"classifier {name} has classes={self.classes}: give at least two, with one logit "
+                "each (for a network with a single output z, return the logits 0 and z)"
+            )
+        if len(set(self.classes)) < len(self.classes):
             raise InputError(
                 f"classifier {name}: classes has {len(self.classes)} names, "
                 f"of which {len(set(self.classes))} are different: "

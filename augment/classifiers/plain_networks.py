@@ -165,7 +165,8 @@ def as_classifier(
     Raises:
         InputError: If the network is in training mode, would normalize images
             twice, fails on the images or does not return one row of logits for
-            each image, or if the number of names does not fit.
+            each image, if it returns a single logit, or if the number of names
+            does not fit.
 
     Example:
         >>> network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()

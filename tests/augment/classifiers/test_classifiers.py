@@ -155,8 +155,8 @@ def test_wrong_images_and_logits_are_refused(function, shape, message):
     assert str(caught.value).startswith("classifier mine ")
 
 
-@pytest.mark.parametrize("classes", [["crane", "orange", "crane"], []])
-def test_class_names_must_be_unique(classes):
+@pytest.mark.parametrize("classes", [["crane", "orange", "crane"], ["crane"], []])
+def test_class_names_must_be_unique_and_at_least_two(classes):
     with pytest.raises(InputError, match="classifier mine"):
         Classifier(mean_color, 8, classes, name="mine")
 

@@ -111,6 +111,14 @@ def test_a_wrong_number_of_names_is_refused(network):
         as_classifier(network, SIZE, classes=CLASSES[:2])
 
 
+def test_a_network_with_a_single_output_is_refused():
+    """The softmax of one logit is 1, so that no attack could succeed."""
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 1)).eval()
+    for attacked in (network, lambda images: network(images)):
+        with pytest.raises(InputError, match="at least two"):
+            augment.attack(attacked, scene(0), settings=light())
+
+
 @pytest.mark.parametrize("options", [{"classes": CLASSES}, {"value_range": (0, 255)}])
 def test_a_classifier_takes_no_options_of_plain_networks(network, options):
     classifier = augment.Classifier(network, SIZE, CLASSES)
