@@ -411,10 +411,11 @@ def attack(
             outputs. None for "0", "1" and so on.
         normalization: Normalization of images for a plain network: "imagenet",
             or mean and standard deviation of the channels red, green and blue,
-            in units of [0, 1]. None if the network takes images in [0, 1], or
-            normalizes them itself.
+            in units of `value_range`. None if the network takes images in
+            [0, 1], or normalizes them itself.
         value_range: Values of black and white that a plain network takes before
-            normalization.
+            normalization. "imagenet" stands for the mean and standard deviation
+            of ImageNet, scaled to this range.
         normalize_light: Whether the light of each image is normalized before
             the classifier sees it, as in `load_classifier`. The attack computes
             gradients through this step.

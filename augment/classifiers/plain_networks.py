@@ -148,10 +148,11 @@ def as_classifier(
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
         normalization: "imagenet", or mean and standard deviation of the
-            channels red, green and blue, in units of [0, 1]. None if the
+            channels red, green and blue, in units of `value_range`. None if the
             network takes images as they are, or normalizes them itself.
         value_range: Values of black and white that the network takes before
-            normalization, such as (0, 255) or (-1, 1).
+            normalization, such as (0, 255) or (-1, 1). "imagenet" stands for
+            the mean and standard deviation of ImageNet, scaled to this range.
         device: Device of the images. None for that of the network.
         argument: What error messages call the network.
         name: Name of the classifier. None for the name of the network's class.
@@ -262,7 +263,8 @@ def _preprocessed(
 
     Args:
         network: The network that gets the normalized images.
-        normalization: "imagenet", or mean and standard deviation. None for no normalization.
+        normalization: "imagenet", or mean and standard deviation in units of `value_range`. None
+            for no normalization.
         value_range: Values of black and white that the network takes before normalization.
 
     Returns:
@@ -281,6 +283,10 @@ def _preprocessed(
         return module.eval()
     if normalization is not None:
         _require_no_normalization(module)
+    if normalization == IMAGENET:
+        # Scaling the mean and the standard deviation of ImageNet to the range of the network is
+        # the same as normalizing values in [0, 1] with them.
+        black, white = UNIT_RANGE
     if normalization is not None and not black <= min(mean) <= max(mean) <= white:
         raise InputError(
             f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "

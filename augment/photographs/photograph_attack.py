@@ -152,8 +152,9 @@ def attack_photographs(
         classes: Names of the classes of a plain network. None for "0", "1" and
             so on.
         normalization: Normalization of images for a plain network: "imagenet",
-            or mean and standard deviation of the channels. None if the network
-            takes images in [0, 1], or normalizes them itself.
+            or mean and standard deviation of the channels, as `attack` takes
+            it. None if the network takes images in [0, 1], or normalizes them
+            itself.
         value_range: Values of black and white that a plain network takes before
             normalization.
         sensor_noise: Standard deviation of the noise, in units of 1/255. 0 for

@@ -53,6 +53,15 @@ def test_own_mean_and_std_are_in_units_of_the_value_range(network, images):
     torch.testing.assert_close(classifier(images), network(Normalize(mean, std)(255 * images)))
 
 
+@pytest.mark.parametrize(("black", "white"), [(0, 255), (-1, 1)])
+def test_imagenet_normalization_is_scaled_to_the_value_range(network, images, black, white):
+    span = white - black
+    mean, std = [black + span * value for value in MEAN], [span * value for value in STD]
+    classifier = as_classifier(network, SIZE, normalization="imagenet", value_range=(black, white))
+    expected = network(Normalize(mean, std)(black + span * images))
+    torch.testing.assert_close(classifier(images), expected)
+
+
 def test_values_are_scaled_to_the_range_of_the_network(network, images):
     classifier = as_classifier(network, SIZE, value_range=(-1, 1))
     torch.testing.assert_close(classifier(images), network(2 * images - 1))
