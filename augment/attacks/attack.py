@@ -637,13 +637,14 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
         batch_size: Number of images of a batch. It is reduced if memory runs out.
 
     Returns:
-        Logits of the C classes, shape (E, V, C).
+        Logits of the C classes with the dtype of the images, shape (E, V, C).
     """
     all_images = images.flatten(0, 1)
     batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
     with eval_mode(model):
         logits = torch.cat(list(progress(batches, "predictions")))
-    return logits.unflatten(0, images.shape[:2])
+    # The network may compute in half precision.
+    return logits.unflatten(0, images.shape[:2]).to(images.dtype)
 
 
 def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tensor:

@@ -415,7 +415,8 @@ class Descent:
         """
         batch = all_images[batch_rows].detach().requires_grad_(True)
         classes = criterion.select(batch_rows)
-        logits = self.model(batch)
+        # The network may compute in half precision.
+        logits = self.model(batch).to(batch.dtype)
         expected_logits = self.expectation(self.model, batch, logits)
         cost = adversarial_cost(expected_logits, classes.source, classes.target)
         (batch_gradient,) = torch.autograd.grad(cost.sum(), batch)

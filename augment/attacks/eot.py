@@ -116,7 +116,7 @@ class ExpectationOverTransformations:
             return logits
         log_probabilities = [logits.log_softmax(1)]
         for _ in range(self.settings.draws):
-            transformed_logits = model(self._transformed(images))
+            transformed_logits = model(self._transformed(images)).to(logits.dtype)
             log_probabilities.append(transformed_logits.log_softmax(1))
         return torch.stack(log_probabilities).mean(0)
 

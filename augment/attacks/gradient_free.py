@@ -168,13 +168,11 @@ class GradientFree(Descent):
         """
         batch = all_images[rows]
         classes = criterion.select(rows)
-        logits = self.model(batch)
+        # The network may compute in half precision.
+        logits = self.model(batch).to(batch.dtype)
         expected_logits = self.expectation(self.model, batch, logits)
-        # Use float64, because the cross entropy in float32 rounds to zero for logit gaps above
-        # 17, and candidates could not be compared.
-        cost = adversarial_cost(expected_logits.double(), classes.source, classes.target)
         return Score(
-            cost=cost.to(batch),
+            cost=adversarial_cost(expected_logits, classes.source, classes.target),
             gap=logit_gap(expected_logits, classes.source, classes.target),
             predicted=logits.argmax(1),
         )

@@ -177,6 +177,34 @@ def test_a_network_in_training_mode_is_scored_in_eval_mode_and_stays_as_it_was(t
         assert torch.equal(value, state[name]), name
 
 
+@pytest.mark.parametrize("optimizer", ["gradient", "random_search"])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_network_may_return_logits_in_half_precision(tmp_path, optimizer, dtype):
+    """The logits are rounded: their differences to float32 are at most ε / 2 of their size."""
+
+    def half_logits(images):
+        mean = images.mean((1, 2, 3))
+        return torch.stack([mean, 0.3 + 0 * mean], dim=1).to(dtype)
+
+    settings = augment.AttackSettings(
+        lighting=augment.StepSettings(step_size=0.5),
+        optimizer=optimizer,
+        max_queries=40,
+        eot=augment.EOTSettings(draws=1),
+    )
+    result = augment.attack(
+        half_logits, augment.build_scene([("solid:orange", 0)], 8), settings=settings
+    )
+    assert result.logits.dtype == torch.float32
+    brightness = to_unit(to_bytes(result.images)).mean((1, 2, 3))
+    torch.testing.assert_close(
+        result.logits[:, 0], brightness, rtol=torch.finfo(dtype).eps / 2, atol=1e-6
+    )
+    assert (result.descent.cost < result.descent.cost_before).all()
+    result.plot()
+    augment.save(result, tmp_path)
+
+
 # --------------------------------------------------------------- refusals and warnings
 
 
