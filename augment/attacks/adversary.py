@@ -275,7 +275,7 @@ def _describe(
     """
     shown = adversary.shown
     return {
-        "label": shown.label,
+        "label": str(shown.label),
         "name": Path(shown.name).name,
         "own_faces": shown.own,
         "albedo_scale": shown.albedo_scale,

@@ -730,7 +730,7 @@ def target_labels(
         return logits.argmin(2)
     view_count = logits.shape[1]
     is_one_class = isinstance(target, str) or is_whole(target)
-    names = [str(target)] * view_count if is_one_class else _target_names(target)
+    names = _targets([target] * view_count if is_one_class else target)
     if len(names) != view_count:
         raise InputError(
             f"target={names} names "
@@ -746,10 +746,12 @@ def target_labels(
     return labels
 
 
-def _target_names(target: object) -> list[str]:
-    """Convert a list of target classes to strings, or raise InputError if it is not a list."""
+def _targets(target: object) -> list[str | int]:
+    """Return a list of names and indices of classes, or raise InputError if it is not a list."""
     advice = "the name or the index of a class, or one for each view"
-    return [str(name) for name in as_list("target", target, str | Integral, advice)]
+    names = as_list("target", target, str | Integral, advice)
+    # An integer of NumPy is no `int`.
+    return [name if isinstance(name, str) else int(name) for name in names]
 
 
 def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Tensor]:

@@ -718,11 +718,15 @@ class _Adversaries:
             classifier: The other classifier.
         """
         view_count = self.result.problem.scene.views
-        sources = [[adversary.shown.label] * view_count for adversary in self.after]
+        attacked_classes = self.result.classifier.classes
+        sources = []
+        for adversary in self.after:
+            label = adversary.shown.label
+            name = label if isinstance(label, str) else attacked_classes[label]
+            sources.append([name] * view_count)
         source = self._labels(sources, classifier)
         if self.result.criterion.target is None:
             return Criterion(source)
-        attacked_classes = self.result.classifier.classes
         targets = [
             [attacked_classes[index] for index in self.result.criterion.target[example].tolist()]
             for example in self.examples

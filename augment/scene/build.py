@@ -230,8 +230,10 @@ def _load_member(
         return load_object(member, vertices)
     mesh, label = member
     if isinstance(mesh, Mesh):
-        return SceneObject.from_mesh(str(label), subdivide(mesh, vertices))
-    return load_object(ObjectSettings(str(mesh), str(label)), vertices)
+        return SceneObject.from_mesh(label, subdivide(mesh, vertices))
+    loaded = load_object(ObjectSettings(str(mesh), str(label)), vertices)
+    # An index remains a number, because a class may have this number as its name.
+    return replace(loaded, label=label)
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:

@@ -34,7 +34,7 @@ class SceneObject:
     """An object of a scene, with its props (meshes beside it) and its table.
 
     Attributes:
-        label: Name of its class.
+        label: Name or index of its class.
         mesh: One mesh of all faces: first those of the object, which spans
             [-1, 1], then those of the props and of the table.
         albedo_scale: Factor that multiplies the albedo of all faces.
@@ -48,7 +48,7 @@ class SceneObject:
             at center + extent · v before.
     """
 
-    label: str
+    label: str | int
     mesh: Mesh
     albedo_scale: float = 1.0
     name: str = "the mesh"
@@ -60,12 +60,12 @@ class SceneObject:
 
     @classmethod
     def from_mesh(
-        cls, label: str, given: Mesh, albedo_scale: float = 1.0, name: str = "the mesh"
+        cls, label: str | int, given: Mesh, albedo_scale: float = 1.0, name: str = "the mesh"
     ) -> SceneObject:
         """Create an object from a mesh of any size at any place.
 
         Args:
-            label: Name of the class of the object.
+            label: Name or index of the class of the object.
             given: The mesh. The object gets a copy that is moved and scaled to
                 span [-1, 1].
             albedo_scale: Factor that multiplies the albedo of all faces.

@@ -244,8 +244,8 @@ class Scene:
         return [example.cameras for example in self.examples]
 
     @cached_property
-    def labels(self) -> list[str]:
-        """Return the class name of each example."""
+    def labels(self) -> list[str | int]:
+        """Return the name or the index of the class of each example."""
         return [self.objects[example.object].label for example in self.examples]
 
     @cached_property

@@ -126,7 +126,7 @@ def _build_scene(
         )
 
 
-def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str, int]:
+def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | int, int]:
     """Return the index of each class that a mesh or a hard negative of a run has.
 
     Args:
@@ -137,7 +137,7 @@ def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str, int
         Index in the list of classes by the name of the class. The class "other",
         which no network has, is left out.
     """
-    indices = {}
+    indices: dict[str | int, int] = {}
     for key, item in settings.objects.items():
         if item.label != OTHER:
             indices[item.label] = class_index(data.classes, item.label, f"label of {key}")

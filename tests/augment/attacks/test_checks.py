@@ -245,6 +245,15 @@ def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_clas
     assert row["confidence"] == confidence(other(images[:, 0])[:, None])
 
 
+def test_the_index_of_a_label_belongs_to_the_attacked_network():
+    scene = augment.build_scene([("solid:orange", 0)], 12)
+    settings = augment.AttackSettings(lighting=StepSettings(step_size=0.2), max_steps=60)
+    result = augment.attack(network(), scene, settings=settings)
+    (row,) = augment.transfer(result, [network(("sky", "orange", "lime"))])
+    assert row["predicted_before"] == [["orange"]]
+    assert row["clean_correct"] == [True]
+
+
 def test_a_network_without_the_target_class_is_refused(sky_attack):
     with pytest.raises(InputError, match="'sky'"):
         augment.transfer(sky_attack, [network(("orange", "lime"))])

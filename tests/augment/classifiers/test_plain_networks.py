@@ -1,11 +1,13 @@
 """A plain network is attacked as it is, after a check on gray images."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 from torchvision.transforms import Normalize
 
 import augment
+import renderer
 from augment.classifiers.plain_networks import as_classifier
 from renderer import InputError
 
@@ -84,6 +86,19 @@ def test_an_index_is_a_target_as_its_name_is(network):
     by_name = augment.attack(classifier, scene("orange"), target="apple", **options)
     by_index = augment.attack(classifier, scene("orange"), target=2, **options)
     assert torch.equal(by_name.images, by_index.images)
+
+
+def test_a_number_is_an_index_even_if_a_class_has_this_number_as_its_name(network):
+    options = {"settings": light(), "force": True, "classes": ("1", "2", "0")}
+    by_index = augment.attack(network, scene(1), target=2, **options).criterion
+    assert (by_index.source.item(), by_index.target.item()) == (1, 2)
+    by_name = augment.attack(network, scene("1"), target="2", **options).criterion
+    assert (by_name.source.item(), by_name.target.item()) == (0, 1)
+    of_a_list = augment.attack(network, scene(1), target=[np.int64(2)], **options).criterion
+    assert of_a_list.target.item() == 2
+    mesh = renderer.solid("orange", 0)
+    of_a_mesh = augment.attack(network, augment.build_scene([(mesh, 1)], SIZE), **options)
+    assert of_a_mesh.criterion.source.item() == 1
 
 
 def test_the_parameters_of_the_network_require_gradients_as_before(network):
