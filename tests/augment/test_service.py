@@ -275,7 +275,8 @@ class PaperLoop:
         self.lights.requires_grad_(True)
         self.images = render(self.scene, self.lights)
         logits = self.model(self.images)
-        self.losses = F.cross_entropy(logits, self.labels, reduction="none")
+        # Float32 loses digits of 1 − p, which is the gradient of a class with the probability p.
+        self.losses = F.cross_entropy(logits.double(), self.labels, reduction="none")
         self.success = logits.argmax(1) != self.labels
 
     def direction(self) -> Tensor:
