@@ -119,7 +119,7 @@ class AttackSettings(ParameterSettings):
     max_queries: int | None = setting(
         None,
         "Largest number of forward passes for each example: images that the search shows to the "
-        "classifier. "
+        "classifier. All starts have the same share of it. "
         f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
         minimum=1,
         maximum=10**9,
@@ -206,6 +206,12 @@ class AttackSettings(ParameterSettings):
         return DEFAULT_QUERIES
 
     @property
+    def query_limit_of_start(self) -> int | None:
+        """Largest number of images that an example may show in each start. None for no limit."""
+        limit = self.query_limit
+        return None if limit is None else limit // (1 + self.restarts)
+
+    @property
     def step_limit(self) -> int:
         """Largest number of steps.
 
@@ -214,7 +220,7 @@ class AttackSettings(ParameterSettings):
         """
         if self.uses_gradients:
             return self.max_steps
-        return self.query_limit or 0
+        return self.query_limit_of_start or 0
 
     def with_budget(self, factor: int) -> Self:
         """Return settings whose largest numbers of steps and queries are multiplied by a factor."""

@@ -247,12 +247,16 @@ class Descent:
                 shape (A,).
             start: First initial values, shape (A, D).
             restarts: Further initial values, each of shape (A, D). They are
-                used for the examples that have not succeeded.
+                used for the examples that have not succeeded. They are not used
+                if their share of the queries is less than one evaluation.
 
         Returns:
             Result of the A examples.
         """
         result = self.run(criterion, examples, start)
+        limit = self.settings.query_limit_of_start
+        if limit is not None and limit < self._passes_of_candidate(criterion):
+            return result
         for restart in restarts:
             failed_rows = torch.nonzero(~result.success).squeeze(1)
             if not len(failed_rows):
@@ -303,21 +307,21 @@ class Descent:
             state: State of the descent. The counts of its active examples are increased.
             evaluation: Evaluation of the candidates of the active examples.
         """
-        pass_count = evaluation.candidate_count * self._passes_of_candidate(state)
+        pass_count = evaluation.candidate_count * self._passes_of_candidate(state.criterion)
         state.result.queries[state.active_rows] += pass_count
         if evaluation.gradient is not None:
             state.result.backward_passes[state.active_rows] += pass_count
 
-    def _passes_of_candidate(self, state: State) -> int:
+    def _passes_of_candidate(self, criterion: Criterion) -> int:
         """Return how many images the classifier sees to evaluate one candidate of an example.
 
         These are all views of the example, each as it is and in each of its
         random transformations.
 
         Args:
-            state: State of the descent, whose criterion has the number of views.
+            criterion: Source and target classes of the views.
         """
-        view_count = state.criterion.source.shape[1]
+        view_count = criterion.source.shape[1]
         return view_count * (1 + self.settings.eot.draws)
 
     def _drop_examples_without_budget(self, state: State) -> None:
@@ -326,10 +330,10 @@ class Descent:
         Args:
             state: State of the descent. Its active examples are updated.
         """
-        limit = self.settings.query_limit
+        limit = self.settings.query_limit_of_start
         if limit is None or not len(state.active_rows):
             return
-        needed = self._candidates_per_step(state) * self._passes_of_candidate(state)
+        needed = self._candidates_per_step(state) * self._passes_of_candidate(state.criterion)
         is_affordable = state.result.queries[state.active_rows] + needed <= limit
         state.active_rows = state.active_rows[is_affordable]
 

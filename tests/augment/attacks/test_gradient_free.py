@@ -192,6 +192,24 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     assert (result.descent.queries <= 40).all()
 
 
+@pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
+@pytest.mark.parametrize("max_queries", [1, 7, 20])
+def test_all_starts_together_show_at_most_the_given_number_of_images(
+    attacked, optimizer, max_queries
+):
+    pytest.importorskip("cma")
+    steps = {"lighting": augment.StepSettings("l2", 0.1)}
+    options = {"optimizer": optimizer, "restarts": 2, "margin": 100.0}
+    result = attacked(steps, max_queries=max_queries, **options)
+    assert not result.success.any()
+    assert (result.queries <= max_queries).all()
+    if optimizer != "cma_es" and max_queries > 1:
+        # The share is used up. The first start shows the initial image without a step.
+        share = max_queries // 3
+        assert result.queries.item() == 3 * share
+        assert result.steps.item() == 3 * (share - 1)
+
+
 def test_the_queries_of_a_gradient_attack_are_limited_and_counted_alike(attacked):
     options = {"max_steps": 50, "margin": 100.0}
     limited = attacked("lighting", max_queries=7, **options)
