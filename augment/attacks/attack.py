@@ -459,7 +459,7 @@ def attack(
             "call norm_balls.attack outside of this mode"
         )
     size = scene.settings.size
-    device = scene.lights.device
+    lights = scene.lights
     with gradient_flags_kept(classifier):
         adapted = as_classifier(
             classifier,
@@ -467,9 +467,10 @@ def attack(
             classes,
             normalization,
             value_range,
-            device,
+            lights.device,
             "classifier",
             normalize_light=normalize_light,
+            dtype=lights.dtype,
         )
         return _attack(adapted, scene, target, settings, seed, force)
 
@@ -495,8 +496,9 @@ def _attack(
     """
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
-    settings = with_optimizer(settings, classifier)
-    if not classifier.has_gradients:
+    has_gradients = classifier.is_differentiable(scene.lights)
+    settings = with_optimizer(settings, classifier, has_gradients)
+    if not has_gradients:
         # Classify each image once only, because a function without gradients may be slow.
         classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
@@ -545,17 +547,20 @@ def _attack(
     )
 
 
-def with_optimizer(settings: AttackSettings, classifier: Classifier) -> AttackSettings:
+def with_optimizer(
+    settings: AttackSettings, classifier: Classifier, has_gradients: bool
+) -> AttackSettings:
     """Choose random search for a classifier without gradients, and warn.
 
     Args:
         settings: Settings of the attack. An optimizer that they name is kept.
         classifier: The classifier to attack.
+        has_gradients: Whether its logits are differentiable in the pixels.
 
     Returns:
         The given settings, or a copy with random search as the optimizer.
     """
-    if settings.optimizer is not None or classifier.has_gradients:
+    if settings.optimizer is not None or has_gradients:
         return settings
     chosen = replace(settings, optimizer=RANDOM_SEARCH)
     # `stacklevel` makes Python name the user's call of `attack` in the warning.

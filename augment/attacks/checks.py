@@ -328,6 +328,7 @@ def _as_classifier(
         value_range,
         result.images_in_views.device,
         argument,
+        dtype=result.images_in_views.dtype,
     )
 
 

@@ -12,7 +12,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -328,18 +327,20 @@ class Classifier(nn.Module):
             return self
         return Classifier(self.function, self.size, self.classes, self.name, normalize_light)
 
-    @cached_property
-    def has_gradients(self) -> bool:
-        """Whether the logits are differentiable in the pixels.
+    def is_differentiable(self, like: Tensor) -> bool:
+        """Return whether the logits are differentiable in the pixels.
 
         A network of torch with weights is assumed to have differentiable
         logits. Any other function is called with a gray image to find out.
+
+        Args:
+            like: Tensor with the dtype and the device of the image.
         """
         parameters = self.function.parameters() if isinstance(self.function, nn.Module) else ()
         weight = next(iter(parameters), None)
         if weight is not None:
             return True
-        gray = torch.full((1, 3, self.size, self.size), GRAY, requires_grad=True)
+        gray = like.new_full((1, 3, self.size, self.size), GRAY, requires_grad=True)
         try:
             with torch.enable_grad():
                 return bool(self._call_network(self.function, gray).requires_grad)

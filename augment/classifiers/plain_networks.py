@@ -137,6 +137,7 @@ def as_classifier(
     argument: str = "network",
     name: str | None = None,
     normalize_light: NormalizeLight = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Classifier:
     """Make a classifier of a plain network, and check it on gray images.
 
@@ -159,6 +160,7 @@ def as_classifier(
         normalize_light: How the light of each image is normalized first: True
             for the defaults, or a mapping with fields of
             `NormalizedLightSettings`. None for no normalization.
+        dtype: Type of the gray images.
 
     Returns:
         The classifier. It contains the network itself, not a copy.
@@ -198,7 +200,7 @@ def as_classifier(
     size = USUAL_SIZE if size is None else size
     device = device_of(network) if device is None else as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
-    count = _count_outputs(function, size, device, argument)
+    count = _count_outputs(function, size, device, dtype, argument)
     if names is not None and len(names) != count:
         raise InputError(
             f"classes has {len(names)} names, but the network returns {count} outputs: "
@@ -340,16 +342,19 @@ def _require_no_normalization(network: nn.Module) -> None:
 
 
 @torch.no_grad()
-def _count_outputs(network: nn.Module, size: int, device: torch.device | str, argument: str) -> int:
+def _count_outputs(
+    network: nn.Module, size: int, device: torch.device | str, dtype: torch.dtype, argument: str
+) -> int:
     """Call a network on gray images to find out the number of its classes.
 
     Args:
         network: Network that takes images in [0, 1].
         size: Pixels per side of the images.
         device: Device of the images.
+        dtype: Type of the images.
         argument: Name of the network in error messages.
     """
-    shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device)
+    shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
     call = NetworkCall(argument)
     return call(network, images.contiguous()).shape[1]

@@ -223,7 +223,8 @@ class _PhotographAttack:
         self.seed = seed
         self.device = device_of(classifier)
         self.model = Quantized(classifier)
-        self.lights = LIGHTS if classifier.has_gradients else LIGHTS[:-1]
+        has_gradients = classifier.is_differentiable(torch.empty(0, device=self.device))
+        self.lights = LIGHTS if has_gradients else LIGHTS[:-1]
 
     def run(self) -> PhotographAttackResult:
         """Attack all photographs with all slides, which are pictures that a projector shows."""

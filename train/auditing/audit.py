@@ -19,6 +19,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from augment.classifiers import Classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
@@ -135,7 +137,7 @@ def run_audit(
                 plan.image_folders = {page.LABORATORY: renders} | plan.image_folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
-    caveats += _gradient_caveats(networks.values())
+    caveats += _gradient_caveats(networks.values(), plan.device)
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
@@ -180,7 +182,7 @@ def _audit_photographs(
     _require_continuable(out, settings.overwrite, is_named)
     caveats = _size_caveats(networks.values())
     for network in networks.values():
-        if not network.has_gradients:
+        if not network.is_differentiable(torch.empty(0, device=device)):
             caveats.append(f"{network.name} has no gradients: only random search attacks it.")
     for sentence in caveats:
         console.warning(sentence)
@@ -420,13 +422,13 @@ def _size_caveats(networks: Collection[Classifier]) -> list[str]:
     return [f"The networks take images of {listed} pixels, and differ by that, too."]
 
 
-def _gradient_caveats(networks: Collection[Classifier]) -> list[str]:
-    """Return a sentence for the report about each network that has no gradients."""
+def _gradient_caveats(networks: Collection[Classifier], device: torch.device) -> list[str]:
+    """Return a sentence for the report about each network that has no gradients on a device."""
     return [
         f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
         "for each radius."
         for network in networks
-        if not network.has_gradients
+        if not network.is_differentiable(torch.empty(0, device=device))
     ]
 
 

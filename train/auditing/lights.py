@@ -260,11 +260,12 @@ def adversaries(
         settings |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
-    if not classifier.has_gradients:
+    scene = views.scene(classifier.size, kind)
+    if not classifier.is_differentiable(scene.lights):
         settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,
-        views.scene(classifier.size, kind),
+        scene,
         settings=AttackSettings(**settings, batch_size=BATCH),
         seed=views.seed,
         force=True,

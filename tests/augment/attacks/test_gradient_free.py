@@ -15,6 +15,7 @@ from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem
 from augment.parameter_settings import StepSettings
 from renderer.light.nonnegative import project_nonnegative
+from renderer.light.presets import load_light
 
 OPTIMIZERS = ["random_search", "cma_es"]
 VALUE_COUNT = 4
@@ -265,6 +266,26 @@ def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sent
     with pytest.warns(UserWarning, match="random search attacks it with at most 5 queries"):
         result = augment.attack(logits_of_means, scene, settings=settings, force=True)
     assert result.settings.optimizer == "random_search"
+
+
+@pytest.mark.parametrize("is_plain", [True, False])
+def test_a_function_that_takes_only_the_dtype_of_the_scene_keeps_its_gradients(
+    make_linear, is_plain
+):
+    network = make_linear(2).eval()
+
+    def function(images):
+        return network(images)  # float64 alone
+
+    light = load_light("grace").double()
+    scene = augment.build_scene([("solid:orange", 0)], 6, light=light, rasterizer="numpy")
+    settings = augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=2)
+    attacked = function if is_plain else augment.Classifier(function, 6, ["0", "1"])
+    result = augment.attack(attacked, scene, settings=settings, force=True)
+    assert result.settings.optimizer is None
+    expected = augment.attack(network, scene, settings=settings, force=True)
+    assert torch.equal(result.images, expected.images)
+    assert (result.backward_passes > 0).all()
 
 
 @pytest.mark.parametrize(
