@@ -9,6 +9,7 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.skylight import Skylight
 from augment.progress import progress
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
@@ -215,7 +216,7 @@ def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
     parameters = []
     for name, steps in settings.parameters.items():
         options = {}
-        if name == Lighting.name:
+        if name in (Lighting.name, Skylight.name):
             options["nonnegative"] = not settings.allow_negative
         parameters.append(make_parameter(name, scene, steps, **options))
     return AttackProblem(scene, parameters)

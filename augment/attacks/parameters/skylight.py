@@ -12,9 +12,11 @@ from augment.parameter_settings import SkylightSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
+from renderer.light.basis import HARMONICS
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
+from renderer.light.window import nonnegative_window
 from renderer.settings import TURBIDITY
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
@@ -32,16 +34,21 @@ class Skylight(Parameter):
     The sky replaces the environment lighting of the scene. It is multiplied by
     a constant factor, so that the initial sky has the mean luminance of the
     lighting that it replaces. Projector and lamps stay as they are.
+
+    The coefficients of the sky end at degree 6, so that its radiance is negative
+    in some directions. If radiance must not be negative, the coefficients are
+    multiplied by `nonnegative_window`, which keeps the mean.
     """
 
     name = "skylight"
 
-    def __init__(self, scene: Scene, settings: SkylightSettings):
+    def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
         """Compute the initial sky and its brightness.
 
         Args:
             scene: Scene to attack.
             settings: Norm-ball, steps and initial sky of the attack.
+            nonnegative: Whether radiance must not be negative in any direction.
         """
         self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
@@ -51,6 +58,7 @@ class Skylight(Parameter):
         # Factor by which the sky is multiplied in each example, shape (E,).
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
+        self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
         self._sun = settings.sun
         values = [
             settings.zenith / settings.sun,
@@ -80,6 +88,8 @@ class Skylight(Parameter):
         # RGB of the 49 harmonic coefficients of the sky model, shape (A, 49, 3).
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
+        if self._window is not None:
+            sky = sky * self._window.to(sky)[:, None]
         # The lighting of the scene may have more coefficients. Those of the sky are then 0.
         missing_count = self._basis.size - sky.shape[-2]
         sky = F.pad(sky, (0, 0, 0, missing_count))

@@ -17,7 +17,7 @@ from augment.attacks.descent import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import AttackProblem, build_problem
 from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.scene import direct_rendering
 from augment.scene.conditions import Conditions
@@ -26,7 +26,7 @@ from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
-from renderer.light.harmonics import nonzero_coefficients, project
+from renderer.light.harmonics import irradiance_error, nonzero_coefficients, project
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
@@ -140,6 +140,27 @@ def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene):
     skies = problem.conditions(problem.start, EVERY).light
     for sky, light in zip(skies, lights, strict=True):
         assert mean_luminance(sky) == pytest.approx(mean_luminance(light), rel=1e-9)
+
+
+@pytest.mark.parametrize("turbidity", [*TURBIDITY, 3.0])
+@pytest.mark.parametrize("zenith", [*ZENITH, 10.0, 45.0, 80.0])
+def test_without_negative_light_a_sky_keeps_its_mean_and_nearly_its_irradiance(
+    make_scene, zenith, turbidity
+):
+    scene = make_scene()
+    lights = []
+    for is_negative_allowed in (True, False):
+        steps = sky_at((zenith, 30.0, turbidity))
+        settings = AttackSettings(skylight=steps, allow_negative=is_negative_allowed)
+        problem = build_problem(settings, scene)
+        lights.append(problem.conditions(problem.start, EVERY).light[0])
+    cut_off, nonnegative = lights
+    radiance = to_map(nonnegative, 64)
+    assert (radiance.amin((0, 1)) >= -TOLERANCE * radiance.amax((0, 1))).all()
+    torch.testing.assert_close(nonnegative[0], cut_off[0])
+    assert irradiance_error(nonnegative, cut_off) < 0.09
+    without_window = to_map(cut_off, 64)
+    assert (without_window.amin((0, 1)) < -TOLERANCE * without_window.amax((0, 1))).any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
