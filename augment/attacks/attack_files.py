@@ -255,8 +255,8 @@ def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, 
         result.settings,
         result.seed,
     )
-    success = success_in_views.all(1)
-    without_noise = result.criterion.reached(predicted)
+    success = success_in_views.all(1) & ~result.success_before
+    without_noise = result.criterion.reached(predicted) & ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)
     numbers = []
     for example, difference in enumerate(differences):

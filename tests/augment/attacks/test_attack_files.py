@@ -69,6 +69,18 @@ def test_each_example_has_a_line_with_the_numbers_of_its_descent(saved):
         assert line["largest_change"]["lighting"] > 0
 
 
+def test_no_version_of_an_example_that_was_wrong_before_is_a_success(by_color, tmp_path):
+    scene = augment.build_scene([("solid:orange", "sky")], 8)
+    settings = augment.AttackSettings(lighting=augment.StepSettings(), max_steps=1)
+    result = augment.attack(by_color, scene, settings=settings, force=True)
+    [line] = augment.save(result, tmp_path)
+    assert line["success_before"]
+    for counted in (line, *line["versions"].values()):
+        assert counted["predicted"] == ["orange"]
+        assert not counted["success"]
+        assert not counted["success_without_noise"]
+
+
 def test_each_line_has_the_predictions_before_and_after(saved):
     for suffix, logits in (
         ("_before", saved.result.logits_before),
