@@ -568,8 +568,9 @@ class AugmentationService:
     def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
         """Return the attack values at which the next attack starts.
 
-        With `warm_start`, they are the values at which the previous attack ended. With
-        `init="random"`, they are random. Otherwise they are those of the scene.
+        With `warm_start`, they are the values at which the previous attack ended, projected to
+        the norm-balls, whose centers may have moved. With `init="random"`, they are random.
+        Otherwise they are those of the scene.
 
         Args:
             problem: The scene of E examples, and the attacked parameters.
@@ -579,7 +580,7 @@ class AugmentationService:
             D values of each example, shape (E, D).
         """
         if self._last_values is not None:
-            return self._last_values
+            return problem.project(self._last_values, problem.all_examples)
         if self.settings.init == "random":
             return self._random_values(problem, number)
         return problem.start

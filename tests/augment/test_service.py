@@ -328,6 +328,26 @@ def test_a_warm_start_continues_the_last_attack(serve, model):
     assert second["loss"] > first["loss"]
 
 
+class AlwaysWrong(nn.Module):
+    """A network that predicts class 1, which no example shows."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.mean((2, 3)) + torch.tensor([0.0, 5.0, 0.0])
+
+
+def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):
+    """Every example is misclassified, so that no step projects its values."""
+    service = serve(
+        warm_start=True,
+        vary=VariationSettings(environments=["grace", "eucalyptus", "st_peters"]),
+        attack=TrainingAttackSettings(lighting=StepSettings("l2", 0.1), max_steps=2),
+    )
+    for number in range(3):
+        diagnostics = service.regenerate(AlwaysWrong(), number).diagnostics
+        assert diagnostics["steps"] == 0
+        assert diagnostics["light_change"] <= 0.1 * (1 + 64 * EPS32)
+
+
 def test_a_resumed_service_continues_the_last_attack(serve, model):
     service = serve(**WARM)
     service.regenerate(model, 0)
