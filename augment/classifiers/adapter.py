@@ -36,6 +36,10 @@ OVERSHOOT = 0.1
 # A network is refused if its outputs for this many images look like probabilities. The logits of a
 # single image may do so by chance.
 MIN_PROBABILITY_ROWS = 2
+# Probabilities may be rounded to multiples of this number.
+ROUNDED = 1e-3
+# The sum of many rounded probabilities may differ from 1 by at most this much.
+MAX_DEVIATION = 0.01
 # Pixel value of the gray image with which a function is called to find out whether it has
 # gradients.
 GRAY = 0.5
@@ -173,15 +177,15 @@ def are_probabilities(outputs: Tensor) -> bool:
         outputs: Outputs for N images and C classes, shape (N, C).
 
     Returns:
-        Whether all values are in [0, 1] and each row sums to 1 up to rounding.
-        Outputs with a single class do not count as probabilities.
+        Whether all values are in [0, 1] and each row sums to 1 up to rounding to
+        three decimals. Outputs with a single class do not count as probabilities.
     """
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
     values = outputs.detach()
-    rounding = max(1e-5, torch.finfo(values.dtype).eps)
+    rounding = max(torch.finfo(values.dtype).eps, ROUNDED * outputs.shape[1] / 2)
     deviation = (values.double().sum(1) - 1).abs().max()
-    return bool((values.min() >= 0) & (deviation <= rounding))
+    return bool((values.min() >= 0) & (deviation <= min(rounding, MAX_DEVIATION)))
 
 
 class Classifier(nn.Module):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import pytest
 import torch
+from scipy.special import softmax
 from torch import Tensor, nn
 
 import augment
@@ -303,6 +304,24 @@ def test_a_function_may_take_and_return_tensors_or_arrays(function):
     images = random(2, 3, 4, 4, seed=0).sigmoid().float()
     for _ in range(2):
         torch.testing.assert_close(classifier(images), images.mean((2, 3)))
+
+
+@pytest.mark.parametrize("class_count", [3, 100])
+@pytest.mark.parametrize(
+    "rounded",
+    [lambda scores: scores.astype(np.float16), lambda scores: np.round(scores, 3)],
+    ids=["float16", "three decimals"],
+)
+def test_rounded_probabilities_become_their_logarithms(class_count, rounded):
+    logits = np.random.default_rng(1).normal(size=(6, class_count))
+    logits[0] = 0.0  # Three equal probabilities are rounded to 0.333.
+    probabilities = rounded(softmax(logits, axis=1))
+    deviation = probabilities.astype(np.float64).sum(1) - 1
+    assert np.abs(deviation).max() > 1e-5
+    classes = [str(index) for index in range(class_count)]
+    classifier = augment.Classifier(lambda images: probabilities, 4, classes)
+    found = classifier(torch.full((6, 3, 4, 4), 0.5)).exp()
+    torch.testing.assert_close(found, torch.from_numpy(probabilities).float())
 
 
 def test_probabilities_of_a_function_without_gradients_become_their_logarithms():
