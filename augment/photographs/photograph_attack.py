@@ -33,7 +33,7 @@ from augment.photographs.projected_light import (
 )
 from augment.progress import progress
 from augment.random_streams import generator
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.image import decode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
@@ -85,18 +85,25 @@ class PhotographAttackResult:
     changed: dict[str, Tensor]
     log_gain: dict[str, Tensor]
 
-    def kept(self, light: str = ADVERSARIAL) -> Tensor:
+    def kept(self, light: str | None = None) -> Tensor:
         """Return a mask of the photographs that keep their class in the light of every slide.
 
         A slide is a picture that the projector shows on a photograph.
 
         Args:
             light: "slide" (slides as they are), "random" (slides with random
-                factors) or "adversarial" (slides with factors of an attack).
+                factors) or "adversarial" (slides with factors of an attack). None
+                for "adversarial", or for "random" if the network has no gradients.
 
         Returns:
             Mask, bool, shape (N,).
+
+        Raises:
+            InputError: If the result has no such light.
         """
+        # The last light is the strongest.
+        light = [*self.changed][-1] if light is None else light
+        require_choice("light", light, self.changed)
         return ~self.changed[light].any(1)
 
     def image(self, photograph: int, light: str, slide: int = 0) -> Tensor:

@@ -140,6 +140,9 @@ def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
     result = attack_photographs(brightest, photographs[:2], SETTINGS)
     assert RANDOM in result.changed
     assert ADVERSARIAL not in result.changed
+    assert torch.equal(result.kept(), result.kept(RANDOM))
+    with pytest.raises(InputError, match="light=adversarial"):
+        result.kept(ADVERSARIAL)
 
 
 def test_photographs_of_another_size_are_an_error(photographs):
