@@ -198,7 +198,7 @@ class DescentResult:
 
         Args:
             rows: Row of each restarted example in this result, shape (A,).
-                None of these examples has succeeded before.
+                None of these examples has succeeded before with sensor noise.
             restart: Result of the restart of these A examples.
         """
         is_success = restart.success
@@ -247,8 +247,9 @@ class Descent:
                 shape (A,).
             start: First initial values, shape (A, D).
             restarts: Further initial values, each of shape (A, D). They are
-                used for the examples that have not succeeded. They are not used
-                if their share of the queries is less than one evaluation.
+                used for the examples that have not succeeded, or whose success
+                does not survive sensor noise. They are not used if their share
+                of the queries is less than one evaluation.
 
         Returns:
             Result of the A examples.
@@ -257,14 +258,43 @@ class Descent:
         limit = self.settings.query_limit_of_start
         if limit is not None and limit < self._passes_of_candidate(criterion):
             return result
+        # The last start, and the rows of its examples in the result.
+        latest = result
+        rows = torch.arange(len(examples), device=examples.device)
         for restart in restarts:
-            failed_rows = torch.nonzero(~result.success).squeeze(1)
-            if not len(failed_rows):
+            checked = self._successes_to_check(latest)
+            result.queries[rows[checked]] += NOISE_DRAWS * criterion.source.shape[1]
+            is_success = latest.success.clone()
+            with frozen_eval_mode(self.model):
+                is_success[checked] = self._is_robust_to_noise(
+                    latest.images[checked],
+                    examples[rows[checked]],
+                    criterion.select(rows[checked]),
+                )
+            rows = rows[~is_success]
+            if not len(rows):
                 break
-            failed_criterion = criterion.select(failed_rows)
-            restarted = self.run(failed_criterion, examples[failed_rows], restart[failed_rows])
-            result.add_restart(failed_rows, restarted)
+            latest = self.run(criterion.select(rows), examples[rows], restart[rows])
+            result.add_restart(rows, latest)
         return result
+
+    def _successes_to_check(self, result: DescentResult) -> Tensor:
+        """Return the rows of the successes of a start that must also survive sensor noise.
+
+        A success whose start has too few queries left for the noisy images counts without them.
+
+        Args:
+            result: Result of one start.
+
+        Returns:
+            Indices of rows. Empty if there is no sensor noise.
+        """
+        is_checked = result.success & bool(self.settings.sensor_noise)
+        limit = self.settings.query_limit_of_start
+        if limit is not None:
+            needed = NOISE_DRAWS * result.images.shape[1]
+            is_checked &= result.queries + needed <= limit
+        return is_checked.nonzero().squeeze(1)
 
     @torch.enable_grad()
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:

@@ -518,7 +518,7 @@ def restarted() -> Restarted:
     ball = StepSettings("linf", 0.5)
     network = Linear(WEIGHT)
     criterion = Criterion(torch.arange(40)[:, None] % 2)
-    settings = settings_of(2)
+    settings = settings_of(2, sensor_noise=0.0)
     starts = [sample(ball, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, "sign", 0.1, ball)
     result = descend(network, problem, criterion, settings, restarts=starts)

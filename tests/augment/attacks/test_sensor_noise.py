@@ -198,6 +198,29 @@ def small_attack(attacked, parameter: str = "lighting", **settings) -> AttackRes
     return attacked(steps, scene, nervous(threshold), **options, **settings)
 
 
+def dark_center(images: Tensor) -> Tensor:
+    """Return logits that prefer class 1 if the red of the center is below 0.61."""
+    brightness = 60 * (images[:, 0, SIZE // 2, SIZE // 2] - 0.61)
+    return torch.stack([brightness, 0 * brightness], dim=1)
+
+
+@pytest.mark.parametrize("seed", [1, 3, 6, 7])
+def test_restarts_go_on_with_successes_that_do_not_survive_noise(seed):
+    """The first start ends just below the threshold, where noise undoes the success."""
+    scene = augment.build_scene([("solid:orange", 0)], SIZE, rasterizer="numpy")
+
+    def run(**options) -> AttackResult:
+        lighting = augment.StepSettings("l2", 1.0, step_size=0.004)
+        settings = augment.AttackSettings(lighting=lighting, max_steps=50, margin=0.0, **options)
+        return augment.attack(dark_center, scene, settings=settings, seed=seed)
+
+    first = run(sensor_noise=6.0)
+    assert first.success_without_noise.all()
+    assert not first.success.any()
+    assert run(sensor_noise=6.0, restarts=30).success.all()
+    assert torch.equal(run(sensor_noise=0.0, restarts=30).steps, first.steps)
+
+
 def test_noise_changes_neither_the_descent_nor_any_other_random_number(attacked):
     torch.manual_seed(5)
     without = small_attack(attacked)
