@@ -218,6 +218,11 @@ def _as_numpy(values: Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
 
 
+def _exact_numpy(values: Tensor) -> np.ndarray:
+    """Convert a tensor on the CPU to an array. NumPy has no bfloat16, which becomes float32."""
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+
+
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     """Write the files of an adversary: those that `reload` reads, and a scene for Mitsuba.
 
@@ -240,7 +245,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     local_light_names = [basis.name for basis, _ in local_lights]
     background = _write_background(adversary.background, folder)
     if adversary.pixels is not None:
-        write_numbers(folder / PIXELS, adversary.pixels.numpy())
+        write_numbers(folder / PIXELS, _exact_numpy(adversary.pixels))
     _write_views(adversary.images_in_views_before, folder, BEFORE)
     _write_views(adversary.images_in_views, folder, AFTER)
     description = _describe(adversary, local_light_names, background)
@@ -347,7 +352,7 @@ def _write_views(images: Tensor, folder: Path, name: str) -> None:
         folder: Folder of the adversary.
         name: NAME, such as "before".
     """
-    write_numbers(folder / f"{name}.npy", images.numpy())
+    write_numbers(folder / f"{name}.npy", _exact_numpy(images))
     for view, image in enumerate(to_bytes(images)):
         pixels = image.permute(1, 2, 0).numpy()
         write_image(folder / f"{name}_{view}.png", Image.fromarray(pixels))

@@ -58,7 +58,8 @@ def _show(axes: Axes, image: Tensor, title: str) -> None:
         image: Image, shape (3, size, size).
         title: The title.
     """
-    pixels = image.permute(1, 2, 0).clamp(0, 1).numpy()
+    # NumPy has no bfloat16.
+    pixels = image.permute(1, 2, 0).clamp(0, 1).float().numpy()
     axes.imshow(pixels, interpolation="nearest")
     axes.set_title(title, fontsize=9)
     axes.axis("off")
@@ -92,8 +93,8 @@ def _draw_probabilities(axes: Axes, before: Tensor, after: Tensor, classes: Sequ
     names = [classes[index] for index in ranked.tolist()]
     above = [row + 0.2 for row in range(shown_count)]
     below = [row - 0.2 for row in range(shown_count)]
-    axes.barh(above, before[ranked].numpy(), 0.4, color=BEFORE_COLOR, label="before")
-    axes.barh(below, after[ranked].numpy(), 0.4, color=AFTER_COLOR, label="after")
+    axes.barh(above, before[ranked].float().numpy(), 0.4, color=BEFORE_COLOR, label="before")
+    axes.barh(below, after[ranked].float().numpy(), 0.4, color=AFTER_COLOR, label="after")
     axes.set_yticks(range(shown_count), names, fontsize=8)
     axes.set_xlim(0, 1)
     axes.set_xlabel("probability", fontsize=8)

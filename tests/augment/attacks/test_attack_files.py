@@ -69,6 +69,18 @@ def test_each_example_has_a_line_with_the_numbers_of_its_descent(saved):
         assert line["largest_change"]["lighting"] > 0
 
 
+@pytest.mark.parametrize("parameter", ["lighting", "pixels"])
+def test_an_attack_in_bfloat16_is_drawn_and_saved_exactly(attacked, tmp_path, parameter):
+    light = load_light("grace").bfloat16()
+    result = attacked(parameter, {"light": light}, force=True, max_steps=1)
+    assert result.images.dtype == torch.bfloat16
+    result.plot()
+    augment.save(result, tmp_path)
+    saved = np.load(tmp_path / "example_000" / "after.npy")
+    assert np.array_equal(saved, result.images_in_views[0].double().numpy())
+    augment.reload(tmp_path / "example_000")
+
+
 def test_no_version_of_an_example_that_was_wrong_before_is_a_success(by_color, tmp_path):
     scene = augment.build_scene([("solid:orange", "sky")], 8)
     settings = augment.AttackSettings(lighting=augment.StepSettings(), max_steps=1)
