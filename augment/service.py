@@ -622,7 +622,7 @@ def _describe_scene(scene: Scene) -> list[object]:
         extent = item.mesh.vertices.std(axis=0)
         counts = (len(item.mesh.vertices), len(item.mesh.faces))
         scale = f"{item.albedo_scale:.3g}"
-        described.append((item.label, item.name, counts, _rounded(extent), scale))
+        described.append((str(item.label), item.name, counts, _rounded(extent), scale))
     for example in scene.examples:
         cameras = [_rounded(vars(camera.fixed()).values()) for camera in example.cameras]
         exposure = f"{example.exposure:.3g}"
