@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, overload
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,13 +27,13 @@ from renderer.errors import (
 )
 from renderer.geometry.mesh import Mesh, require_mesh
 from renderer.geometry.shapes import sphere
-from renderer.image import as_background, composite
+from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.shading.gloss import Gloss
-from renderer.surface.albedo import face_albedo, surface_albedo
+from renderer.surface.albedo import NO_TEXTURE, face_albedo, surface_albedo
 from renderer.transport.operator_stacks import TransferOperators
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.precomputed import build_transport
@@ -82,7 +83,7 @@ def render(
     """Render a mesh, differentiable with respect to light, vertices, albedo and gloss.
 
     Arguments can be NumPy arrays or lists instead of tensors. The images have the
-    dtype and the device of the light.
+    dtype and the device of the light. They are computed in float32 or float64.
 
     Gradients with respect to the vertices do not include visibility changes,
     unless `silhouettes` is True. Gradients with respect to vertices, albedo and
@@ -98,7 +99,8 @@ def render(
             image of shape (3, size, size), or an image for each camera.
         lights: Local lights, such as `nb.Lamps`. A light alone has full white
             power. A light can also be in a pair with its coefficients,
-            shape (light.size, 3). Local lights cast shadows, but do not bounce.
+            shape (light.size, 3). Local lights cast shadows, but do not bounce, so
+            `bounces` must be 0.
         vertices: Positions in world units, shape (N, 3). None uses the positions
             of the mesh.
         albedo: Linear albedo in [0, 1], shape (F, 3) for one color per face, or
@@ -145,7 +147,7 @@ def render(
     _require_gloss(gloss)
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     light = None if light is None else _as_light(light)
-    albedo = None if albedo is None else _as_albedo(albedo)
+    albedo = None if albedo is None else _as_albedo(albedo, mesh)
     vertices = None if vertices is None else as_tensor("vertices", vertices)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         shape = tuple(vertices.shape)
@@ -159,6 +161,10 @@ def render(
     like = torch.zeros(0) if light is None else light
     if light is None and local_lights:
         like = local_lights[0][1]
+    image_dtype = like.dtype
+    # Rounded to half precision, vertices would move by pixels.
+    like = like.to(torch.promote_types(image_dtype, torch.float32))
+    light = None if light is None else light.to(like)
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     is_moved = vertices is not None
@@ -175,10 +181,14 @@ def render(
         _choose(rasterizer),
         closed=moved_mesh.closed if is_moved else mesh.closed,
     )
-    backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
+    backgrounds = as_background(background, size, like)
+    if backgrounds.ndim > 3 and len(backgrounds) not in (1, len(views)):
+        raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {len(views)}")
+    backgrounds = backgrounds.expand(len(views), -1, -1, -1)
     # Object that computes bounces and shadows
     # of environment light. None without both.
-    transport = build_transport(moved_mesh, settings, albedo_scale, split.basis)
+    colored_mesh = moved_mesh if albedo is None else _recolored(moved_mesh, albedo, encoding)
+    transport = build_transport(colored_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
     for camera, view, view_background in zip(all_cameras, views, backgrounds, strict=True):
@@ -202,7 +212,7 @@ def render(
         )
         seen = shaded_view.pixel_radiance(camera, view_background.flatten(1))
         image = composite(seen.radiance, seen.coverage, seen.pixels, view_background, encoding)
-        images.append(image)
+        images.append(image.to(image_dtype))
     return images[0] if isinstance(cameras, Camera) else torch.stack(images)
 
 
@@ -446,17 +456,19 @@ def _as_light(light: object) -> Tensor:
     return coefficients
 
 
-def _as_albedo(albedo: object) -> Tensor:
-    """Convert the argument `albedo` to a tensor, and check that its values are in [0, 1].
+def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
+    """Convert the argument `albedo` to a tensor, and check its shape and its values.
 
     Args:
         albedo: Linear albedo as a tensor, an array or a list.
+        mesh: Mesh that gets the albedo.
 
     Returns:
         Linear albedo.
 
     Raises:
-        InputError: If a value is NaN or not in [0, 1].
+        InputError: If the shape does not fit the mesh, or if a value is NaN or
+            not in [0, 1].
     """
     values = as_tensor("albedo", albedo)
     require_bounded(albedo=values)
@@ -466,7 +478,40 @@ def _as_albedo(albedo: object) -> Tensor:
             f"albedo has values from {extremes}: give values from 0 to 1, and set albedo_scale "
             "for brighter surfaces"
         )
+    is_texture = values.ndim == 3 and values.shape[2] == 3 and len(mesh.textures) == 1
+    if values.shape != mesh.faces.shape and not is_texture:
+        raise InputError(
+            f"albedo has shape {tuple(values.shape)}, which does not fit the mesh: give one color "
+            f"per face, {tuple(mesh.faces.shape)}, or a texture (H, W, 3) if the mesh has one "
+            "texture"
+        )
     return values
+
+
+def _recolored(mesh: Mesh, albedo: Tensor, encoding: str) -> Mesh:
+    """Return a matte mesh with a given albedo, off which light bounces.
+
+    Args:
+        mesh: Mesh with F faces.
+        albedo: Linear albedo, shape (F, 3) for one color per face, or
+            (height, width, 3) for the only texture. The texture is rounded to 8
+            bits, which the mean over the patches of a surface evens out.
+        encoding: Encoding of the colors of the mesh, "linear" or "srgb".
+    """
+    colors = encode(albedo.detach().cpu().double(), encoding).numpy()
+    if albedo.ndim == 3:
+        texture = np.rint(255 * colors).astype(np.uint8)
+        return replace(mesh, textures=(texture,), gloss=None, gloss_textures=())
+    corner_colors = colors[:, None].repeat(3, axis=1).astype(np.float32)
+    untextured = np.full_like(mesh.texture_ids, NO_TEXTURE)
+    return replace(
+        mesh,
+        corner_colors=corner_colors,
+        texture_ids=untextured,
+        textures=(),
+        gloss=None,
+        gloss_textures=(),
+    )
 
 
 def _sample_albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
@@ -482,17 +527,9 @@ def _sample_albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding:
 
     Returns:
         Linear albedo at the samples, shape (S, 3).
-
-    Raises:
-        InputError: If the albedo has a wrong shape.
     """
     if albedo is None:
         return surface_albedo(mesh, view, encoding)
     if albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
-    if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
-        return surface_albedo(mesh, view, encoding, [albedo])
-    raise InputError(
-        f"albedo has shape {tuple(albedo.shape)}, which does not fit the mesh: give one color per "
-        f"face, {tuple(mesh.faces.shape)}, or a texture (H, W, 3) if the mesh has one texture"
-    )
+    return surface_albedo(mesh, view, encoding, [albedo])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import renderer
 from renderer.errors import InputError
-from renderer.image import as_background, encode
+from renderer.image import as_background, decode, encode
 from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
@@ -153,6 +153,52 @@ def test_an_albedo_image_replaces_the_texture_of_the_mesh(stone, light):
     albedo = torch.from_numpy(texture).double() / 255
     found = renderer.render(black, CAMERAS, light, albedo=albedo, **SMALL)
     torch.testing.assert_close(found, expected, rtol=0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_light_bounces_off_a_given_albedo(light, encoding):
+    cup = renderer.solid("cup")
+    colors = np.random.default_rng(3).integers(0, 256, (len(cup.faces), 3)) / 255
+    options = {**SMALL, "bounces": 2, "encoding": encoding}
+    painted = replace(cup, corner_colors=np.float32(colors)[:, None].repeat(3, 1))
+    expected = renderer.render(painted, CAMERAS, light, **options)
+    albedo = decode(torch.from_numpy(np.float32(colors)).double(), encoding)
+    found = renderer.render(cup, CAMERAS, light, albedo=albedo, **options)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+def test_light_bounces_off_a_given_texture(light):
+    cup = renderer.solid("cup")
+    rng = np.random.default_rng(4)
+    texture = rng.integers(0, 256, (4, 5, 3)).astype(np.uint8)
+    textured = replace(
+        cup,
+        corner_uvs=rng.random((len(cup.faces), 3, 2)).astype(np.float32),
+        texture_ids=np.zeros(len(cup.faces), dtype=np.int32),
+        textures=(texture,),
+    )
+    expected = renderer.render(textured, CAMERAS, light, bounces=2, **SMALL)
+    black = replace(textured, textures=(np.zeros_like(texture),))
+    albedo = torch.from_numpy(texture).double() / 255
+    found = renderer.render(black, CAMERAS, light, albedo=albedo, bounces=2, **SMALL)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+def test_light_in_bfloat16_does_not_move_silhouettes(light):
+    apple = renderer.solid("apple")
+    camera = renderer.OrthographicCamera(60.0, 20.0, 2.4)
+    options = {"size": 64, "background": 0.0}
+    expected = renderer.render(apple, camera, light.float(), **options)
+    found = renderer.render(apple, camera, light.bfloat16(), **options)
+    assert found.dtype == torch.bfloat16
+    # Light and image values in bfloat16 have 8 bits.
+    torch.testing.assert_close(found.float(), expected, rtol=0, atol=0.03)
+
+
+def test_the_number_of_backgrounds_is_that_of_the_cameras(stone, light):
+    options = {**SMALL, "background": torch.zeros(2, 3, 9, 9)}
+    with pytest.raises(InputError, match="backgrounds"):
+        renderer.render(stone, CAMERAS, light, **options)
 
 
 def views_of(background: Tensor) -> Tensor:
