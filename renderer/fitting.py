@@ -109,6 +109,8 @@ FINAL_GRID = 5
 # background in the other hundredth of the pixel can be brighter
 # than the object, for example in the blue channel of a banana.
 WHOLE_PIXEL = 0.999
+# The bounding box of a mask contains the pixels that it covers by more than this.
+HALF_PIXEL = 0.5
 # A pixel on the border of the object gets the mean color of the pixels that the
 # object covers completely and that are at most this many rows and columns away.
 BORDER = 2
@@ -403,7 +405,8 @@ def fit_scene(
 
     Raises:
         InputError: If the photograph or the mask has a wrong shape, or if the
-            mask covers fewer than `MIN_COVERED_PIXELS` pixels.
+            mask covers fewer than `MIN_COVERED_PIXELS` pixels, or no pixel by
+            more than `HALF_PIXEL`.
 
     Example:
         >>> import norm_balls as nb
@@ -431,6 +434,11 @@ def fit_scene(
         raise InputError(
             f"the mask covers {covered_pixels:.0f} pixels of {size} × {size}, but at least "
             f"{MIN_COVERED_PIXELS} are needed: give a mask that shows the object"
+        )
+    if mask.max() <= HALF_PIXEL:
+        raise InputError(
+            f"the mask covers no pixel by more than {HALF_PIXEL}: give a mask with values in "
+            "[0, 1], 1 where the object is"
         )
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
@@ -1035,8 +1043,8 @@ def _mask_box(mask: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
         to 1, with x to the right and y up, shape (2,) each.
     """
     size = len(mask)
-    rows = np.flatnonzero((mask > 0.5).any(1).numpy())
-    columns = np.flatnonzero((mask > 0.5).any(0).numpy())
+    rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
+    columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())
     left = 2 * columns[0] / size - 1
     right = 2 * (columns[-1] + 1) / size - 1
     bottom = 1 - 2 * (rows[-1] + 1) / size

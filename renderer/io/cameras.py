@@ -26,6 +26,9 @@ TRANSFORMS = "transforms.json"
 # COLMAP's camera models without lens
 # distortion, with their numbers of parameters.
 COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
+# Camera models of nerfstudio that are perspective. Parameters of lens distortion, which
+# they also have, are checked separately.
+PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 # Names of the parameters of lens distortion in transforms.json.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 # Advice at the end of errors about lens distortion.
@@ -263,14 +266,20 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
         - the width and the height of the image in pixels.
 
     Raises:
-        InputError: If the camera has distortion.
+        InputError: If the camera is not perspective or has distortion, or if
+            the image size is missing.
     """
+    model = entries.get("camera_model", "PINHOLE")
+    if model not in PERSPECTIVE:
+        raise InputError(f"camera_model={model} is not supported: {UNDISTORT}")
     distortion_keys = [name for name in DISTORTION if entries.get(name)]
     if distortion_keys:
         raise InputError(
             f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
             f"supported: {UNDISTORT}"
         )
+    if "w" not in entries and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
+        raise InputError("the focal length is in pixels, but the image size w and h is missing")
     # A file with square images may have a field of view,
     # but no image size. The focal length and the principal
     # point are then computed for an image of one pixel.

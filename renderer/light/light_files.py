@@ -82,7 +82,7 @@ def save_light(
     try:
         atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
         if picture is not None:
-            image = Image.fromarray(to_bytes(picture).numpy())
+            image = Image.fromarray(to_bytes(picture.clamp(0, 1)).numpy())
             write_image(path.with_suffix(".png"), image)
     except OSError as error:
         raise InputError(f"light {path} cannot be written: {error}") from error

@@ -234,7 +234,8 @@ def test_no_other_nonnegative_light_solves_a_quadratic_program_better(program):
     assert slopes.min() > -1e-6 * slopes.abs().max()
 
 
-def test_a_mask_of_nothing_is_refused():
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_a_mask_of_nothing_is_refused(share):
     mesh = renderer.normalize(renderer.solid("apple"))
     with pytest.raises(InputError, match="mask"):
-        fit_scene(torch.zeros(3, 32, 32), torch.zeros(32, 32), mesh)
+        fit_scene(torch.zeros(3, 32, 32), torch.full((32, 32), share), mesh)

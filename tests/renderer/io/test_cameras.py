@@ -95,6 +95,22 @@ def test_distorted_cameras_are_refused(tmp_path):
         renderer.load_cameras(tmp_path / "transforms.json")
 
 
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "EQUIRECTANGULAR"])
+def test_cameras_that_are_not_perspective_are_refused(tmp_path, model):
+    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, camera_model=model)
+    with pytest.raises(InputError, match=model):
+        renderer.load_cameras(tmp_path / "transforms.json")
+
+
+def test_a_focal_length_in_pixels_needs_the_image_size(tmp_path):
+    path = tmp_path / "transforms.json"
+    write_transforms(path, fl_x=FOCAL_X)
+    scene = json.loads(path.read_text())
+    path.write_text(json.dumps({key: scene[key] for key in scene if key not in ("w", "h")}))
+    with pytest.raises(InputError, match="image size"):
+        renderer.load_cameras(path)
+
+
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"frames": []}', '{"frames": [{}]}'])
 def test_damaged_transforms_are_refused(tmp_path, content):
     path = tmp_path / "transforms.json"

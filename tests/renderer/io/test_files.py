@@ -160,3 +160,12 @@ def test_a_mesh_is_exported_and_loaded_by_either_type_of_path(tmp_path, path_typ
     mesh = renderer.solid("orange")
     renderer.export_mesh(mesh, path)
     assert len(renderer.load_mesh(path).faces) == len(mesh.faces)
+
+
+def test_coefficients_beyond_the_power_of_a_projector_are_white_in_the_image(tmp_path):
+    projector = Projector(4, power=2.0)
+    coefficients = torch.full((projector.size, 3), 2.1)
+    coefficients[0] = -0.1
+    renderer.save_light(tmp_path / "light.json", coefficients, projector)
+    values = np.unique(np.asarray(Image.open(tmp_path / "light.png")))
+    assert values.tolist() == [0, 255]
