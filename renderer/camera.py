@@ -55,7 +55,9 @@ class Camera(ABC):
     The camera lies at a polar angle from +z and at an azimuth from +x toward
     +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
     are differentiable with respect to fields that are tensors. Derivatives with
-    respect to an angle are per degree.
+    respect to an angle are per degree. They include moving outlines only if
+    `nb.render` gets `silhouettes=True`, and no change of highlights with the
+    direction of view.
 
     Attributes:
         polar: Polar angle in degrees, within two turns.

@@ -72,8 +72,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     the vertex or face colors, as far as the file has them. Without any of them,
     the color is white. Alpha, other material properties and the wrap mode of
     textures are ignored. glTF stores all colors except textures as linear values.
-    They are sRGB-encoded here. If a glTF file has a skin, the mesh gets the pose
-    and the joints of the file.
+    trimesh rounds them to 8 bits, and they are sRGB-encoded here. If a glTF file
+    has a skin, the mesh gets the pose and the joints of the file.
 
     Args:
         path: A .glb, .gltf, .obj, .ply or .stl file, or another format of
