@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache
+from functools import cache, wraps
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -66,6 +66,23 @@ def cache_tensors(function: Callable[..., Constant]) -> Callable[..., Constant]:
         Function with a cache.
     """
     return cache(torch.inference_mode(False)(function))
+
+
+def _copy_result(function: Callable[[int], Tensor]) -> Callable[[int], Tensor]:
+    """Decorate a function with a cache, so that changes of a result do not reach the cache.
+
+    Args:
+        function: Function that returns a cached tensor.
+
+    Returns:
+        Function that returns a copy of the tensor.
+    """
+
+    @wraps(function)
+    def copied(degree: int) -> Tensor:
+        return function(degree).clone()
+
+    return copied
 
 
 def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
@@ -390,6 +407,7 @@ def monomials(vectors: Tensor, degree: int) -> Tensor:
     return values
 
 
+@_copy_result
 @cache_tensors
 def bands(degree: int) -> Int[Tensor, " coefficients"]:
     """Return the band l of each SH coefficient up to a degree: 0, 1, 1, 1, 2, ...
@@ -404,6 +422,7 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
+@_copy_result
 @cache_tensors
 def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """Compute the factor A_l of each SH coefficient of a light in the irradiance.
@@ -428,6 +447,7 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     return torch.tensor(factors, dtype=torch.float64)[bands(degree)]
 
 
+@_copy_result
 @cache_tensors
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Return the indices of the SH coefficients that change the irradiance of a diffuse surface.

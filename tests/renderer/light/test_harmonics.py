@@ -13,6 +13,7 @@ from scipy.special import eval_legendre, spherical_in
 from renderer.errors import InputError
 from renderer.light.harmonics import (
     DIFFUSE_DEGREE,
+    bands,
     basis,
     lambertian_factors,
     nonzero_coefficients,
@@ -145,3 +146,11 @@ def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(
 def test_degrees_out_of_range_are_refused(degree):
     with pytest.raises(InputError, match=r"^degree"):
         basis(random_directions(1), degree)
+
+
+@pytest.mark.parametrize("function", [bands, lambertian_factors, nonzero_coefficients])
+def test_changes_of_a_result_do_not_reach_later_results(function):
+    first = function(6)
+    expected = first.clone()
+    first += 1
+    assert torch.equal(function(6), expected)
