@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import (
@@ -55,9 +56,9 @@ class Camera(ABC):
     The camera lies at a polar angle from +z and at an azimuth from +x toward
     +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
     are differentiable with respect to fields that are tensors. Derivatives with
-    respect to an angle are per degree. They include moving outlines only if
-    `nb.render` gets `silhouettes=True`, and no change of highlights with the
-    direction of view.
+    respect to an angle are per degree. They include moving outlines and
+    changes of highlights with the direction of view only if `nb.render` gets
+    `silhouettes=True`.
 
     Attributes:
         polar: Polar angle in degrees, within two turns.
@@ -259,6 +260,24 @@ class Camera(ABC):
         # This is the position of an orthographic
         # camera. `PerspectiveCamera` overrides it.
         return np.append(self.axes()[2], 0.0)
+
+    def differentiable_eye(self) -> Tensor:
+        """Compute `eye` differentiably with respect to fields of the camera that are tensors.
+
+        Returns:
+            Position of the camera (x, y, z, w), float64, shape (4,).
+        """
+        # Camera coordinates of the origin and of the
+        # unit vectors give the axes of the camera.
+        origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
+        coordinates = self._camera_coordinates(origin_and_units)
+        origin = coordinates[:, 0]
+        axes = coordinates[:, 1:] - origin[:, None]
+        if not isinstance(self, PerspectiveCamera):
+            return F.pad(axes[2], (0, 1))
+        offsets = [-self.right, -self.up, self.distance]
+        position = torch.stack([_as_tensor(offset, origin) for offset in offsets])
+        return F.pad((position - origin) @ axes, (0, 1), value=1.0)
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:

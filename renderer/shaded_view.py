@@ -7,7 +7,7 @@ sample is covered if it shows the shape.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import NamedTuple
 
@@ -213,7 +213,7 @@ class ShadedView:
         fragments = self.fragments
         # Each sample becomes a pixel of a finer
         # image, so that it is shaded alone.
-        finer_fragments = fragments.by_sample()
+        finer_fragments = replace(fragments.by_sample(), camera=camera)
         summands = [
             self._environment_radiance(finer_fragments),
             *self._lamp_radiances(finer_fragments),

@@ -109,7 +109,9 @@ class Fragments:
         """
         if self.camera is None:
             return torch.zeros(4)
-        return torch.from_numpy(self.camera.eye())
+        if self.camera.fixed() is self.camera:
+            return torch.from_numpy(self.camera.eye())
+        return self.camera.differentiable_eye()
 
     @cached_property
     def barycentric(self) -> Tensor:
