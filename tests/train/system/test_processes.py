@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -216,10 +217,11 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     with subprocess.Popen([*start, *overrides], cwd=tmp_path, env=environment, **pipes) as first:
-        for line in first.stdout:
-            if line.startswith("epoch 1/"):
-                first.terminate()
-                break
+        # The first epoch has ended when its metrics are written.
+        while not any(file.read_text() for file in tmp_path.glob("runs/*/*/metrics.jsonl")):
+            assert first.poll() is None
+            time.sleep(0.1)
+        first.terminate()
         (advice,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
     assert first.returncode != 0
     command = shlex.split(advice.partition("to go on: ")[2])
