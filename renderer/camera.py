@@ -267,17 +267,23 @@ class Camera(ABC):
         Returns:
             Position of the camera (x, y, z, w), float64, shape (4,).
         """
+        axes, _ = self._differentiable_axes()
+        return F.pad(axes[2], (0, 1))
+
+    def _differentiable_axes(self) -> tuple[Tensor, Tensor]:
+        """Compute the axes of the camera differentiably with respect to its fields.
+
+        Returns:
+            A tuple of
+            - the axes, one in each row, float64, shape (3, 3);
+            - the origin of the world in camera coordinates, shape (3,).
+        """
         # Camera coordinates of the origin and of the
         # unit vectors give the axes of the camera.
         origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
         coordinates = self._camera_coordinates(origin_and_units)
         origin = coordinates[:, 0]
-        axes = coordinates[:, 1:] - origin[:, None]
-        if not isinstance(self, PerspectiveCamera):
-            return F.pad(axes[2], (0, 1))
-        offsets = [-self.right, -self.up, self.distance]
-        position = torch.stack([_as_tensor(offset, origin) for offset in offsets])
-        return F.pad((position - origin) @ axes, (0, 1), value=1.0)
+        return coordinates[:, 1:] - origin[:, None], origin
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -453,6 +459,18 @@ class PerspectiveCamera(Camera):
     def eye(self) -> np.ndarray:
         """Return the position of the camera as (x, y, z, 1), float64, shape (4,)."""
         return self.pose()[:, 3]
+
+    def differentiable_eye(self) -> Tensor:
+        """Compute `eye` differentiably with respect to fields of the camera that are tensors.
+
+        Returns:
+            Position of the camera (x, y, z, 1), float64, shape (4,).
+        """
+        axes, origin = self._differentiable_axes()
+        # Camera coordinates relative to the pivot, as in `pose`.
+        offsets = [-self.right, -self.up, self.distance]
+        position = torch.stack([_as_tensor(offset, origin) for offset in offsets])
+        return F.pad((position - origin) @ axes, (0, 1), value=1.0)
 
     @property
     def angle(self) -> float:

@@ -278,7 +278,7 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
             f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
             f"supported: {UNDISTORT}"
         )
-    if "w" not in entries and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
+    if not {"w", "h"} <= entries.keys() and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
         raise InputError("the focal length is in pixels, but the image size w and h is missing")
     # A file with square images may have a field of view,
     # but no image size. The focal length and the principal

@@ -16,6 +16,7 @@ import trimesh
 from renderer.camera import (
     OrthographicCamera,
     PerspectiveCamera,
+    PinholeCamera,
     orbit_cameras,
 )
 from renderer.errors import InputError
@@ -38,6 +39,9 @@ PERSPECTIVE = [
     PerspectiveCamera(57.3, -114.6, 2.4, right=0.3, up=-0.2, distance=3.0),
     PerspectiveCamera(143.2, 40.1, 1.0, distance=1.8),
 ]
+SHIFTED_PINHOLE = PinholeCamera(
+    57.3, -114.6, 2.4, right=0.3, up=-0.2, distance=3.0, roll=20.0, center_x=0.4, center_z=0.1
+)
 CAMERA = PerspectiveCamera(51.6, 22.9, 2.4, right=0.2, up=-0.1, distance=1.9)
 POSITION = CAMERA.pose()[:3, 3]
 NO_NUMBA = find_spec("numba") is None
@@ -317,3 +321,9 @@ def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
     torch.testing.assert_close(found[is_inside], expected[is_inside], rtol=0, atol=1e-12)
     without_perspective = replace(view, depths=None).interpolate(uvs_of_corners)
     assert (without_perspective - expected)[is_inside].abs().max() > 0.05
+
+
+@pytest.mark.parametrize("camera", [*ORTHOGRAPHIC, *PERSPECTIVE, SHIFTED_PINHOLE])
+def test_the_differentiable_position_of_a_camera_is_its_position(camera):
+    found = camera.differentiable_eye().numpy()
+    np.testing.assert_allclose(found, camera.eye(), rtol=0, atol=1e-12)
