@@ -187,7 +187,9 @@ def render(
     backgrounds = backgrounds.expand(len(views), -1, -1, -1)
     # Object that computes bounces and shadows
     # of environment light. None without both.
-    colored_mesh = moved_mesh if albedo is None else _recolored(moved_mesh, albedo, encoding)
+    colored_mesh = moved_mesh
+    if albedo is not None and bounces:
+        colored_mesh = _recolored(moved_mesh, albedo, encoding)
     transport = build_transport(colored_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
