@@ -10,6 +10,7 @@ cost          Building an operator of one of 20 views, and a light step (image,
               clamp, gradient), for each kind of light paths and each size.
               Errors are against many rays and samples.
 local lights  The same for lamps and projectors. Errors are against 64² samples.
+samples       Errors of a cup by the number of samples, against 32² samples.
 mitsuba       The difference to a path tracer. "noise" is the standard error of
               the path tracer. "direct" is our error without light paths.
 
@@ -83,6 +84,9 @@ class Samples:
 
 COST_SAMPLES = Samples(measured=8, converged=16)
 LOCAL_LIGHT_SAMPLES = Samples(measured=2, converged=64)
+# Samples per side of a pixel in the table of errors by the number of samples.
+SAMPLES = (2, 4, 8, 16)
+CONVERGED_SAMPLES = 32
 
 
 @dataclass(frozen=True)
@@ -286,6 +290,25 @@ def measure_errors(operator: TransferOperator, exact: TransferOperator, light: T
         gradient_by_light(operator, light), gradient_by_light(exact, light)
     )
     return {"image_error": image_error, "gradient_error": gradient_error}
+
+
+def measure_errors_by_samples(mesh: Mesh, size: int) -> Iterator[Row]:
+    """Measure how the errors of direct light and of shadows fall as the samples increase.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the images.
+
+    Yields:
+        A row for each kind of light paths and each number of samples.
+    """
+    light = load_light("grace")
+    for name in ("direct", "shadows"):
+        [exact] = build(mesh, size, CONVERGED_SAMPLES, LIGHT_PATHS[name])
+        for samples in SAMPLES:
+            [operator] = build(mesh, size, samples, LIGHT_PATHS[name])
+            errors = measure_errors(operator, exact, light)
+            yield {"table": "samples", "light": name, "size": size, "samples": samples} | errors
 
 
 def radiance_image(operator: TransferOperator, light: Tensor) -> Tensor:
@@ -500,6 +523,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         measure_costs("cost", LIGHT_PATHS, COST_SAMPLES, load),
         measure_costs("local lights", LOCAL_LIGHTS, LOCAL_LIGHT_SAMPLES, load),
     ]
+    if not options.steps_only:
+        tables.append(measure_errors_by_samples(normalize(solid("cup", 0)), options.sizes[0]))
     if options.mitsuba:
         tables.append(compare_with_mitsuba(options.sizes[0]))
     record(chain.from_iterable(tables), options.csv)

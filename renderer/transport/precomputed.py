@@ -242,7 +242,7 @@ class Transport:
         # consist.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
-        self._directions = sphere(rays.DIRECTIONS)
+        self._directions = rays.directions_of_pixel(settings.samples)
         # Radiance of the sky: one row for each ray direction, one column for each SH
         # coefficient.
         self._sky = basis.radiance(self._directions)

@@ -1,10 +1,11 @@
 """Surface points at the samples of a view, and rays from these points among the faces of a mesh.
 
 The library Embree casts the rays (Wald et al. 2014). All pixels use the same
-directions, and each pixel divides the directions among its samples. The edges
-of shadows, of albedo and of the mesh are therefore averaged in the same way,
-and the cost of a pixel does not depend on its number of samples. Pixels that
-can see no other surface, such as all pixels of a convex mesh, cast no rays.
+directions, and each pixel divides the directions among its samples. No two
+samples of a pixel share a direction, and each sample has at least
+`DIRECTIONS_PER_SAMPLE` of them. The image therefore converges as the number of
+samples grows. Pixels that can see no other surface, such as all pixels of a
+convex mesh, cast no rays.
 
 Shapes use these letters: a mesh has V vertices and F faces. A view has S
 covered samples in P pixels, and these samples show G of the F faces.
@@ -31,9 +32,11 @@ from renderer.shading.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
 
-# Number of ray directions, which cover the whole sphere. A pixel of a flat surface
-# casts rays in about half of them, because the surface blocks the other half.
+# Smallest number of ray directions of a pixel, which cover the whole sphere. A pixel of a flat
+# surface casts rays in about half of them, because the surface blocks the other half.
 DIRECTIONS = 512
+# Smallest number of ray directions of each sample of a pixel.
+DIRECTIONS_PER_SAMPLE = 32
 # Rays start at this distance above the surface, as a fraction of the largest vertex
 # coordinate. Otherwise, a ray could hit the surface on which it starts, because Embree
 # computes in float32.
@@ -337,6 +340,18 @@ def _dot(vectors: Tensor, directions: Tensor) -> Tensor:
         Scalar products, shape (B, D).
     """
     return torch.einsum("bdi,di->bd", vectors, directions)
+
+
+def directions_of_pixel(samples: int) -> Tensor:
+    """Compute the directions of the rays of a pixel, which its samples divide among themselves.
+
+    Args:
+        samples: Number of samples along one side of a pixel.
+
+    Returns:
+        Unit vectors, float64, shape (D, 3).
+    """
+    return sphere(max(DIRECTIONS, DIRECTIONS_PER_SAMPLE * samples**2))
 
 
 @cache_tensors

@@ -6,7 +6,10 @@ import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
-from renderer.geometry.mesh import Mesh, concatenate
+from renderer.geometry.mesh import Mesh, concatenate, normalize
+from renderer.geometry.shapes import solid
+from renderer.light.presets import load_light
+from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.transport.rays import DIRECTIONS, Rays, Surface, sphere
 from renderer.visibility.fragments import build_fragments
@@ -56,3 +59,26 @@ def test_each_sample_casts_rays_in_directions_all_over_the_sphere():
     sums = torch.einsum("pds,di->psi", is_from_sample.double(), sphere(DIRECTIONS))
     means = sums / is_from_sample.sum(1)[..., None]
     assert means.norm(dim=-1).mean() < 0.4
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_shadows_converge_with_the_number_of_samples(normals):
+    """An image of 16 times as many pixels, averaged, is the reference.
+
+    Coverage converges as 1 / samples, because edges of the cup are the largest error.
+    """
+    cup = normalize(solid("cup"))
+    camera = OrthographicCamera(50.0, 30.0, 2.4)
+    light = 0.2 * load_light("grace")  # No pixel of the image is clamped.
+
+    def image(size: int, samples: int) -> Tensor:
+        options = {"normals": normals, "shadows": True, "encoding": "linear", "background": 0.0}
+        return render(cup, camera, light, size, samples=samples, **options)
+
+    expected = image(16 * 16, 2).view(3, 16, 16, 16, 16).mean((2, 4))
+    differences = [image(16, samples) - expected for samples in (4, 8, 16)]
+    errors = [float(difference.square().mean().sqrt()) for difference in differences]
+    brightness = float(expected.square().mean().sqrt())
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[2] < 0.7 * errors[1]
+    assert errors[2] < 0.01 * brightness
