@@ -1,14 +1,6 @@
-"""Measures free memory, and estimates the memory that renders, operators and attacks need."""
-
-from pathlib import Path
+"""Estimates the memory that renders, operators and attacks need."""
 
 import torch
-
-from renderer.errors import InputError
-
-MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine here.
-GROUP = Path("/sys/fs/cgroup")  # Linux writes the memory limit of a container here (cgroup v2).
-GIB = 2**30
 
 # An attack on the light keeps about so many numbers in memory for each coefficient of the light of
 # each example.
@@ -25,67 +17,6 @@ NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.
 OPERATOR_BYTES = 8
-
-
-def require_memory(name: str, needed: int, device: torch.device) -> None:
-    """Check that enough memory is free, because Linux would otherwise kill the process.
-
-    Args:
-        name: Objects that need the memory, in the plural, such as "40 renders".
-        needed: Number of bytes that they need.
-        device: Device on which they are stored.
-
-    Raises:
-        InputError: If fewer bytes are free.
-    """
-    if not has_memory(needed, device):
-        free = free_memory(device) or 0
-        raise InputError(
-            f"{name} need {needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free: "
-            "reduce their number or size",
-        )
-
-
-def has_memory(needed: int, device: torch.device) -> bool:
-    """Return whether a number of bytes is free on a device.
-
-    Args:
-        needed: Number of bytes.
-        device: Device on which they are needed.
-
-    Returns:
-        Whether enough bytes are free. True also if the amount of free memory is unknown.
-    """
-    free = free_memory(device)
-    return free is None or needed <= free
-
-
-def free_memory(device: torch.device) -> int | None:
-    """Return the free memory of a GPU, the machine or the container.
-
-    Args:
-        device: The device.
-
-    Returns:
-        The number of bytes. None if it is unknown.
-    """
-    if device.type == "cuda":
-        # torch reserves memory that it does not use yet. This memory is free for torch.
-        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return torch.cuda.mem_get_info(device)[0] + reserved
-    try:
-        lines = dict(line.split(":") for line in MEMORY.read_text().splitlines())
-        free = 1024 * int(lines["MemAvailable"].split()[0])
-    except (OSError, KeyError, ValueError):
-        return None
-    try:
-        limit = int((GROUP / "memory.max").read_text())
-        used = int((GROUP / "memory.current").read_text())
-    # Outside of a container, the files do not exist. A container without a limit has the text
-    # "max" in the first file, which is not a number.
-    except (OSError, ValueError):
-        return free
-    return min(free, limit - used)
 
 
 def attack_bytes(

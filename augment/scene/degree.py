@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from augment.memory import has_memory, operator_bytes
+from augment.memory import operator_bytes
 from augment.parameter_settings import MaterialSettings
 from augment.scene.materials import ROUGHNESS, initial_materials
 from augment.scene.objects import SceneObject
@@ -24,6 +24,7 @@ from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
 from renderer.light.highlights import highlight_error, required_degree
 from renderer.light.presets import load_light
+from renderer.memory import has_memory
 from renderer.settings import MIN_ROUGHNESS
 from renderer.shading.gloss import Gloss, smallest_roughness
 

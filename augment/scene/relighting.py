@@ -14,11 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from augment.memory import require_memory
 from augment.progress import progress
 from augment.scene.objects import SceneObject
 from renderer.camera import Camera
 from renderer.image import background_term
+from renderer.memory import require_memory
 from renderer.settings import ImageSettings
 from renderer.transport.operator_stacks import PIXELS_PER_STACK, OperatorStack, Rows
 from renderer.transport.operators import TransferOperator

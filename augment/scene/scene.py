@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from augment.memory import attack_bytes, require_memory
+from augment.memory import attack_bytes
 from augment.progress import progress
 from augment.scene.conditions import Conditions, Example
 from augment.scene.direct_rendering import DirectRenderer
@@ -23,6 +23,7 @@ from renderer.errors import InputError, describe, require_bounded
 from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
+from renderer.memory import require_memory
 from renderer.settings import ImageSettings
 from renderer.transport.operator_stacks import OperatorStack, ScatterLayers
 from renderer.transport.operators import build_operators

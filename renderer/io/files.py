@@ -127,3 +127,31 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def file_below(folder: Path, name: str) -> Path:
+    """Find the regular file that another file names by a relative path.
+
+    A file from a stranger must not read the user's other files. Its folder is
+    therefore never left, also not by a symbolic link.
+
+    Args:
+        folder: Folder of the file that has the name.
+        name: Relative path with / or \\ between its parts, such as
+            "textures/peel.png".
+
+    Raises:
+        ValueError: If the path leaves the folder, or if the file does not exist.
+    """
+    relative_path = name.replace("\\", "/")
+    root = folder.resolve()
+    path = Path(root, relative_path).resolve()
+    # A colon begins with a drive of Windows or with a scheme, such as "http:".
+    if not path.is_relative_to(root) or ":" in relative_path.partition("/")[0]:
+        raise ValueError(
+            f"it refers to {name}, which is not below its folder: put the file into {folder}"
+        )
+    # `is_file` is False for a named pipe. Reading a pipe might never end.
+    if not path.is_file():
+        raise ValueError(f"it refers to {name}, which does not exist in {folder}")
+    return path

@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import nn
 
-from augment import AugmentationService, AugmentationSettings, memory
-from augment.memory import require_memory
+from augment import AugmentationService, AugmentationSettings
 from augment.scene import scene
 from augment.scene.build import build_scene
 from augment.settings import CameraEffectSettings, TrainingAttackSettings
+from renderer import memory
 from renderer.errors import InputError
 from renderer.image import to_bytes
+from renderer.memory import require_memory
 
 CPU = torch.device("cpu")
 ORANGE = [("solid:orange", "orange")]

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import Label, class_index, nearest
-from augment.memory import require_memory
 from augment.progress import progress
 from renderer.errors import InputError, single_line
 from renderer.io.images import read_square
+from renderer.memory import require_memory
 from train import console
 from train.settings import label_names
 

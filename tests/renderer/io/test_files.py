@@ -16,7 +16,7 @@ from PIL import Image
 import renderer
 from renderer.errors import InputError
 from renderer.io.arrays import write_numbers
-from renderer.io.files import (
+from renderer.io.files import (, file_below
     TEMPORARY,
     atomic_write,
     remove_unfinished,
@@ -169,3 +169,19 @@ def test_coefficients_beyond_the_power_of_a_projector_are_white_in_the_image(tmp
     renderer.save_light(tmp_path / "light.json", coefficients, projector)
     values = np.unique(np.asarray(Image.open(tmp_path / "light.png")))
     assert values.tolist() == [0, 255]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../secret", "{outside}", "link", "folder/../../secret", "C:\\secret", "http://host/secret"],
+)
+def test_a_file_that_is_named_by_another_file_is_below_its_folder(tmp_path, name):
+    outside = tmp_path / "secret"
+    outside.write_text("secret")
+    folder = tmp_path / "mesh"
+    (folder / "folder").mkdir(parents=True)
+    (folder / "link").symlink_to(outside)
+    (folder / "folder" / "peel").write_text("peel")
+    assert file_below(folder, "folder\\peel").read_text() == "peel"
+    with pytest.raises(ValueError, match="secret|link"):
+        file_below(folder, name.format(outside=outside))
