@@ -16,9 +16,10 @@ from PIL import Image
 import renderer
 from renderer.errors import InputError
 from renderer.io.arrays import write_numbers
-from renderer.io.files import (, file_below
+from renderer.io.files import (
     TEMPORARY,
     atomic_write,
+    file_below,
     remove_unfinished,
     replacing,
 )
