@@ -14,6 +14,7 @@ Blender and Mitsuba.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +26,7 @@ from torch import Tensor
 from renderer.errors import MAX_MAGNITUDE, InputError, require_file
 from renderer.io.arrays import read_numbers, write_numbers
 from renderer.io.files import replacing
+from renderer.io.primaries import REC_709, to_rec709
 from renderer.light.harmonics import basis, equirectangular
 
 # Suffixes of the files that `write_map` writes.
@@ -110,10 +112,14 @@ def negative_fraction(radiance: Tensor) -> float:
 def read_map(path: str | Path) -> Tensor:
     """Read an environment map from a file.
 
-    The values of the file are taken as linear RGB radiance. An alpha channel is
-    dropped. A single gray channel is used for red, green and blue. If an .exr
-    file has layers, the layer without a name is read. If all layers have names,
-    the first layer with red, green and blue is read.
+    The values of the file are taken as linear RGB radiance. Other primaries than
+    those of Rec. 709 (`chromaticities` of .exr, PRIMARIES of .hdr) are converted.
+    The chromaticity of the light stays the same, without adaptation to another
+    white. Colors beyond Rec. 709 get channels of 0. The EXPOSURE and COLORCORR of
+    an .hdr file are divided out. An alpha channel is dropped. A single gray
+    channel is used for red, green and blue. If an .exr file has layers, the layer
+    without a name is read. If all layers have names, the first layer with red,
+    green and blue is read.
 
     Args:
         path: An .npy, .hdr or .exr file. The array of an .npy file has the
@@ -130,8 +136,12 @@ def read_map(path: str | Path) -> Tensor:
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
-        texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
-        radiance = texels[..., _color_channels(names)]
+        if path.suffix.lower() == ".npy":
+            texels, names = _read_array(path)
+            chromaticities: Sequence[float] = REC_709
+        else:
+            texels, names, chromaticities = _read_image(path)
+        radiance = _in_rec709(texels[..., _color_channels(names)], chromaticities)
     # NumPy and OpenImageIO raise many kinds of errors for a damaged file.
     except Exception as error:
         message = str(error).partition("\n")[0]
@@ -258,18 +268,20 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     return array, names
 
 
-def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
+def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:
     """Read an environment map from an .hdr or .exr file.
 
     Args:
         path: File to read.
 
     Returns:
-        The texels, shape (H, W, C), and the names of the C channels.
+        The texels, shape (H, W, C), the names of the C channels, and the
+        chromaticities of red, green, blue and white, 8 numbers.
 
     Raises:
         InputError: If the file cannot be read or has another format, or if the
             image is stored cropped, mirrored or rotated.
+        ValueError: If the header of an .hdr file is damaged.
     """
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
@@ -289,7 +301,75 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
             "the image is stored cropped, mirrored or rotated: save the whole image again, with "
             "its top row first"
         )
-    return texels, spec.channelnames
+    chromaticities = spec.getattribute("chromaticities") or REC_709
+    if image.file_format_name == "hdr":
+        factors, chromaticities = _radiance_header(path)
+        texels = texels / factors
+    return texels, spec.channelnames, chromaticities
+
+
+def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
+    """Read what the header of an .hdr file says about its values, which OpenImageIO ignores.
+
+    The manual of Radiance (File Formats, "Picture Files") says that EXPOSURE and
+    COLORCORR are cumulative factors of the pixels. Indented lines are of other
+    pictures. Without PRIMARIES, maps of others than Radiance are Rec. 709.
+
+    Args:
+        path: File that OpenImageIO has read.
+
+    Returns:
+        Factors of red, green and blue, float32, shape (3,), and the
+        chromaticities of red, green, blue and white, 8 numbers.
+
+    Raises:
+        ValueError: If the values are damaged, or encoded with a GAMMA.
+    """
+    factors = np.ones(3)
+    chromaticities: Sequence[float] = REC_709
+    with path.open("rb") as file:
+        for line in iter(file.readline, b""):
+            # An empty line ends the header.
+            if not line.strip():
+                break
+            key, _, value = line.decode("latin-1").partition("=")
+            if key in ("EXPOSURE", "COLORCORR"):
+                # One number is broadcast to three channels, and two raise an error.
+                factors *= np.array(value.split(), dtype=float)
+            elif key == "PRIMARIES":
+                chromaticities = [float(number) for number in value.split()]
+            elif key == "GAMMA" and float(value) != 1:
+                raise ValueError(f"GAMMA={value.strip()} is not linear: save linear radiance")
+    if not ((factors > 0) & (factors <= MAX_MAGNITUDE)).all():
+        raise ValueError(f"EXPOSURE and COLORCORR multiply the pixels by {factors.tolist()}")
+    return factors.astype(np.float32), chromaticities
+
+
+def _in_rec709(radiance: np.ndarray, chromaticities: Sequence[float]) -> np.ndarray:
+    """Convert radiance of any primaries to Rec. 709. A negative channel that this makes becomes 0.
+
+    Args:
+        radiance: Linear RGB radiance, float32, shape (H, W, 3).
+        chromaticities: CIE x and y of red, green, blue and white, 8 numbers.
+
+    Raises:
+        ValueError: If the chromaticities are no primaries.
+    """
+    matrix = to_rec709(chromaticities, adapt=False)
+    if matrix is None:
+        return radiance
+    # Infinite radiance gives NaN, which `read_map` refuses.
+    with np.errstate(invalid="ignore", over="ignore"):
+        converted: np.ndarray = radiance @ matrix.T.astype(np.float32)
+    is_beyond = (converted < 0) & (radiance >= 0).all(axis=-1, keepdims=True)
+    lost = -converted[is_beyond].sum() / max(np.abs(converted).sum(), np.finfo(np.float32).tiny)
+    if lost > NEGATIVE:
+        warnings.warn(
+            f"{lost:.2%} of the radiance of the environment map is of colors beyond Rec. 709: "
+            "their negative channels are set to 0",
+            stacklevel=2,
+        )
+    return np.where(is_beyond, 0, converted)
 
 
 def _to_rgbe_precision(radiance: Tensor) -> Tensor:

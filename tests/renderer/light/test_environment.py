@@ -122,13 +122,15 @@ def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], **attribut
     spec = OpenImageIO.ImageSpec(width, height, channels, "half")
     spec.channelnames = names
     for name, value in attributes.items():
-        if hasattr(spec, name):
+        if name == "chromaticities":
+            spec.attribute(name, "float[8]", value)
+        elif hasattr(spec, name):
             setattr(spec, name, value)
         else:
             spec.attribute(name, value)
     file = OpenImageIO.ImageOutput.create(str(path))
     assert file.open(str(path), spec)
-    assert file.write_image(texels.astype(np.float32))
+    assert file.write_image(np.ascontiguousarray(texels, np.float32))
     assert file.close()
 
 
@@ -158,6 +160,105 @@ def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, ex
     write_exr(tmp_path / "map.exr", texels, channel_names)
     found = read_map(tmp_path / "map.exr")
     np.testing.assert_array_equal(found, texels[..., expected_channels])
+
+
+# ACEScg: chromaticities, and the matrices of SMPTE ST 2065-1 and IEC 61966-2-1 to and
+# from XYZ. Their product keeps the chromaticity of each light.
+ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+ACESCG_TO_XYZ = np.array(
+    [
+        [0.6624542, 0.1340042, 0.1561877],
+        [0.2722287, 0.6740818, 0.0536895],
+        [-0.0055746, 0.0040607, 1.0103391],
+    ]
+)
+XYZ_TO_REC_709 = np.array(
+    [
+        [3.2404542, -1.5371385, -0.4985314],
+        [-0.9692660, 1.8760108, 0.0415560],
+        [0.0556434, -0.2040259, 1.0572252],
+    ]
+)
+ACESCG_TO_REC_709 = XYZ_TO_REC_709 @ ACESCG_TO_XYZ
+LIGHT = np.array([1, 0.5, 0.1])
+
+
+def write_hdr(path: Path, header: str, rgb: np.ndarray) -> Path:
+    """Write a map of 3 × 2 equal texels with additional lines in its header."""
+    exponent = math.ceil(math.log2(rgb.max())) + 1
+    texel = bytes([*np.round(rgb * 2.0 ** (8 - exponent)).astype(int), exponent + 128])
+    path.write_bytes(HDR_HEADER.replace(b"\n\n", f"\n{header}\n\n".encode(), 1) + 6 * texel)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["exr", "hdr"])
+def test_a_map_of_acescg_becomes_rec_709(tmp_path, suffix):
+    texel = np.linalg.solve(ACESCG_TO_REC_709, LIGHT)
+    path = tmp_path / f"map.{suffix}"
+    if suffix == "exr":
+        texels = np.broadcast_to(texel, (2, 3, 3))
+        write_exr(path, texels, ("R", "G", "B"), chromaticities=ACESCG)
+    else:
+        write_hdr(path, "PRIMARIES= " + " ".join(map(str, ACESCG)), texel)
+    torch.testing.assert_close(
+        read_map(path), torch.tensor(LIGHT).float().expand(2, 3, 3), rtol=0, atol=0.008
+    )
+
+
+def test_a_map_with_another_white_keeps_the_chromaticity_of_its_light(tmp_path):
+    """The white of Radiance's primaries has equal X, Y and Z."""
+    header = "PRIMARIES=0.640 0.330 0.290 0.600 0.150 0.060 0.333333 0.333333"
+    radiance = read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 1, 1])))
+    expected = torch.from_numpy(XYZ_TO_REC_709.sum(axis=1)).float()
+    torch.testing.assert_close(radiance, expected.expand(2, 3, 3), rtol=0, atol=1e-3)
+
+
+def test_colors_beyond_rec_709_have_no_negative_radiance_and_a_warning(tmp_path):
+    green = np.broadcast_to([0.0, 1.0, 0.0], (2, 3, 3))
+    write_exr(tmp_path / "map.exr", green, ("R", "G", "B"), chromaticities=ACESCG)
+    with pytest.warns(UserWarning, match=r"beyond Rec\. 709"):
+        radiance = read_map(tmp_path / "map.exr")
+    expected = torch.from_numpy(ACESCG_TO_REC_709[:, 1]).float().clamp(min=0)
+    torch.testing.assert_close(radiance, expected.expand(2, 3, 3), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("header", "factors"),
+    [
+        ("EXPOSURE=2", 2),
+        ("EXPOSURE= 2.0\nEXPOSURE=4", 8),
+        ("COLORCORR=1 2 4", [1, 2, 4]),
+        ("EXPOSURE=.5\nCOLORCORR= 1 2 4\nCOLORCORR=2 2 2", [1, 2, 4]),
+        ("\tEXPOSURE=2", 1),
+        ("GAMMA=1", 1),
+        ("PRIMARIES=.64 .33 .3 .6 .15 .06 .3127 .329", 1),
+    ],
+)
+def test_the_radiance_of_a_hdr_file_is_divided_by_all_factors_of_its_header(
+    tmp_path, header, factors
+):
+    """The factors are cumulative. Indented lines belong to other pictures."""
+    radiance = read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 0.5, 0.25])))
+    expected = np.array([1, 0.5, 0.25]) / factors
+    np.testing.assert_array_equal(radiance, np.broadcast_to(expected, (2, 3, 3)))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "GAMMA=2.2",
+        "EXPOSURE=0",
+        "EXPOSURE=nan",
+        "EXPOSURE=-1",
+        "EXPOSURE=bright",
+        "COLORCORR=1 2",
+        "PRIMARIES=0 0 0 0 0 0 0 0",
+        "PRIMARIES=.64 .33",
+    ],
+)
+def test_a_hdr_file_with_a_header_that_gives_no_radiance_is_refused(tmp_path, header):
+    with pytest.raises(InputError, match=r"map\.hdr cannot be read"):
+        read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 0.5, 0.25])))
 
 
 @pytest.mark.parametrize(
