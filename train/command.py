@@ -494,6 +494,14 @@ def _as_text(key: str, value: str) -> str:
         parsed = OverridesParser.create().parse_override(override).value()
     except HydraException:
         return f"{key}={quoted(value)}"
+    if isinstance(parsed, list) and not set("[]{}" + QUOTES) & set(value[1:-1]):
+        # Classes can be named true, null or 1.5. Hydra would read them as values.
+        members = zip(value[1:-1].split(","), parsed, strict=False)
+        texts = [
+            quoted(text.strip()) if member is None or isinstance(member, bool | float) else text
+            for text, member in members
+        ]
+        return f"{key}=[{','.join(texts)}]"
     is_changed = isinstance(parsed, str | int | float) and parsed != value
     return f"{key}={quoted(value)}" if is_changed else override
 

@@ -37,6 +37,10 @@ from train.settings import label_names
 PREDICTIONS = "predictions.csv"
 # Number of images for which the model computes logits in one call.
 BATCH = 256
+# Columns about the class that a photograph shows. The columns of a positive class begin with its
+# name, and no name can make them equal to these.
+TRUE_PROBABILITY = "probability_of_true"
+TRUE_RANK = "rank_of_true"
 # A PyTorch module, or a function, that maps images to logits.
 Model = Callable[[torch.Tensor], torch.Tensor]
 
@@ -326,10 +330,10 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
     """Write predictions to the table predictions.csv, which has a row for each photograph.
 
     The columns path, label, source, hard_negatives, mesh, predicted,
-    probability, true_probability and true_rank do not depend on the positive
-    class. For each positive class, such as orange, there are the columns
-    orange_probability, orange_rank and orange_log_odds. The cell of a value
-    that is None is empty.
+    probability, probability_of_true and rank_of_true do not depend on the
+    positive class. For each positive class, such as orange, there are the
+    columns orange_probability, orange_rank and orange_log_odds. The cell of a
+    value that is None is empty.
 
     Args:
         path: Path of the table.
@@ -363,8 +367,8 @@ def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
         "mesh": photograph.mesh,
         "predicted": predictions[0].predicted,
         "probability": predictions[0].probability,
-        "true_probability": predictions[0].true_probability,
-        "true_rank": predictions[0].true_rank,
+        TRUE_PROBABILITY: predictions[0].true_probability,
+        TRUE_RANK: predictions[0].true_rank,
     }
     for prediction in predictions:
         label = prediction.label
@@ -416,8 +420,14 @@ def _from_row(row: Mapping[str, str], label: str) -> Prediction:
         # Earlier versions of the library did not write the column "mesh".
         mesh=row.get("mesh") or None,
     )
-    true_probability = row["true_probability"]
-    true_rank = row["true_rank"]
+    if TRUE_RANK not in row:
+        # Earlier versions of the library wrote columns with these names, which also are the
+        # columns of a positive class "true".
+        if label == "true":
+            raise LookupError("an earlier version mixed up the columns of the class 'true'")
+        row = {**row, TRUE_PROBABILITY: row["true_probability"], TRUE_RANK: row["true_rank"]}
+    true_probability = row[TRUE_PROBABILITY]
+    true_rank = row[TRUE_RANK]
     return Prediction(
         photograph=photograph,
         label=label,

@@ -219,9 +219,11 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
-    curves = {"all": [overall]} if has_overall else {}
+    # A source or a label can have the name "all", too.
+    title = "all images" if "all" in known else "all"
+    curves = {title: [overall]} if has_overall else {}
     curves |= {name: [pair] for name, pair in known.items()}
-    bold = {"all": {"color": "black", "linewidth": 2.5, "zorder": 3}}
+    bold = {title: {"color": "black", "linewidth": 2.5, "zorder": 3}}
     draw_roc(axes, curves, bold)
     axes.set_title(f"ROC: {label}")
     axes.set_aspect("equal")

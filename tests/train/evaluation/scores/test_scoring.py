@@ -18,6 +18,7 @@ from train.evaluation.scores.metrics import AT_THRESHOLD, METRICS
 from train.evaluation.scores.predictions import (
     Prediction,
     Predictor,
+    rank_classes,
     read_predictions,
     write_predictions,
 )
@@ -596,6 +597,35 @@ PREDICTIONS = [
 def test_written_predictions_are_read_bit_by_bit(tmp_path):
     write_predictions(tmp_path / "a.csv", PREDICTIONS)
     assert read_predictions(tmp_path / "a.csv", "orange") == PREDICTIONS
+
+
+# Each name is, or begins or ends like, a column of predictions.csv, or needs quotes in it.
+AWKWARD_CLASSES = [
+    *("true", "True", "false", "label", "path", "predicted", "probability", "probability_of"),
+    *("rank", "of_true", "a,b", 'say "a"', "two\nlines", "", "true_probability", "null", "nan"),
+]
+
+
+@pytest.mark.parametrize("labels", [AWKWARD_CLASSES, AWKWARD_CLASSES[:1]])
+def test_columns_of_any_class_name_are_read_bit_by_bit(tmp_path, labels):
+    logits = torch.randn(5, len(AWKWARD_CLASSES), generator=torch.manual_seed(0))
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), AWKWARD_CLASSES[number], None)
+        for number in range(5)
+    ]
+    predictions = rank_classes(photographs, logits, AWKWARD_CLASSES, labels)
+    write_predictions(tmp_path / "a.csv", predictions)
+    assert read_predictions(tmp_path / "a.csv", labels) == predictions
+
+
+def test_predictions_of_an_earlier_version_are_read_but_not_those_of_its_class_true(tmp_path):
+    write_predictions(tmp_path / "a.csv", PREDICTIONS)
+    text = (tmp_path / "a.csv").read_text()
+    earlier = text.replace("probability_of_true", "true_probability")
+    (tmp_path / "a.csv").write_text(earlier.replace("rank_of_true", "true_rank"))
+    assert read_predictions(tmp_path / "a.csv", "orange") == PREDICTIONS
+    with pytest.raises(InputError, match="mixed up"):
+        read_predictions(tmp_path / "a.csv", "true")
 
 
 def test_predictions_of_another_class_are_refused(tmp_path):
