@@ -10,13 +10,14 @@ from train.training.run import Run
 
 
 def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:
-    """Make a run and load it. Without data, it loads those of the settings."""
+    """Make a run, load it and begin it. Without data, it loads those of the settings."""
     settings = with_label(settings)
     initial = load_initial(settings)
     if data is None:
         data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
     run.load()
+    run.begin()
     return run
 
 

@@ -470,7 +470,9 @@ class AuditSettings(ClassifierSettings):
 class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
-    runs: list[str] = setting(REQUIRED, "Folders of finished runs.")
+    runs: list[str] = setting(
+        REQUIRED, "Folders of finished runs and of sweeps. Folders below them count, too."
+    )
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=GROUPS)
     photographs: str = setting(

@@ -53,6 +53,7 @@ from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabele
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
+from train.report.report_page import PAGE
 from train.report.results import RESULTS, require_replaceable
 from train.runs.run_config import CONFIG, read_config, read_json, require_same, write_config
 from train.runs.run_lock import sole_writer
@@ -448,8 +449,14 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
     """
     if settings.overwrite:
         networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
+        (out / PAGE).unlink(missing_ok=True)
         for name in (*networks, renders.name):
-            shutil.rmtree(out / name, ignore_errors=True)
+            # A folder that exists counts as complete, so it loses its name first.
+            removed = out / f"{name}.part"
+            shutil.rmtree(removed, ignore_errors=True)
+            if (out / name).exists():
+                (out / name).rename(removed)
+            shutil.rmtree(removed, ignore_errors=True)
     elif (out / CONFIG).exists():
         require_same(out, settings, "out=", _may_change)
     write_config(out, settings, command=command_line("audit"))

@@ -5,7 +5,6 @@ be loaded again with reload=FOLDER.
 """
 
 import shlex
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
-from augment.attacks.attack_files import LINES, require_renderers, save
+from augment.attacks.attack_files import require_renderers, save
 from augment.attacks.checks import (
     check,
     require_transferable,
@@ -53,7 +52,7 @@ from train.report.attack_tables import (
     write_sweeps,
     write_transfers,
 )
-from train.report.results import require_replaceable
+from train.report.results import remove_attack, require_replaceable
 from train.runs.run_config import write_config
 from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_chosen, load_network
@@ -176,7 +175,7 @@ def run(settings: AttackExperimentSettings) -> None:
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
-        _remove_adversaries(out)
+        remove_attack(out)
         mesh_attacks = attacks(settings, classifier, device, adversary)
         outcomes, sweeps = _write_attacks(mesh_attacks, out, settings, targets)
         if not is_verbose():
@@ -334,26 +333,6 @@ def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
     for outcome in outcomes:
         lines += outcome.details
     return lines
-
-
-def _remove_adversaries(out: Path) -> None:
-    """Remove the files of an earlier pnb-attack from a folder.
-
-    Otherwise a report of this folder would show old and new adversaries.
-
-    Args:
-        out: Folder with a subfolder for the result of each mesh.
-    """
-    for lines in out.glob(f"*/{LINES}"):
-        for example in lines.parent.glob("example_*"):
-            if example.is_dir():
-                shutil.rmtree(example)
-            else:
-                example.unlink()
-        lines.unlink()
-        lines.with_name(TRANSFERS).unlink(missing_ok=True)
-    for name in (TABLE, FIGURE):
-        (out / name).unlink(missing_ok=True)
 
 
 def attacks(

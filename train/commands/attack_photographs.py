@@ -6,7 +6,7 @@ from renderer.errors import InputError
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings
 from train.evaluation.relit import MODELED, RELIT, attack_folder
-from train.report.results import require_replaceable
+from train.report.results import remove_attack, require_replaceable
 from train.runs.run_config import write_config
 from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_chosen
@@ -42,6 +42,7 @@ def run(settings: AttackExperimentSettings) -> None:
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
+        remove_attack(out)
         with keyed("photographs"):
             scores = attack_folder(
                 classifier,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from train.command_settings import CompareSettings
 from train.report.comparison import format_comparison, format_short_comparison
-from train.report.summary import summarize
+from train.report.summary import finished_runs
 from train.system.verbosity import is_verbose, shortened
 
 
@@ -20,7 +20,7 @@ def print_comparison(settings: CompareSettings) -> None:
     Raises:
         InputError: If a folder holds no finished training run.
     """
-    runs = [summarize(Path(run)) for run in settings.runs]
+    runs = finished_runs([Path(run) for run in settings.runs])
     options = (settings.exclude, settings.photographs, settings.by)
     if is_verbose():
         print(format_comparison(runs, *options))

@@ -23,7 +23,7 @@ from train import console
 from train.command import compose, program, read_settings
 from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import report_of
-from train.report.results import require_new_run
+from train.report.results import remove_run, require_new_run
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
 from train.runs.run_config import CONFIG, format_command, require_same_run, resume_config
@@ -120,6 +120,8 @@ def _train_on_photographs(
     if settings.train.resume and is_finished(first):
         require_same_run(first, on_photographs, finished=True)
     else:
+        if settings.overwrite and not settings.train.resume and distributed.rank() == 0:
+            remove_run(folder)
         # The folder of the main training has no recorded settings yet. To resume, the
         # user therefore has to give the whole command again.
         _train_in(first, on_photographs, command, shlex.split(command), folder)

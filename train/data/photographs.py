@@ -260,7 +260,7 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
-    all_paths = list(_files(folder))
+    all_paths = list(visible_files(folder))
     image_paths = sorted(path for path in all_paths if path.suffix.lower() in SUFFIXES)
     if not image_paths:
         raise InputError(
@@ -283,7 +283,7 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
         Sorted paths, relative to the folder.
     """
     own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
-    other_files = [path for path in _files(folder) if path not in own_files]
+    other_files = [path for path in visible_files(folder) if path not in own_files]
     return sorted(path for path in other_files if path.suffix.lower() not in SUFFIXES)
 
 
@@ -306,7 +306,7 @@ def is_hidden(name: str) -> bool:
     return name.startswith(".") or name == MACOS_FOLDER
 
 
-def _files(folder: Path) -> Iterator[PurePosixPath]:
+def visible_files(folder: Path) -> Iterator[PurePosixPath]:
     """Yield the paths of all files that are not hidden, relative to the folder.
 
     Symbolic links are followed. A link to a folder that contains the link is

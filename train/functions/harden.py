@@ -272,6 +272,7 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
         data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
     run.load()
+    run.begin()
     run.fit()
     run.score()
     run.export()

@@ -1,5 +1,6 @@
-"""Protect the results of earlier commands. Only `overwrite=true` lets a command replace them."""
+"""Protect or remove results of earlier commands. Only `overwrite=true` lets a command do so."""
 
+import shutil
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -12,18 +13,22 @@ from train.evaluation.relit import RELIT
 from train.evaluation.scores.predictions import PREDICTIONS
 from train.evaluation.scores.scoring import CONTACT_SHEET, SUMMARY
 from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
+from train.report.attack_tables import FIGURE, TABLE, TRANSFERS
 from train.report.report_page import PAGE
 from train.report.summary import is_finished
 from train.runs import checkpoint
 from train.runs.run_config import CONFIG, read_config
-from train.runs.run_log import METRICS
+from train.runs.run_lock import FAILURE
+from train.runs.run_log import BEFORE, METRICS, RENDERS
 from train.runs.saved_networks import PUBLISHED, WEIGHTS
+from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
 # Files that each command writes to its output folder, as patterns of `Path.glob`.
 # A command refuses a folder with one of these files.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
-OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
-OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
+# `remove_run` removes them in this order.
+OF_RUN = (METRICS, checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, WEIGHTS)
+OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE)
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
 OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
 OF_FIT = ("light.json", "background.png", "comparison.png")
@@ -107,3 +112,45 @@ def _is_of_training(folder: Path) -> bool:
     with suppress(InputError):
         return isinstance(read_config(folder / CONFIG).get("train"), Mapping)
     return False
+
+
+def remove_run(folder: Path) -> None:
+    """Remove the results of a training run and of its first training and baselines.
+
+    The metrics go first, without which no run counts as finished, and config.yaml goes last. If
+    the removal is stopped, what is left belongs to the run that config.yaml describes. The log
+    stays.
+
+    Args:
+        folder: Folder of the run.
+    """
+    files = [folder / name for name in (*OF_RUN, FAILURE, PAGE)]
+    files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
+    for file in files:
+        file.unlink(missing_ok=True)
+    for name in (RENDERS, BEFORE, KEPT_ASIDE):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    with suppress(InputError):
+        for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
+            if (folder / name / CONFIG).is_file():
+                remove_run(folder / name)
+    (folder / CONFIG).unlink(missing_ok=True)
+
+
+def remove_attack(out: Path) -> None:
+    """Remove the results of an earlier pnb-attack, so that no report shows them with new ones.
+
+    Args:
+        out: Folder with a subfolder for the result of each mesh, or with the
+            attack on photographs.
+    """
+    for name in (PAGE, CONFIG, RELIT, TABLE, FIGURE):
+        (out / name).unlink(missing_ok=True)
+    for lines in out.glob(f"*/{LINES}"):
+        for example in lines.parent.glob("example_*"):
+            if example.is_dir():
+                shutil.rmtree(example)
+            else:
+                example.unlink()
+        lines.with_name(TRANSFERS).unlink(missing_ok=True)
+        lines.unlink()

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from augment.attacks.attack_files import LINES
 from augment.settings import MODES
 from renderer.errors import InputError, single_line
+from train import console
 from train.evaluation.scores.metrics import (
     METRICS,
     AreaUnderCurve,
@@ -870,18 +871,19 @@ def find(folders: Sequence[Path]) -> Findings:
             attack.
     """
     # A dictionary has each folder once.
-    paths: dict[Path, None] = {}
-    for folder in folders:
+    paths: dict[Path, Path] = {}
+    for folder in map(published, folders):
         if not folder.is_dir():
             raise InputError(
                 f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks",
             )
-        paths.update(dict.fromkeys(_walk(folder)))
+        for path in _walk(folder):
+            paths.setdefault(path.resolve(), path)
     if not paths:
         names = ", ".join(map(str, folders))
         raise InputError(f"runs: {names} holds no run and no attack: give other folders")
     found = Findings()
-    for path in paths:
+    for path in paths.values():
         try:
             _add(found, path)
         except (InputError, OSError) as error:
@@ -890,6 +892,34 @@ def find(folders: Sequence[Path]) -> Findings:
     methods = [*MODES]
     found.runs.sort(key=lambda run: methods.index(run.method) if run.method in methods else -1)
     return found
+
+
+def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
+    """Read the finished runs in folders and below them, and warn about the others.
+
+    Args:
+        folders: Folders of runs, of scores or of published networks, or folders
+            that contain them, such as those of sweeps.
+
+    Raises:
+        InputError: If one of the folders holds no finished run.
+    """
+    runs: dict[tuple[Path, str], RunSummary] = {}
+    for folder in folders:
+        found = find([folder])
+        if not found.runs:
+            reasons = [f" ({run.folder}: {run.state})" for run in found.unfinished]
+            raise InputError(
+                f"runs: {folder} holds no finished run{''.join(reasons[:1])}: "
+                "let its run finish or resume it, or give another folder"
+            )
+        if found.unfinished:
+            first = found.unfinished[0]
+            left_out = f"{len(found.unfinished)} unfinished of {folder}"
+            console.warning("left out: %s (%s: %s)", left_out, first.folder, first.state)
+        for summary in found.runs:
+            runs.setdefault((summary.folder.resolve(), summary.method), summary)
+    return [*runs.values()]
 
 
 def _add(found: Findings, path: Path) -> None:

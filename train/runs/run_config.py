@@ -5,7 +5,6 @@ files as before. Decisive settings are the settings that change the result. The
 number of threads, for example, is not decisive.
 """
 
-import hashlib
 import json
 import os
 import platform
@@ -13,7 +12,6 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,8 +25,8 @@ from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
 from train.command import program
 from train.former_keys import rename_former_keys
-from train.runs.saved_networks import selected_file
-from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, mapped
+from train.runs.fingerprints import fingerprints, is_changed
+from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, mapped
 
 CONFIG = "config.yaml"
 # Packages whose versions config.yaml records, in addition to Python and torch.
@@ -368,76 +366,9 @@ def require_same(
             )
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
-        if hashes.get(path, fingerprint) != fingerprint:
+        if is_changed(hashes.get(path, fingerprint), fingerprint):
             raise InputError(
                 f"{path} has changed since {folder} began: "
                 f"put it back, or start in another folder with {elsewhere}",
             )
     return config
-
-
-def fingerprints(settings: Any) -> dict[str, str]:
-    """Compute the SHA-256 of each input file that the settings name.
-
-    Args:
-        settings: Settings of a command, a dataclass.
-
-    Returns:
-        Hash by path. The hash of a training run covers its selected network. The
-        hash of any other folder covers the names and sizes of its files.
-    """
-    values = dict(dotted(asdict(settings)))
-    texts = _collect_texts([values.get(key) for key in INPUTS])
-    paths = {text.removeprefix("run:") for text in texts}
-    return {path: _fingerprint(Path(path)) for path in sorted(paths) if os.path.exists(path)}
-
-
-def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts in a setting that may be paths of input files.
-
-    Args:
-        value: Value of the setting: a text, a mapping that describes an object
-            with its "mesh" and its "props" (other meshes beside it), or a list
-            of these. Any other value has no path.
-    """
-    if isinstance(value, dict):
-        value = [value.get("mesh"), value.get("props")]
-    if isinstance(value, list):
-        texts: set[str] = set()
-        for item in value:
-            texts |= _collect_texts(item)
-        return texts
-    return {value} if isinstance(value, str) else set()
-
-
-def _fingerprint(path: Path) -> str:
-    """Compute the SHA-256 of a file, of a training run or of another folder.
-
-    Args:
-        path: File or folder that exists.
-
-    Returns:
-        Hash of the contents of the file, or of the selected network of the run.
-        For another folder, hash of the names and sizes of its files.
-    """
-    path = selected_file(path) or path
-    if path.is_dir():
-        files = [file for file in path.rglob("*") if file.is_file()]
-        sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
-        return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
-    status = path.stat()
-    return _hash_file(path, status.st_size, status.st_mtime_ns)
-
-
-@cache
-def _hash_file(path: Path, size: int, modified: int) -> str:
-    """Compute the SHA-256 of a file. The result is cached.
-
-    Args:
-        path: The file.
-        size: Its size in bytes. With another size, the hash is computed again.
-        modified: Time of its last change. With another time, the hash is
-            computed again.
-    """
-    with open(path, "rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()

@@ -1,7 +1,6 @@
 """Write and read the metrics and the images of a training run."""
 
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,10 +15,7 @@ from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
-from train.runs.checkpoint import BEST, LAST, PREVIOUS
 from train.runs.run_config import opened_text, parse_object
-from train.runs.run_lock import FAILURE
-from train.runs.saved_networks import WEIGHTS
 
 METRICS = "metrics.jsonl"
 # Sub-folder of a run with images of the training renders of some epochs.
@@ -61,23 +57,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
             if any(not isinstance(value, int | float) for value in line.values()):
                 raise ValueError("a value is not a number")
         return lines
-
-
-def remove_run(folder: Path) -> None:
-    """Remove the results of a run, before another run starts in its folder.
-
-    The caller removes the scores on photographs. The log and the report stay,
-    because the new run replaces them.
-
-    Args:
-        folder: Folder of the run.
-    """
-    for name in (LAST, PREVIOUS, BEST, WEIGHTS, METRICS, FAILURE):
-        (folder / name).unlink(missing_ok=True)
-    for events in folder.glob("events.out.tfevents.*"):
-        events.unlink()
-    for name in (RENDERS, BEFORE):
-        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 class RunLog:

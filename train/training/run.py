@@ -29,17 +29,18 @@ from renderer.image import to_unit
 from train import console
 from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
-from train.data.photographs import DESCRIPTION, find_photographs, require_outside
+from train.data.photographs import find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
 from train.evaluation.laboratory.kept_aside import kept_aside_settings
-from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.laboratory.laboratory import is_laboratory, write_laboratory
 from train.evaluation.scores.metrics import METRICS
 from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
-from train.evaluation.scores.scoring import SUMMARY, Scores, evaluate_photographs, format_scores
+from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
+from train.report.results import remove_run
 from train.runs import checkpoint
-from train.runs.run_config import require_same_run, write_config
-from train.runs.run_log import BEFORE, RunLog, remove_run
+from train.runs.run_config import CONFIG, require_same_run, write_config
+from train.runs.run_log import BEFORE, RunLog
 from train.runs.saved_networks import NORMALIZE_LIGHT, WEIGHTS, export
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings, label_names
 from train.system.device import (
@@ -136,6 +137,7 @@ class Run:
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier = self._require_folder()
+        self._is_resumed = earlier is not None
         validation = choose_validation(settings, self.data, self.initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, validation.fraction, seed=0)
@@ -153,8 +155,20 @@ class Run:
             self._warn_of_stretched_schedule(earlier.train.epochs)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", self.folder)
-        if distributed.rank() == 0:
-            self._write_config()
+
+    def begin(self) -> None:
+        """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
+
+        All runs of a command begin before the first one is trained. Whatever stops the command,
+        no result in their folders belongs to another run then.
+        """
+        if distributed.rank() > 0:
+            return
+        # Without `overwrite`, a configuration is that of a run without a checkpoint.
+        is_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
+        if is_left and not self._is_resumed:
+            remove_run(self.folder)
+        self._write_config()
 
     def fit(self) -> None:
         """Score the initial network, if the run has one, and train to the last epoch."""
@@ -292,11 +306,6 @@ class Run:
 
     def _write_config(self) -> None:
         """Write config.yaml with the settings and the hardware of the run to its folder."""
-        if self.settings.overwrite and not self.settings.train.resume:
-            remove_run(self.folder)
-            # The new run may score its network on other photographs.
-            for summary in self.folder.glob(f"*/{SUMMARY}"):
-                summary.unlink()
         hardware = {
             "device": str(self.trainer.device),
             "precision": self.trainer.model.precision,
@@ -364,15 +373,15 @@ class Run:
         """Render test images of other objects and projected patterns than those of the training.
 
         Nothing is rendered if the settings name photographs to score, if they
-        ask for no test renders, or if a resumed run has already rendered them.
+        ask for no test renders, or if a resumed run has already rendered them
+        with the same settings.
         """
         if self.scored_folders or not self.settings.evaluate.laboratory_setups:
             return
         folder = self.folder / KEPT_ASIDE
-        is_complete = self.settings.train.resume and (folder / DESCRIPTION).exists()
-        if not is_complete:
-            classes = self.data.classes
-            settings = kept_aside_settings(self.settings, classes, self.data.size, folder)
+        classes = self.data.classes
+        settings = kept_aside_settings(self.settings, classes, self.data.size, folder)
+        if not (self._is_resumed and is_laboratory(folder, settings)):
             try:
                 write_laboratory(settings)
             except InputError as error:
@@ -568,6 +577,9 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
     for run in runs:
         run.load()
+    # The main run is the last one. The baselines write to subfolders of its folder.
+    for run in reversed(runs):
+        run.begin()
     return runs
 
 

@@ -268,6 +268,23 @@ class TestAWholeAudit:
             run_audit(AuditSettings(**given, hardened="guessing", seed=1))
 
 
+def test_an_audit_killed_while_it_removes_results_leaves_no_part_of_them(
+    tmp_path, given, monkeypatch
+):
+    out = tmp_path / "audit"
+    for name in ("classifier/laboratory/summary.json", "renders/lab.json"):
+        (out / name).parent.mkdir(parents=True)
+        (out / name).touch()
+    settings = AuditSettings(**given, overwrite=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(audit.shutil, "rmtree", lambda folder, **_: folder.exists() and stop())
+        with pytest.raises(KeyboardInterrupt):
+            audit._prepare_folder(settings, out, out / "renders")
+    assert not (out / "classifier").exists()
+    audit._prepare_folder(settings, out, out / "renders")
+    assert [path.name for path in out.iterdir()] == ["config.yaml"]
+
+
 class TestAnAuditWithoutMitsuba:
     @pytest.fixture(autouse=True)
     def fast_without_mitsuba(self, given, monkeypatch) -> None:

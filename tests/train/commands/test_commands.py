@@ -134,7 +134,7 @@ MISTAKES = [
     ([*EVALUATE, "out=file"], "out=file"),
     (["compare"], "runs is not set"),
     (["compare", "runs=[a,b,./a]"], "runs names a twice"),
-    (["compare", "runs=[2024]"], "2024 holds no finished run"),
+    (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["compare", "--multirun"], "--multirun"),
     ([*EXPORT, "out=a.jpg"], "out: "),
     (["publish", "run=1.10", "out=file/out"], "out=file/out"),

@@ -6,7 +6,7 @@ from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.evaluation.tables import format_interval, fraction
 from train.report.comparison import format_table
-from train.report.summary import summarize
+from train.report.summary import finished_runs, summarize
 
 
 @pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n', '{"epoch": 1}\n{"test/accuracy": 1'])
@@ -15,6 +15,37 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
         (tmp_path / "metrics.jsonl").write_text(lines)
     with pytest.raises(InputError, match="holds no finished run"):
         summarize(tmp_path)
+
+
+class TestRunsBelowFolders:
+    @pytest.fixture(autouse=True)
+    def nested_sweeps(self, made_up_run, tmp_path) -> None:
+        """Make up two sweeps, one inside the other, with an unfinished run, and an evaluation."""
+        for name in ("sweep/a", "sweep/inner/b", "sweep/inner/c", "d"):
+            made_up_run(tmp_path / name, "random", {}, f"seed={ord(name[-1])}")
+        (tmp_path / "sweep/unfinished").mkdir()
+        (tmp_path / "sweep/unfinished/metrics.jsonl").write_text('{"epoch": 1}\n')
+        (tmp_path / "sweep/photographs").mkdir()
+        (tmp_path / "sweep/photographs/a.png").touch()
+
+    @pytest.mark.parametrize(
+        ("given", "expected"),
+        [
+            (["d"], "d"),
+            (["sweep"], "abc"),
+            (["d", "sweep/inner"], "dbc"),
+            (["sweep/inner/c", "sweep"], "cab"),
+            (["sweep", "sweep/../d", "d"], "abcd"),
+        ],
+    )
+    def test_are_found_once_and_in_the_order_of_the_folders(self, tmp_path, given, expected):
+        runs = finished_runs([tmp_path / name for name in given])
+        assert [run.folder.name for run in runs] == [*expected]
+
+    @pytest.mark.parametrize("given", [["sweep/unfinished"], ["d", "sweep/photographs"], ["no"]])
+    def test_are_missed_if_there_are_none_in_one_of_the_folders(self, tmp_path, given):
+        with pytest.raises(InputError, match=f"^runs: {tmp_path / given[-1]} "):
+            finished_runs([tmp_path / name for name in given])
 
 
 @pytest.fixture

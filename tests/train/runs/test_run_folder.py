@@ -18,6 +18,8 @@ from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from train.command import read_settings
+from train.command_settings import AuditSettings
+from train.runs import fingerprints
 from train.runs.run_config import (
     CONFIG,
     decisive_settings,
@@ -108,6 +110,90 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
         match=rf"{file.parent}\S* has changed since {folder} began: put it back",
     ):
         require_same_run(folder, settings)
+
+
+def replace_content(file: Path) -> None:
+    """Replace the content of a file by another of the same size, and keep its time of change."""
+    status = file.stat()
+    file.write_bytes(file.read_bytes()[::-1])
+    os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+    fingerprints._hash_version.cache_clear()  # As in another process.
+
+
+MATERIAL = "newmtl red\nmap_Kd -s 1 1 1 my skin.png\n"
+GLTF = '{"images": [{"uri": "textures/my%20skin.png"}], "buffers": [{"uri": "mesh.bin"}]}'
+INPUT_FILES = {
+    "photographs/orange/a.png": "ab",
+    "linked/b.png": "ab",
+    "mesh.obj": "# comment\n  mtllib my mesh.mtl\n",
+    "my mesh.mtl": MATERIAL,
+    "my skin.png": "ab",
+    "mesh.gltf": GLTF,
+    "mesh.bin": "ab",
+    "textures/my skin.png": "ab",
+    "network.py": "# ab\n",
+    "wall.png": "ab",
+    "classes.txt": "ab",
+}
+AUDIT = {"classifier": "c", "meshes": ["solid:orange"], "out": "audit"}
+
+
+@pytest.mark.parametrize(
+    ("given", "changed"),
+    [
+        (AUDIT | {"meshes": [], "photographs": "photographs"}, "photographs/orange/a.png"),
+        (AUDIT | {"photos": "photographs"}, "photographs/orange/a.png"),
+        (AUDIT | {"photos": "photographs"}, "linked/b.png"),
+        (AUDIT | {"laboratory": "photographs"}, "photographs/orange/a.png"),
+        (AUDIT | {"meshes": ["mesh.obj"]}, "mesh.obj"),
+        (AUDIT | {"meshes": ["mesh.obj"]}, "my mesh.mtl"),
+        (AUDIT | {"meshes": ["mesh.obj"]}, "my skin.png"),
+        (AUDIT | {"meshes": [{"mesh": "mesh.gltf"}]}, "mesh.bin"),
+        (AUDIT | {"hard_negatives": ["mesh.gltf"]}, "textures/my skin.png"),
+        (AUDIT | {"classifier": "python:network:build"}, "network.py"),
+        (AUDIT | {"hardened": "run:photographs"}, "photographs/orange/a.png"),
+        (AUDIT | {"environments": ["wall.png"]}, "wall.png"),
+        (AUDIT | {"weights": "wall.png"}, "wall.png"),
+        (AUDIT | {"classes": "classes.txt"}, "classes.txt"),
+    ],
+)
+def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, given, changed):
+    for name, content in INPUT_FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    (tmp_path / "photographs" / "apple").symlink_to(tmp_path / "linked")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = AuditSettings(**given)
+    write_config(tmp_path / "audit", settings)
+    require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
+    (tmp_path / "unrelated.png").write_text("new")
+    require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
+    replace_content(tmp_path / changed)
+    with pytest.raises(InputError, match="has changed since"):
+        require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
+
+
+def test_a_folder_too_large_to_read_is_told_by_the_times_of_its_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(fingerprints, "MAX_FOLDER_BYTES", 1)
+    (tmp_path / "photographs").mkdir()
+    file = tmp_path / "photographs" / "a.png"
+    file.write_text("ab")
+    settings = AuditSettings(**AUDIT | {"photos": str(file.parent)})
+    before = fingerprints.fingerprints(settings)
+    assert fingerprints.fingerprints(settings) == before
+    os.utime(file, ns=(0, 0))
+    assert fingerprints.fingerprints(settings) != before
+
+
+def test_a_folder_that_an_earlier_version_recorded_by_its_sizes_is_accepted(tmp_path):
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "a.png").write_text("ab")
+    settings = AuditSettings(**AUDIT | {"photos": str(tmp_path / "photographs")})
+    (now,) = fingerprints.fingerprints(settings).values()
+    sizes = hashlib.sha256(repr([("a.png", 2)]).encode()).hexdigest()
+    assert not fingerprints.is_changed(sizes, now)
+    assert fingerprints.is_changed(sizes[::-1], now)
 
 
 def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(

@@ -1,10 +1,13 @@
 import errno
 import gc
+import itertools
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
@@ -21,11 +24,13 @@ from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run, finish, loaded_run
 from tests.train.helpers import read_markdown
+from train.command_settings import LabSettings
 from train.data import batches
 from train.data.sets import Split
 from train.report.comparison import format_table
 from train.report.report_page import write_report
-from train.report.summary import summarize
+from train.report.results import remove_run
+from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
 from train.runs.run_log import read_metrics
 from train.runs.saved_networks import load_run
@@ -287,6 +292,81 @@ def test_a_new_run_in_the_same_folder_has_no_scores_of_the_earlier_one(tiny, pho
     assert summarize(tmp_path).photographs
     completed_run(tiny(*WITHOUT_RENDERS, "overwrite=true"), tmp_path)
     assert not summarize(tmp_path).photographs
+
+
+class TestARunThatReplacesAnother:
+    """A run that is killed leaves nothing of the earlier run that its resumption would take."""
+
+    RENDERED = (*WITHOUT_RENDERS, "evaluate.laboratory_setups=5")
+
+    @pytest.fixture
+    def rendered(self, monkeypatch, photos) -> list[LabSettings]:
+        """Replace the renders kept aside by photographs, and return the settings of each call."""
+        calls = []
+
+        def write(settings: LabSettings) -> None:
+            calls.append(settings)
+            shutil.copytree(photos, settings.out, dirs_exist_ok=True)
+            description = Path(settings.out) / "lab.json"
+            description.write_text(json.dumps(asdict(settings)))
+
+        monkeypatch.setattr("train.training.run.write_laboratory", write)
+        return calls
+
+    def test_renders_anew_after_a_kill_during_its_renders(
+        self, tiny, tmp_path, monkeypatch, rendered
+    ):
+        completed_run(tiny(*self.RENDERED), tmp_path)
+        with monkeypatch.context() as patch:
+            killed = Mock(side_effect=KeyboardInterrupt)
+            patch.setattr("train.training.run.write_laboratory", killed)
+            with pytest.raises(KeyboardInterrupt):
+                completed_run(tiny(*self.RENDERED, "seed=8", "overwrite=true"), tmp_path)
+        assert not is_finished(tmp_path)
+        completed_run(tiny(*self.RENDERED, "seed=8", "train.resume=true"), tmp_path)
+        assert [settings.seed for settings in rendered] == [2001 + 7, 2001 + 8]
+
+    def test_renders_once_if_it_is_resumed_and_anew_with_other_settings(
+        self, tiny, tmp_path, rendered
+    ):
+        completed_run(tiny(*self.RENDERED), tmp_path)
+        resumed = (*self.RENDERED, "train.resume=true")
+        completed_run(tiny(*resumed), tmp_path)
+        assert len(rendered) == 1
+        completed_run(tiny(*resumed, "evaluate.laboratory_setups=10"), tmp_path)
+        assert [settings.setups for settings in rendered] == [5, 10]
+
+    @pytest.mark.parametrize("kept", range(12))
+    def test_removes_the_earlier_run_or_leaves_it_as_it_was_configured(
+        self, tmp_path, monkeypatch, kept
+    ):
+        """The removal is killed after `kept` steps."""
+        names = ["metrics.jsonl", "last.pt", "best.pt", "report.html", "photographs/summary.json"]
+        names += ["before/summary.json", "kept_aside/lab.json", "random/metrics.jsonl"]
+        for name in names:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text('{"test/accuracy": 1}\n')
+        (tmp_path / "config.yaml").write_text("train: {}\ncompare: [random]\n")
+        (tmp_path / "random" / "config.yaml").write_text("train: {}\n")
+        (tmp_path / "mine.txt").touch()
+        steps = itertools.count()
+
+        def counted(function: Callable[..., None]) -> Callable[..., None]:
+            def call(path: Path, **options: bool) -> None:
+                if path.exists() and next(steps) == kept:
+                    raise KeyboardInterrupt
+                function(path, **options)
+
+            return call
+
+        monkeypatch.setattr(Path, "unlink", counted(Path.unlink))
+        monkeypatch.setattr(shutil, "rmtree", counted(shutil.rmtree))
+        with suppress(KeyboardInterrupt):
+            remove_run(tmp_path)
+        left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
+        assert is_finished(tmp_path) == (kept == 0)
+        assert left == {"mine.txt"} or "config.yaml" in left
+        assert (left == {"mine.txt"}) == (next(steps) <= kept)
 
 
 class TestThreads:

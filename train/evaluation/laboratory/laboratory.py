@@ -33,6 +33,7 @@ from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
+from train.runs.run_config import read_json
 from train.runs.run_lock import LOCK, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
@@ -282,6 +283,16 @@ def write_laboratory(settings: LabSettings) -> int:
         return len(rows)
 
 
+def is_laboratory(folder: Path, settings: LabSettings) -> bool:
+    """Return whether `write_laboratory` completed a folder with these settings, moved or not."""
+    try:
+        description = read_json(folder / DESCRIPTION)
+    except InputError:
+        return False
+    wanted = {**asdict(settings), "out": description.get("out")}
+    return {**description, **json.loads(json.dumps(wanted))} == description
+
+
 def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[list[Subject]]:
     """Group meshes by their class.
 
@@ -328,8 +339,9 @@ def _require_empty(out: Path, overwrite: bool) -> None:
         InputError: If the folder has files, and `overwrite` is False.
     """
     if overwrite:
-        for render in out.glob(RENDERS):
-            render.unlink()
+        # lab.json says that the renders are complete.
+        for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
+            file.unlink(missing_ok=True)
     elif any(path.name != LOCK for path in out.iterdir()):
         raise InputError(
             f"out={out} holds files, but the renders need an empty folder: "

@@ -334,14 +334,16 @@ def write(scores: Scores, out: Path) -> None:
     predicted = scores.predicted
     out.mkdir(parents=True, exist_ok=True)
     remove_unfinished(out)
+    # Without a summary, no folder counts as scored.
+    (out / SUMMARY).unlink(missing_ok=True)
     write_predictions(out / PREDICTIONS, predicted.predictions)
-    text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
-    atomic_write(out / SUMMARY, text + "\n")
     write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images))
     pooled = scores.pooled
     groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
     curves = {name: pool.scores for name, pool in groups.items()}
     write_roc(out, pooled.all.scores, curves, scores.label)
+    text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
+    atomic_write(out / SUMMARY, text + "\n")
 
 
 def choose_operating_points(

@@ -2,11 +2,13 @@
 
 import csv
 import json
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -186,6 +188,21 @@ def test_what_cannot_be_photographed_is_refused_before_anything_is_written(
     with pytest.raises(InputError, match=message):
         lab.write_laboratory(settings(tmp_path / "lab", **changes))
     assert not (tmp_path / "lab").exists()
+
+
+def test_renders_that_replace_others_count_as_complete_only_at_their_end(
+    tmp_path, laboratory, monkeypatch
+):
+    folder = tmp_path / "lab"
+    shutil.copytree(laboratory, folder)
+    again = settings(folder, overwrite=True)
+    assert lab.is_laboratory(folder, settings(tmp_path / "elsewhere"))
+    assert not lab.is_laboratory(folder, settings(folder, seed=1))
+    monkeypatch.setattr(lab, "_write_render", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        lab.write_laboratory(again)
+    assert not lab.is_laboratory(folder, again)
+    assert not list(folder.rglob("*.json"))
 
 
 def test_a_folder_that_holds_something_is_left_alone(laboratory):
