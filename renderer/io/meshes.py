@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -32,20 +31,20 @@ from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_f
 from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.image import encode
 from renderer.io.images import eight_bits
+from renderer.io.mesh_file import MeshFile, Part
+from renderer.io.obj import read_obj
 from renderer.io.skins import skinned, with_skins_as_attributes
 from renderer.validation import as_path, require_flag
 
 # Suffixes of archive files, which are not read. trimesh could read them,
 # but the names of the files inside an archive cannot be checked first.
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
-# Pattern for the lines of .mtl files that define a material.
-DEFINED_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-# Pattern for the lines of .obj files that use a material.
-USED_MATERIAL = re.compile(rb"^[ \t]*usemtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 # Pattern for the messages in trimesh's log that say that
 # trimesh left out an image, a material or something else of
 # a file. For .obj, .ply and .dae files, only the log tells.
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")
+# Readers of our own. trimesh reads the other formats.
+READERS = {"obj": read_obj}
 # Number that stands for the type float32 in glTF 2.0 (section 3.6.2.2).
 FLOAT = 5126
 # Numbers for the kinds of glTF primitives that consist
@@ -107,7 +106,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
     require_flag("gloss", gloss)
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    placed_parts = [transformed(part, matrix) for part, matrix in read_parts(path, is_gltf, gloss)]
+    parts = read_parts(path, is_gltf, gloss)
+    placed_parts = [transformed(part.mesh, part.matrix) for part in parts]
     if not placed_parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _merge_vertices(concatenate(placed_parts))
@@ -149,10 +149,8 @@ def _merge_vertices(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=merged_keys[:, :3], faces=faces, skin=skin)
 
 
-def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a mesh file, and the matrices that place the parts in the scene.
-
-    A part is a mesh with one material. A file may hold several parts.
+def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[Part]:
+    """Read the parts of a mesh file, and warn once of what is ignored or assumed.
 
     Args:
         path: File to read.
@@ -162,9 +160,8 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
             metallic and specular factor. False makes the parts matte.
 
     Returns:
-        Pairs of a part in its own coordinates and of the affine matrix that places
-        the part in the scene, shape (4, 4). If the file has joints, all parts are
-        already in scene coordinates, and the matrix is the identity.
+        Parts with one or several materials. If the file has joints, all parts are
+        already in scene coordinates.
 
     Raises:
         InputError: If the file does not exist, has an unknown format, or cannot
@@ -172,139 +169,85 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
     """
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
-    formats = set(trimesh.available_formats()) - ARCHIVES
+    formats = (set(trimesh.available_formats()) | READERS.keys()) - ARCHIVES
     if suffix not in formats:
         known = ", ".join(sorted(formats))
         raise InputError(f"{path} has no known mesh format: use one of {known}")
     # trimesh and Pillow can raise almost any exception for a damaged file.
     try:
-        return _read_parts(path, suffix, linear, gloss)
+        file = MeshFile(path)
+        if suffix in READERS:
+            parts = READERS[suffix](file)
+        else:
+            parts = _read_parts(file, suffix, linear, gloss)
     except Exception as error:
         raise InputError(f"{path} cannot be read as a mesh: {single_line(error)}") from error
+    file.warn(stacklevel=3)
+    return parts
 
 
-def _read_parts(
-    path: Path, suffix: str, linear: bool, gloss: bool
-) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a mesh file whose format trimesh knows.
-
-    A part is a mesh with one material. A file may hold several parts.
+def _read_parts(file: MeshFile, suffix: str, linear: bool, gloss: bool) -> list[Part]:
+    """Read the parts of a mesh file with trimesh.
 
     Args:
-        path: File to read.
+        file: File to read.
         suffix: Suffix of the file in lower case, without the period.
         linear: True if the file stores linear colors, except for textures.
         gloss: True reads the specular reflection of glTF materials.
 
-    Returns:
-        Pairs of a part and of the affine matrix that places the part in the
-        scene, shape (4, 4).
-
     Raises:
         Exception: Any exception, if the file is damaged or not supported.
     """
-    content = path.read_bytes()
+    content = file.content
     tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
     has_skins = any("skin" in node for node in tree.get("nodes", []))
     if has_skins:
         content = with_skins_as_attributes(content, tree)
     textured_count = _count_textured_parts(tree, gloss)
     specular_factors = _specular_factors(tree) if gloss else {}
-    if suffix == "obj":
-        content = _as_utf8(content)
-    scene = _load(content, suffix, _Files(path))
-    parts = {}
+    scene = _load(content, suffix, _Files(file))
+    meshes = {}
     for name, geometry in scene.geometry.items():
         # The geometry may also be points or lines, which are skipped.
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
-        part = _as_mesh(geometry, linear)
-        parts[name] = _with_gloss(part, geometry.visual, specular_factors) if gloss else part
+        mesh = _as_mesh(geometry, linear)
+        meshes[name] = _with_gloss(mesh, geometry.visual, specular_factors) if gloss else mesh
     # trimesh skips a glTF image that it cannot read, and
     # reports no error. Such a file then has too few textures.
-    if sum(len(part.textures) for part in parts.values()) < textured_count:
+    if sum(len(mesh.textures) for mesh in meshes.values()) < textured_count:
         raise ValueError("the image of a texture is missing, or cannot be decoded")
-    placed_parts = []
+    parts = []
     # Several nodes of the scene may show the same part at different places.
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
-        if name not in parts:
+        if name not in meshes:
             continue
         if has_skins:
-            part_in_scene = skinned(parts[name], node, scene, tree)
-            placed_parts.append((part_in_scene, np.eye(4)))
+            parts.append(Part(skinned(meshes[name], node, scene, tree)))
         else:
-            placed_parts.append((parts[name], matrix))
-    return placed_parts
+            parts.append(Part(meshes[name], matrix=matrix))
+    return parts
 
 
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
-    """Reader for the files that a mesh file refers to, such as images and .mtl files.
+    """Reader through which trimesh reads the files that a mesh file refers to."""
 
-    trimesh calls `get` for each of these files.
-
-    Attributes:
-        materials: Content of the .mtl file that was read last, in UTF-8.
-    """
-
-    materials = b""
+    def __init__(self, file: MeshFile) -> None:
+        super().__init__(str(file.path))
+        self.file = file
 
     def get(self, name: str) -> bytes:
-        """Read a file that the mesh file refers to.
-
-        The file is first sought at the given path, relative to the folder of the
-        mesh file. If it is not there, it is sought in this folder itself. A path
-        may contain \\ instead of / and %20 instead of a blank.
-
-        Args:
-            name: Path of the file, as it is written in the mesh file.
-
-        Returns:
-            Content of the file.
-
-        Raises:
-            FileNotFoundError: If the file does not exist.
-        """
-        relative_path = unquote(name.strip('" \t')).replace("\\", "/")
-        candidates = (
-            Path(self.parent, relative_path),
-            Path(self.parent, Path(relative_path).name),
-        )
-        for file in candidates:
-            # `is_file` is False for a named pipe.
-            # Reading a pipe might never end.
-            if file.is_file() and file.suffix.lower() == ".mtl":
-                self.materials = _as_utf8(file.read_bytes())
-                return self.materials
-            if file.is_file():
-                return file.read_bytes()
-        raise FileNotFoundError(f"the file refers to {name}, which does not exist")
+        """Read a file below the folder of the mesh file."""
+        return self.file.read(name)
 
 
 def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
-    """Read a scene with trimesh, and check that trimesh left nothing out.
-
-    Args:
-        content: Content of the mesh file.
-        suffix: Suffix of the file in lower case, without the period.
-        files: Reader for other files that the mesh file refers to.
-
-    Returns:
-        Scene of trimesh.
-
-    Raises:
-        ValueError: If trimesh could not read an image, a material or another
-            part of the file.
-    """
+    """Read a scene with trimesh, and raise `ValueError` if trimesh left something out."""
     with _recorded_omissions() as omissions:
         scene = trimesh.load(
             io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False
         )
-    if suffix == "obj" and b"mtllib" in content:
-        used_materials = set(USED_MATERIAL.findall(content))
-        defined_materials = set(DEFINED_MATERIAL.findall(files.materials))
-        for name in used_materials - defined_materials:
-            omissions.append(f"the .mtl file does not define the material {name.decode()}")
     if omissions:
         raise ValueError(omissions[0])
     return scene
@@ -359,15 +302,6 @@ class _OmissionRecorder(logging.Filter):
             error = record.exc_info[1] if record.exc_info else ""
             self.omissions.append(f"{message} {error}")
         return False
-
-
-def _as_utf8(text: bytes) -> bytes:
-    """Convert text to UTF-8. Text that is not valid UTF-8 is assumed to be Latin-1."""
-    try:
-        text.decode()
-    except UnicodeDecodeError:
-        return text.decode("latin-1").encode()
-    return text
 
 
 def _gltf_tree(content: bytes) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Independent references for tests: SciPy's harmonics, the sRGB standard, and test meshes."""
 
+import io
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from numpy.typing import ArrayLike
+from PIL import Image
 from scipy.special import sph_harm_y_all
 
 from renderer.geometry.mesh import Mesh, normalize
@@ -130,3 +132,10 @@ def linear_of(srgb: ArrayLike) -> np.ndarray:
     srgb = np.asarray(srgb)
     curve = ((srgb + 0.055) / 1.055) ** 2.4
     return np.where(srgb <= 0.04045, srgb / 12.92, curve)
+
+
+def png_of(*color: int) -> bytes:
+    """Encode an image of one color as .png."""
+    content = io.BytesIO()
+    Image.fromarray(np.full((2, 2, len(color)), color, dtype=np.uint8)).save(content, "PNG")
+    return content.getvalue()

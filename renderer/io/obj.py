@@ -1,0 +1,389 @@
+"""Read .obj files and their material libraries, which are .mtl files."""
+
+import re
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from renderer.geometry.mesh import NO_TEXTURE, Mesh
+from renderer.geometry.polygons import triangulate
+from renderer.io.mesh_file import MeshFile, Part, as_utf8, product, require_bounded, unit_colors
+
+# Statements that describe the surface or name groups of faces.
+_READ = {"v", "vt", "vn", "f", "usemtl", "mtllib", "g", "o"}
+# Statements that do not change the surface, such as lines and points.
+_IGNORED = {"l", "p", "s", "vp", "lod", "mg", "bevel", "c_interp", "d_interp", "shadow_obj"}
+# Properties of materials, in lower case, that would change the shape or the base color.
+_REFUSED_PROPERTIES = {"map_d", "map_tr", "disp", "decal"}
+# Successive lines with the same keyword.
+_BLOCK = re.compile(rb"[ \t]*(\S+)[^\n]*\n(?:[ \t]*\1(?=\s)[^\n]*\n)*")
+# Option of a texture, with its values.
+_OPTION = re.compile(
+    r"(-[a-z]+)\s+((?:on|off|[rgbmlz])\s+|(?:[-+]?[\d.]+(?:e[-+]?\d+)?\s+){1,3})(.*)", re.IGNORECASE
+)
+# Options of textures that leave the colors as they are.
+_HARMLESS_OPTIONS = {"-blendu", "-blendv", "-texres", "-bm", "-boost"}
+# Options of textures that leave the colors as they are if they have these values.
+_NEUTRAL_VALUES = {"-o": [0, 0, 0], "-s": [1, 1, 1], "-t": [0, 0, 0], "-mm": [0, 1]}
+# Index for a corner without texture coordinates or normal.
+_ABSENT = -1
+# End of the text of a corner that leaves out an index.
+_LEFT_OUT = -(10**18)
+# Opacity above which a surface counts as opaque.
+_OPAQUE = 0.999
+
+# Keywords of the properties of a material, with their values.
+_Properties = list[tuple[str, str]]
+
+
+class _Lines(NamedTuple):
+    """All lines with the same keyword.
+
+    Attributes:
+        keyword: Keyword at the beginning of each line.
+        firsts: Number of the first line of each block of successive lines.
+        blocks: Text of each block.
+    """
+
+    keyword: bytes
+    firsts: list[int]
+    blocks: list[bytes]
+
+    def numbers(self) -> np.ndarray:
+        """Return the number of each line, which counts the lines that are read."""
+        ranges = [
+            np.arange(first, first + block.count(b"\n"))
+            for first, block in zip(self.firsts, self.blocks, strict=True)
+        ]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *ranges])
+
+    def texts(self) -> list[str]:
+        """Return the text of each line after the keyword."""
+        lines = b"".join(self.blocks).decode().split("\n")[:-1]
+        return [line.strip().removeprefix(self.keyword.decode()).strip() for line in lines]
+
+    def words(self) -> tuple[np.ndarray, bytes]:
+        """Return the number of words of each line, and the lines, without keyword and comment."""
+        text = b"".join(self.blocks)
+        if b"#" in text:
+            text = re.sub(rb"#.*", b"", text)
+        if text.count(self.keyword) != text.count(b"\n"):
+            raise ValueError(f"a line {self.keyword.decode()} is damaged: export the file again")
+        text = text.replace(self.keyword, b"")
+        characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
+        is_blank = characters <= ord(" ")
+        line_of_word = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
+        return np.bincount(line_of_word, minlength=text.count(b"\n")), text
+
+
+class _Material(NamedTuple):
+    """Base color of a material.
+
+    Attributes:
+        color: sRGB-encoded color.
+        texture: Name of the image file. An empty string without a texture.
+        is_clamped: True if the texture does not repeat.
+    """
+
+    color: tuple[float, ...] = (1.0, 1.0, 1.0)
+    texture: str = ""
+    is_clamped: bool = False
+
+
+def read_obj(file: MeshFile) -> list[Part]:
+    """Read all objects of an .obj file as one part, or none if the file has no faces.
+
+    Raises:
+        ValueError: If the file is damaged, or has features that would change the
+            shape or the base color and are not supported.
+    """
+    lines = _lines_by_keyword(file)
+    vertices, vertex_colors = _vertices(lines["v"], file)
+    uvs, _ = _table(lines["vt"], (1, 2, 3))
+    normals, _ = _table(lines["vn"], (3,))
+    require_bounded(coordinates=vertices, normals=normals, texture_coordinates=uvs)
+    line_numbers, indices, sizes = _polygons(lines, file)
+    if not len(sizes):
+        return []
+    triangles, polygons, crossing_count = triangulate(vertices[indices[:, 0]], sizes)
+    if crossing_count:
+        file.assume(f"{crossing_count} faces intersect themselves, so their shape is unclear")
+    corners = indices[triangles]
+    materials, material_of_polygon = _materials(lines, line_numbers, file)
+    material_of_face = material_of_polygon[polygons]
+    colors = np.array([material.color for material in materials])[material_of_face, None]
+    if vertex_colors is not None:
+        colors = product(colors, vertex_colors[corners[..., 0]])
+    # Textures by their names, because several materials may have the same.
+    names = list(dict.fromkeys(material.texture for material in materials if material.texture))
+    ids = [names.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
+    texture_ids = np.array(ids, dtype=np.int32)[material_of_face]
+    is_textured = texture_ids != NO_TEXTURE
+    if (corners[is_textured, :, 1] == _ABSENT).any():
+        raise ValueError("faces with a texture have no texture coordinates")
+    corner_uvs = np.zeros((len(corners), 3, 2), dtype=np.float32)
+    corner_uvs[is_textured] = uvs[corners[is_textured, :, 1], :2]
+    is_clamped = np.array([material.is_clamped for material in materials])[material_of_face]
+    if is_clamped.any() and not (np.abs(corner_uvs[is_clamped] - 0.5) <= 0.5).all():
+        raise ValueError("textures with the option -clamp are not supported beyond their edges")
+    mesh = Mesh(
+        vertices=vertices,
+        faces=corners[..., 0],
+        corner_colors=np.broadcast_to(colors, (len(corners), 3, 3)).astype(np.float32),
+        corner_uvs=corner_uvs,
+        texture_ids=texture_ids,
+        textures=tuple(file.texture(name) for name in names),
+    )
+    if not len(normals):
+        return [Part(mesh)]
+    # A row of zeros at the end is the normal of corners without a normal.
+    return [Part(mesh, np.concatenate([normals, np.zeros((1, 3))])[corners[..., 2]])]
+
+
+def _cleaned(text: bytes) -> bytes:
+    """Convert text to UTF-8 with one statement per line, without lines of comments."""
+    text = as_utf8(text).replace(b"\r\n", b"\n").replace(b"\r", b"\n") + b"\n"
+    # Comments are removed first, because a backslash
+    # at their end does not continue the line.
+    if b"#" in text:
+        text = re.sub(rb"^[ \t]*#.*", b"", text, flags=re.MULTILINE)
+    return re.sub(rb"\\[ \t]*\n", b" ", text)
+
+
+def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
+    """Sort the lines of the file by their keywords, and refuse unsupported statements."""
+    lines = {keyword: _Lines(keyword.encode(), [], []) for keyword in _READ}
+    number = 0
+    for match in _BLOCK.finditer(_cleaned(file.content)):
+        keyword = match[1].decode()
+        if keyword in lines:
+            lines[keyword].firsts.append(number)
+            lines[keyword].blocks.append(match[0])
+            number += match[0].count(b"\n")
+        elif keyword in _IGNORED:
+            file.ignore(keyword)
+        else:
+            raise ValueError(
+                f"the statement {keyword[:20]} is not supported: convert the file to polygons"
+            )
+    return lines
+
+
+def _numbers(text: bytes, dtype: type, count: int) -> np.ndarray:
+    """Parse numbers between blanks, and check how many they are."""
+    with warnings.catch_warnings():
+        # NumPy stops with a warning at a word that is no number.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        numbers: np.ndarray = np.fromstring(text, dtype, sep=" ")
+    if len(numbers) != count:
+        raise ValueError(f"number {len(numbers) + 1} of {count} is damaged: export the file again")
+    return numbers
+
+
+def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Parse lines of numbers as an array with zeros at the end of short lines.
+
+    Returns:
+        A tuple of
+        - the numbers, shape (N, largest of `lengths`);
+        - how many numbers each line has, shape (N,).
+    """
+    counts, text = lines.words()
+    wrong = counts[~np.isin(counts, lengths)]
+    if len(wrong):
+        raise ValueError(
+            f"a line {lines.keyword.decode()} has {wrong[0]} numbers: "
+            f"give {' or '.join(map(str, lengths))}"
+        )
+    table = np.zeros((len(counts), max(lengths)))
+    is_given = np.arange(max(lengths)) < counts[:, None]
+    table[is_given] = _numbers(text, np.float64, counts.sum())
+    return table, counts
+
+
+def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | None]:
+    """Parse the vertices and their colors, which are white for vertices without a color."""
+    table, counts = _table(lines, (3, 4, 6))
+    if (table[counts == 4, 3] != 1).any():
+        raise ValueError("vertices with a weight other than 1 are not supported")
+    is_colored = counts == 6
+    if not is_colored.any():
+        return table[:, :3], None
+    colors = np.ones((len(table), 3))
+    colors[is_colored] = unit_colors(table[is_colored, 3:], file)
+    return table[:, :3], colors
+
+
+def _polygons(
+    lines: dict[str, _Lines], file: MeshFile
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parse the faces.
+
+    Returns:
+        A tuple of
+        - the numbers of the lines of the faces, shape (P,);
+        - the indices of the position, the texture coordinates and the normal of
+          each corner of all faces, or `_ABSENT`, shape (C, 3);
+        - the number of corners of each face, shape (P,).
+    """
+    line_numbers = lines["f"].numbers()
+    sizes, text = lines["f"].words()
+    indices = _corners(text.split())
+    for column, keyword in enumerate(("v", "vt", "vn")):
+        written = indices[:, column]
+        numbers = lines[keyword].numbers()
+        # A negative index counts backward from the line of the face.
+        counts_before = np.searchsorted(numbers, line_numbers).repeat(sizes)
+        resolved = np.where(written < 0, counts_before + written, written - 1)
+        is_given = written != _LEFT_OUT
+        wrong = written[is_given & ((resolved < 0) | (resolved >= len(numbers)))]
+        if len(wrong):
+            raise ValueError(
+                f"a face has the index {wrong[0]} of {keyword}, "
+                f"but the file has {len(numbers)} lines {keyword}"
+            )
+        indices[:, column] = np.where(is_given, resolved, _ABSENT)
+    is_face = sizes >= 3
+    if not is_face.all():
+        file.ignore("faces with fewer than 3 corners")
+    return line_numbers[is_face], indices[is_face.repeat(sizes)], sizes[is_face]
+
+
+def _corners(words: list[bytes]) -> np.ndarray:
+    """Parse corners such as 1/2/3 or 1//3 as rows of three, with `_LEFT_OUT` for no index."""
+    if not words:
+        return np.zeros((0, 3), dtype=np.int64)
+    text = b" ".join(words) + b" "
+    absent = b"/%d" % _LEFT_OUT
+    text = text.replace(b"//", absent + b"/").replace(b"/ ", absent + b" ")
+    characters = np.frombuffer(text, dtype=np.uint8)
+    # The character after each number, which is a blank at the end of a corner.
+    separators = characters[(characters == ord(" ")) | (characters == ord("/"))]
+    is_last = separators == ord(" ")
+    firsts = np.flatnonzero(np.append(True, is_last[:-1]))
+    corners = np.cumsum(is_last) - is_last
+    columns = np.arange(len(is_last)) - firsts[corners]
+    if columns.max() > 2:
+        raise ValueError("a corner of a face has more than three indices")
+    table = np.full((len(words), 3), _LEFT_OUT)
+    table[corners, columns] = _numbers(text.replace(b"/", b" "), np.int64, len(columns))
+    return table
+
+
+def _materials(
+    lines: dict[str, _Lines], line_numbers: np.ndarray, file: MeshFile
+) -> tuple[list[_Material], np.ndarray]:
+    """Read the materials in use, and find the material of each face.
+
+    Returns:
+        A tuple of
+        - the materials, of which the first is for faces without a material;
+        - the index of the material of each face, shape (P,).
+    """
+    library = _library(lines["mtllib"].texts(), file)
+    materials = [_Material()]
+    # Index of the material of each line "usemtl", after the index for faces before these lines.
+    indices = [0]
+    index_of_name: dict[str, int] = {}
+    choice_of_face = np.searchsorted(lines["usemtl"].numbers(), line_numbers)
+    used_choices = set(choice_of_face.tolist())
+    for choice, name in enumerate(lines["usemtl"].texts(), start=1):
+        if choice in used_choices and name not in index_of_name:
+            index_of_name[name] = len(materials)
+            materials.append(_material(name, library, file))
+        indices.append(index_of_name.get(name, 0))
+    return materials, np.array(indices)[choice_of_face]
+
+
+def _library(names: list[str], file: MeshFile) -> dict[str, _Properties] | None:
+    """Read the properties of all materials by name. None if the file names no library."""
+    library: dict[str, _Properties] = {}
+    for name in names:
+        try:
+            contents = [file.read(name)]
+        except ValueError:
+            # The line may name several files, or end with a comment.
+            parts = re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or name.split()
+            if parts in ([name], []):
+                raise
+            contents = [file.read(part) for part in parts]
+        for content in contents:
+            # The first file that defines a material counts.
+            library = _definitions(content) | library
+    return library if names else None
+
+
+def _definitions(content: bytes) -> dict[str, _Properties]:
+    """Read the properties of the materials of one .mtl file by name."""
+    definitions: dict[str, _Properties] = {}
+    properties: _Properties = []
+    for keyword, rest in re.findall(r"[ \t]*(\S+)(.*)\n", _cleaned(content).decode()):
+        text = rest.strip()
+        if keyword.lower() != "newmtl":
+            properties.append((keyword, text))
+            continue
+        properties = []
+        if text in definitions:
+            raise ValueError(f"an .mtl file defines the material {text} twice")
+        definitions[text] = properties
+    return definitions
+
+
+def _material(name: str, library: dict[str, _Properties] | None, file: MeshFile) -> _Material:
+    """Interpret the properties of a material."""
+    if library is None:
+        file.assume("materials are white, because the file names no material library")
+        return _Material()
+    # The name may be followed by a comment.
+    properties = library.get(name, library.get(re.split(r"\s+#", name)[0]))
+    if properties is None:
+        raise ValueError(f"no .mtl file defines the material {name}")
+    material = _Material()
+    opacities = {}
+    for keyword, text in properties:
+        match keyword.lower():
+            case "kd":
+                material = material._replace(color=_color(text))
+            case "map_kd":
+                texture, is_clamped = _texture(text)
+                material = material._replace(texture=texture, is_clamped=is_clamped)
+            case "d" | "tr" as key:
+                # A number may follow the option "-halo".
+                opacities[key] = float(text.partition("#")[0].split()[-1])
+            case key if key in _REFUSED_PROPERTIES:
+                raise ValueError(f"the material {name} has {keyword}, which is not supported")
+            case _:
+                file.ignore(keyword)
+    if not opacities.get("d", 1 - opacities.get("tr", 0)) >= _OPAQUE:
+        raise ValueError(f"the material {name} is transparent, which is not supported")
+    return material
+
+
+def _color(text: str) -> tuple[float, ...]:
+    """Parse a color of one gray value, or of red, green and blue."""
+    values = [float(word) for word in text.partition("#")[0].split()]
+    # A comparison with NaN is False, so `not` also finds NaN.
+    if len(values) not in (1, 3) or not all(0 <= value <= 1.001 for value in values):
+        raise ValueError(f'"Kd {text}" is not a color: give red, green and blue from 0 to 1')
+    return tuple(min(value, 1.0) for value in values * (3 // len(values)))
+
+
+def _texture(text: str) -> tuple[str, bool]:
+    """Parse the name of a texture, and whether it is clamped, from a value with options."""
+    is_clamped = False
+    while option := _OPTION.fullmatch(text):
+        name, values, text = option.groups()
+        name = name.lower()
+        words = values.lower().split()
+        if name in _NEUTRAL_VALUES:
+            neutral = _NEUTRAL_VALUES[name]
+            is_neutral = [float(word) for word in words] == neutral[: len(words)]
+        else:
+            is_neutral = name in _HARMLESS_OPTIONS or words == ["off"] or name == "-clamp"
+        if not is_neutral:
+            raise ValueError(f"the option {name} {values.strip()} of a texture is not supported")
+        is_clamped |= name == "-clamp" and words == ["on"]
+    if not text:
+        raise ValueError("a map_Kd names no image")
+    return text, is_clamped
