@@ -3,18 +3,29 @@
 import io
 import math
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, features
 from torch import Tensor
 
 from renderer.errors import InputError, require_file
+from renderer.io.color_profiles import conversion_to_srgb
 from renderer.io.files import atomic_write
 
 # Suffixes of the files in a folder that count as images.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+# Formats of Pillow that are read, whatever the name of the file. Others can run programs:
+# Pillow passes an EPS file to Ghostscript. "TGA" is last, because it has no signature.
+FORMATS = [
+    *("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM"),
+    *(["AVIF"] if "avif" in features.modules else []),
+    "TGA",
+]
 # A large JPEG file is decoded at a reduced size before it is
 # resized to a small square. The sides of the decoded image
 # are at least this many times as long as those of the square.
@@ -103,14 +114,57 @@ def read_square(path: str | Path, size: int) -> np.ndarray:
     return np.asarray(central_square(image, size))
 
 
+@contextmanager
+def open_image(path: str | Path) -> Iterator[Image.Image]:
+    """Open an image file of one of `FORMATS`, without decoding its pixels.
+
+    Args:
+        path: Regular file.
+
+    Yields:
+        Image.
+
+    Raises:
+        InputError: If the path is not a regular file, such as a named pipe.
+        Exception: If the file is damaged. The class depends on the format.
+    """
+    require_file(path, "give an image file")
+    # From a path, Pillow would map a TIFF file to memory, and scramble it if it is rotated.
+    with Path(path).open("rb") as file, identify(file) as image:
+        yield image
+
+
+def identify(file: BinaryIO) -> Image.Image:
+    """Return the image in a stream of bytes, without decoding its pixels.
+
+    Args:
+        file: Stream of an image file of one of `FORMATS`.
+
+    Raises:
+        Exception: If the file is damaged. The class depends on the format.
+    """
+    image = Image.open(file, formats=FORMATS)
+    key = image.info.get("transparency")
+    if image.format == "PNG" and key is not None:
+        # Pillow expands gray pixels of 2 and 4 bits, and keeps the upper 8 of 16 bits
+        # of colors, but does not do the same with the transparent color.
+        layout = image.tile[0][3]
+        if layout in ("L;2", "L;4"):
+            image.info["transparency"] = key * {"L;2": 85, "L;4": 17}[layout]
+        elif layout == "RGB;16B":
+            image.info["transparency"] = tuple(value >> 8 for value in key)
+    return image
+
+
 def read_rgb(path: str | Path, min_side: int) -> Image.Image:
-    """Read an image file as an upright RGB image on a white background.
+    """Read an image file as an upright sRGB image on a white background.
 
     A large JPEG file is decoded at 1/2, 1/4 or 1/8 of its size, which is several
     times faster.
 
     Args:
-        path: Image file. It may be rotated (EXIF) and have transparent parts.
+        path: Image file. It may be rotated (EXIF), have transparent parts and a
+            color profile.
         min_side: Width and height in pixels below which an image is not reduced
             while it is decoded.
 
@@ -120,15 +174,45 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
     Raises:
         Exception: If the file is damaged. The class depends on the format.
     """
-    with Image.open(path) as image:
+    with open_image(path) as image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
         image.draft(None, (min_side, min_side))
-        upright = eight_bits(ImageOps.exif_transpose(image))
-    if upright.has_transparency_data:
-        upright = upright.convert("RGBA")
-        white = Image.new("RGBA", upright.size, "white")
-        upright = Image.alpha_composite(white, upright)
-    return upright.convert("RGB")
+        convert = conversion_to_srgb(image, path)
+        color, alpha = color_and_alpha(image)
+    if convert is not None:
+        color = convert(color)
+    color = color.convert("RGB")
+    if alpha is None:
+        return color
+    color.putalpha(alpha)
+    white = Image.new("RGBA", color.size, "white")
+    return Image.alpha_composite(white, color).convert("RGB")
+
+
+def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
+    """Return the upright pixels of an open image with 8 bits per channel.
+
+    Args:
+        image: Image of `open_image`. It may be rotated (EXIF).
+
+    Returns:
+        A tuple of
+        - the colors, in the mode "L", "RGB" or "CMYK";
+        - the opacity, in the mode "L", or None.
+
+    Raises:
+        Exception: If the file is damaged. The class depends on the format.
+    """
+    ImageOps.exif_transpose(image, in_place=True)
+    image = eight_bits(image)
+    is_gray = image.mode in ("1", "L", "LA", "La")
+    if image.has_transparency_data:
+        rgba = image.convert("RGBA")
+        color = rgba.getchannel("R") if is_gray else rgba.convert("RGB")
+        return color, rgba.getchannel("A")
+    if image.mode in ("L", "CMYK"):
+        return image, None
+    return image.convert("L" if is_gray else "RGB"), None
 
 
 def central_square(image: Image.Image, size: int) -> Image.Image:
@@ -148,22 +232,34 @@ def eight_bits(image: Image.Image) -> Image.Image:
     """Convert an image to 8 bits per channel.
 
     Args:
-        image: Image with 8, 16 or 32 bits per channel.
+        image: Image with 1 to 32 bits per channel.
 
     Returns:
-        Image with 8 bits per channel.
+        Image with 8 bits per channel. A 16-bit image with a transparent gray value
+        gets an alpha channel.
 
     Raises:
-        ValueError: If the pixels are floating-point numbers.
+        ValueError: If the value of white is unknown, because the pixels are
+            floating-point numbers or integers of 32 bits. If another library
+            opened an image of another format than `FORMATS`.
         Exception: If the file is damaged. The class depends on the format.
     """
-    if image.mode == "F":
-        raise ValueError("the pixels are floating-point numbers, so the value of white is unknown")
+    if image.format not in (None, "MPO", *FORMATS):
+        raise ValueError(f"the format {image.format} of an image is not read: use PNG or JPEG")
+    if image.mode == "F" or (image.mode == "I" and image.format == "TIFF"):
+        kind = "floating-point numbers" if image.mode == "F" else "signed or 32-bit integers"
+        raise ValueError(
+            f"the pixels are {kind}, so the value of white is unknown: save 8 or 16 bits"
+        )
     if image.mode.startswith("I"):
         # Pixels of the mode "I" have 16 bits. `Image.convert` would
         # clip their values at 255 instead of dividing them by 256.
-        scaled = np.clip(np.asarray(image) // 256, 0, 255)
-        return Image.fromarray(scaled.astype(np.uint8))
+        pixels = np.asarray(image)
+        scaled = Image.fromarray(np.clip(pixels // 256, 0, 255).astype(np.uint8))
+        key = image.info.get("transparency")
+        if key is not None:
+            scaled.putalpha(Image.fromarray(np.where(pixels == key, 0, 255).astype(np.uint8)))
+        return scaled
     image.load()
     return image
 

@@ -261,7 +261,7 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
     all_paths = list(visible_files(folder))
-    image_paths = sorted(path for path in all_paths if path.suffix.lower() in SUFFIXES)
+    image_paths = sorted(path for path in all_paths if _is_image(folder, path))
     if not image_paths:
         raise InputError(
             f"{folder} holds no photographs: give a folder with image files whose names end in "
@@ -284,7 +284,14 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
     """
     own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
     other_files = [path for path in visible_files(folder) if path not in own_files]
-    return sorted(path for path in other_files if path.suffix.lower() not in SUFFIXES)
+    return sorted(path for path in other_files if not _is_image(folder, path))
+
+
+def _is_image(folder: Path, path: PurePosixPath) -> bool:
+    """Return whether a file has the name of an image, and is no named pipe, socket or device."""
+    # A link to a missing file is an image that cannot be read.
+    has_suffix = path.suffix.lower() in SUFFIXES
+    return has_suffix and (os.path.isfile(folder / path) or not os.path.exists(folder / path))
 
 
 # `cache` runs the function only at the first call with each text.
@@ -403,6 +410,9 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
     if not os.path.lexists(table):
         return rows
     try:
+        # Opening a named pipe would wait forever.
+        if not table.is_file():
+            raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
             for line in csv.DictReader(file, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
@@ -442,8 +452,9 @@ def load_photographs(
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 
-    Each image is rotated as its EXIF orientation says. Transparent pixels are
-    blended with white, and 16-bit channels are converted to 8 bits. The central
+    Each image is rotated as its EXIF orientation says, and converted to sRGB as its
+    color profile says. Transparent pixels are blended with white, and 16-bit
+    channels are converted to 8 bits. The central
     square is reduced with Pillow's Lanczos filter. The filter is wider for a
     larger reduction, which prevents aliasing.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from renderer.io.images import open_image
 from train.evaluation.scores.metrics import auc_and_recalls
 from train.evaluation.scores.sheet import Pair, draw_roc
 from train.evaluation.tables import Estimate
@@ -325,7 +326,7 @@ def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Pict
         List of one encoded image. Empty if the file is missing or damaged.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             pixels = image.convert("RGB")
     except Exception:  # Pillow raises errors of many types for a damaged file.
         return []

@@ -1,4 +1,6 @@
 import logging
+import os
+import socket
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -108,6 +110,20 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
         "orange/b.HEIC",
         "orange/c.avif",
     ]
+
+
+def test_pipes_and_sockets_are_no_photographs(tmp_path):
+    """Opening a named pipe would wait for a writer forever."""
+    save(tmp_path / "a.png", plain())
+    os.mkfifo(tmp_path / "pipe.png")
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(tmp_path / "socket.jpg"))
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [str(photograph.path) for photograph in found] == ["a.png"]
+    assert [str(path) for path in unsupported_files(tmp_path)] == ["pipe.png", "socket.jpg"]
+    os.mkfifo(tmp_path / "photos.csv")
+    with pytest.raises(InputError, match=r"photos\.csv .*not a regular file"):
+        find_photographs(tmp_path, CLASSES, "orange")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,316 @@
+"""Photographs become sRGB with 8 bits, whatever the file says about its colors."""
+
+import os
+import struct
+import warnings
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+
+from renderer.errors import InputError
+from renderer.io.images import read_image, read_rgb
+from renderer.io.meshes import load_mesh
+
+# CIE chromaticities of red, green, blue and white (SMPTE EG 432-1, Adobe RGB (1998),
+# ISO 22028-2 and ITU-R BT.2020).
+D65 = (0.3127, 0.329)
+SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, *D65)
+DISPLAY_P3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, *D65)
+ADOBE = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *D65)
+PRO_PHOTO = (0.734699, 0.265301, 0.159597, 0.840403, 0.036598, 0.000105, 0.34567, 0.3585)
+REC_2020 = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, *D65)
+# White of the connection space of ICC profiles, and Bradford's matrix.
+D50 = np.array([0.9642, 1, 0.8249])
+BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+COLOR = (230, 120, 40)
+
+
+def to_d50(primaries: tuple[float, ...]) -> np.ndarray:
+    """Compute the matrix from linear RGB to XYZ of the connection space of ICC profiles."""
+    x, y = np.reshape(primaries, (4, 2)).T
+    xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    matrix = xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
+    gains = (BRADFORD @ D50) / (BRADFORD @ xyz[:, 3])
+    return np.linalg.inv(BRADFORD) @ np.diag(gains) @ BRADFORD @ matrix
+
+
+def srgb_curve(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def stored(primaries: tuple[float, ...], gamma: float | None, color=COLOR) -> np.ndarray:
+    """Return the 8-bit values that stand for an sRGB color with a gamma, or sRGB's curve (None)."""
+    encoded = np.array(color) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    there = np.linalg.solve(to_d50(primaries), to_d50(SRGB) @ linear)
+    values = srgb_curve(there) if gamma is None else there ** (1 / gamma)
+    return np.round(values * 255).astype(np.uint8)
+
+
+def fixed(*numbers: float) -> bytes:
+    """Write numbers of the type s15Fixed16 of ICC profiles."""
+    return struct.pack(f">{len(numbers)}i", *(round(number * 65536) for number in numbers))
+
+
+def profile(space: bytes, curve: bytes, primaries: tuple[float, ...] = SRGB) -> bytes:
+    """Write a matrix or a gray ICC profile of version 2 (ICC.1:2001-04)."""
+    tags = {b"desc": b"desc" + bytes(4) + struct.pack(">I", 2) + b"a\0" + bytes(78)}
+    tags |= {b"cprt": b"text" + bytes(4) + b"a\0\0\0", b"wtpt": b"XYZ " + bytes(4) + fixed(*D50)}
+    if space == b"GRAY":
+        tags[b"kTRC"] = curve
+    else:
+        for name, column in zip((b"r", b"g", b"b"), to_d50(primaries).T, strict=True):
+            tags[name + b"XYZ"] = b"XYZ " + bytes(4) + fixed(*column)
+            tags[name + b"TRC"] = curve
+    offset = 128 + 4 + 12 * len(tags)
+    table, data = struct.pack(">I", len(tags)), b""
+    for name, content in tags.items():
+        table += name + struct.pack(">2I", offset + len(data), len(content))
+        data += content + bytes(-len(content) % 4)
+    header = struct.pack(
+        ">I4sI4s4s4s", offset + len(data), bytes(4), 0x2100000, b"mntr", space, b"XYZ "
+    )
+    header += bytes(12) + b"acsp" + bytes(28) + fixed(*D50)
+    return header.ljust(128, b"\0") + table + data
+
+
+def gamma_curve(gamma: float) -> bytes:
+    return b"curv" + bytes(4) + struct.pack(">IH", 1, round(gamma * 256)) + bytes(2)
+
+
+def srgb_table() -> bytes:
+    """Write sRGB's curve as a table of 1024 values."""
+    encoded = np.linspace(0, 1, 1024)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    values = np.round(linear * 65535).astype(">u2").tobytes()
+    return b"curv" + bytes(4) + struct.pack(">I", 1024) + values
+
+
+def png(size: tuple[int, int], depth: int, color_type: int, rows: bytes, **chunks: bytes) -> bytes:
+    """Write a PNG file byte by byte. `rows` are the packed rows of pixels."""
+
+    def chunk(name: str, data: bytes) -> bytes:
+        checksum = zlib.crc32(name.encode() + data)
+        return struct.pack(">I", len(data)) + name.encode() + data + struct.pack(">I", checksum)
+
+    width, height = size
+    stride = len(rows) // height
+    lines = b"".join(b"\0" + rows[row * stride : (row + 1) * stride] for row in range(height))
+    parts = [chunk("IHDR", struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0))]
+    parts += [chunk(name, data) for name, data in chunks.items()]
+    parts += [chunk("IDAT", zlib.compress(lines)), chunk("IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def read(path: Path) -> np.ndarray:
+    return np.asarray(read_rgb(path, 8)).astype(int)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
+@pytest.mark.parametrize(
+    ("primaries", "gamma"),
+    [(DISPLAY_P3, None), (ADOBE, 2.19921875), (PRO_PHOTO, 1.8)],
+    ids=["Display P3", "Adobe RGB", "ProPhoto"],
+)
+def test_a_photograph_with_an_icc_profile_becomes_srgb(tmp_path, suffix, primaries, gamma):
+    curve = srgb_table() if gamma is None else gamma_curve(gamma)
+    image = Image.new("RGB", (16, 16), tuple(map(int, stored(primaries, gamma))))
+    options = {"quality": 100} if suffix in ("jpg", "webp") else {}
+    if suffix == "webp":
+        options["lossless"] = True
+    path = tmp_path / f"a.{suffix}"
+    image.save(path, icc_profile=profile(b"RGB ", curve, primaries), **options)
+    assert np.abs(read(path) - COLOR).max() <= (3 if suffix == "jpg" else 2)
+
+
+def test_alpha_palettes_and_turned_images_keep_their_pixels_beside_a_profile(tmp_path):
+    color = tuple(map(int, stored(DISPLAY_P3, None)))
+    content = profile(b"RGB ", srgb_table(), DISPLAY_P3)
+    image = Image.new("RGBA", (16, 8), (*color, 255))
+    image.paste((*color, 0), (0, 0, 8, 8))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "a.png", icc_profile=content, exif=exif)
+    pixels = read(tmp_path / "a.png")
+    assert pixels.shape == (16, 8, 3)
+    assert (pixels[:8] == 255).all()
+    assert np.abs(pixels[8:] - COLOR).max() <= 2
+    image.convert("RGB").quantize(4).save(tmp_path / "p.png", icc_profile=content)
+    assert np.abs(read(tmp_path / "p.png") - COLOR).max() <= 2
+
+
+@pytest.mark.parametrize("name", ["own", "little cms"])
+def test_a_profile_of_srgb_changes_no_bit(tmp_path, name):
+    content = profile(b"RGB ", srgb_table())
+    if name == "little cms":
+        content = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    pixels = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=content)
+    np.testing.assert_array_equal(read(tmp_path / "a.png"), pixels)
+
+
+def test_a_gray_photograph_has_the_curve_of_its_profile(tmp_path):
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    expected = np.round(255 * srgb_curve((levels / 255) ** 1.8))
+    for mode, space in (("L", b"GRAY"), ("LA", b"GRAY"), ("L", b"RGB ")):
+        image = Image.fromarray(levels).convert(mode)
+        image.save(tmp_path / "a.png", icc_profile=profile(space, gamma_curve(1.8)))
+        assert np.abs(read(tmp_path / "a.png") - expected[..., None]).max() <= 1
+    sixteen = Image.fromarray(levels.astype(np.uint16) * 257)
+    sixteen.save(tmp_path / "a.png", icc_profile=profile(b"GRAY", gamma_curve(1.8)))
+    assert np.abs(read(tmp_path / "a.png") - expected[..., None]).max() <= 1
+
+
+def test_lab_pixels_become_srgb(tmp_path):
+    """In the memory of Pillow, a and b are shifted by 128."""
+    xyz = to_d50(SRGB) @ (((np.array(COLOR) / 255 + 0.055) / 1.055) ** 2.4) / D50
+    root = np.cbrt(xyz)
+    lab = [116 * root[1] - 16, 500 * (root[0] - root[1]), 200 * (root[1] - root[2])]
+    pixel = (round(lab[0] * 2.55), round(lab[1]) + 128, round(lab[2]) + 128)
+    Image.new("LAB", (8, 8), pixel).save(tmp_path / "a.tif")
+    assert np.abs(read(tmp_path / "a.tif") - COLOR).max() <= 2
+
+
+@pytest.mark.parametrize("kind", ["damaged", "of other channels"])
+def test_an_image_whose_profile_cannot_be_used_is_srgb_with_one_warning(tmp_path, kind):
+    content = kind.encode() if kind == "damaged" else profile(b"GRAY", gamma_curve(1.7))
+    for name in "ab":
+        Image.new("RGB", (8, 8), COLOR).save(tmp_path / f"{name}.png", icc_profile=content)
+    with pytest.warns(UserWarning, match="color profile"):
+        assert (read(tmp_path / "a.png") == COLOR).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (read(tmp_path / "b.png") == COLOR).all()
+
+
+def png_numbers(*numbers: float) -> bytes:
+    return struct.pack(f">{len(numbers)}I", *(round(number * 100_000) for number in numbers))
+
+
+@pytest.mark.parametrize(
+    ("primaries", "gamma", "chunks"),
+    [
+        (SRGB, 1.0, {"gAMA": png_numbers(1)}),
+        (SRGB, 1.8, {"gAMA": png_numbers(1 / 1.8)}),
+        (ADOBE, None, {"gAMA": png_numbers(0.45455), "cHRM": png_numbers(*D65, *ADOBE[:6])}),
+        (SRGB, None, {"gAMA": png_numbers(0.45455), "cHRM": png_numbers(*D65, *SRGB[:6])}),
+        (SRGB, None, {"sRGB": b"\0", "gAMA": png_numbers(1)}),
+        (DISPLAY_P3, None, {"cICP": bytes([12, 13, 0, 1])}),
+        (REC_2020, 1.0, {"cICP": bytes([9, 8, 0, 1]), "gAMA": png_numbers(0.45455)}),
+        (SRGB, None, {"cICP": bytes([1, 13, 0, 1])}),
+    ],
+)
+def test_the_color_chunks_of_a_png_file_count(tmp_path, primaries, gamma, chunks):
+    rows = bytes(stored(primaries, gamma)) * 4
+    (tmp_path / "a.png").write_bytes(png((2, 2), 8, 2, rows, **chunks))
+    tolerance = 0 if primaries == SRGB and gamma is None else 2
+    assert np.abs(read(tmp_path / "a.png") - COLOR).max() <= tolerance
+
+
+def test_a_png_file_of_high_dynamic_range_is_refused(tmp_path):
+    (tmp_path / "a.png").write_bytes(png((2, 2), 8, 2, bytes(12), cICP=bytes([9, 16, 0, 1])))
+    with pytest.raises(InputError, match="cICP"):
+        read_image(tmp_path / "a.png", 2)
+
+
+def test_the_mark_of_adobe_rgb_in_exif_data_counts(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    image = Image.new("RGB", (16, 16), tuple(map(int, stored(ADOBE, 2.19921875))))
+    image.save(tmp_path / "a.jpg", exif=exif, quality=100)
+    assert np.abs(read(tmp_path / "a.jpg") - COLOR).max() <= 3
+
+
+@pytest.mark.parametrize(
+    ("depth", "color_type", "pixels", "key", "expected"),
+    [
+        (1, 0, "10101010", 1, [255, 0] * 4),
+        (2, 0, "00011011", 2, [0, 85, 255, 255]),
+        (2, 0, "00011011", 0, [255, 85, 170, 255]),
+        (4, 0, "00110100", 4, [51, 255]),
+        (8, 0, f"{100:08b}{7:08b}", 100, [255, 7]),
+        (16, 0, f"{0x6440:016b}{0x6441:016b}", 0x6440, [255, 0x64]),
+    ],
+)
+def test_the_transparent_gray_of_a_png_file_is_transparent(
+    tmp_path, depth, color_type, pixels, key, expected
+):
+    row = int(pixels, 2).to_bytes(len(pixels) // 8, "big")
+    content = png((len(expected), 2), depth, color_type, 2 * row, tRNS=struct.pack(">H", key))
+    (tmp_path / "a.png").write_bytes(content)
+    np.testing.assert_array_equal(read(tmp_path / "a.png")[..., 1], [expected, expected])
+
+
+def test_the_transparent_color_of_16_bits_is_transparent(tmp_path):
+    row = struct.pack(">6H", 0x1000, 0x2000, 0x3000, 0x1100, 0x2000, 0x3000)
+    key = struct.pack(">3H", 0x1000, 0x2000, 0x3000)
+    (tmp_path / "a.png").write_bytes(png((2, 2), 16, 2, 2 * row, tRNS=key))
+    assert read(tmp_path / "a.png")[0].tolist() == [[255] * 3, [0x11, 0x20, 0x30]]
+
+
+def test_16_bit_tiff_files_are_turned_and_scaled(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    pixels = np.arange(6, dtype=np.uint16).reshape(2, 3) * 9000
+    Image.fromarray(pixels).save(tmp_path / "a.tif", exif=exif)
+    np.testing.assert_array_equal(read(tmp_path / "a.tif")[..., 0], np.rot90(pixels // 256))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float32])
+def test_tiff_files_whose_white_is_unknown_are_refused(tmp_path, dtype):
+    Image.fromarray(np.full((4, 4), 200, dtype)).save(tmp_path / "a.tif")
+    with pytest.raises(InputError, match="white is unknown"):
+        read_image(tmp_path / "a.tif", 2)
+
+
+@pytest.fixture
+def eps(tmp_path, monkeypatch) -> Path:
+    """Write an EPS file named .png, and a program in the place of Ghostscript."""
+    ran = tmp_path / "ran"
+    program = tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {ran}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)
+    content = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n"
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    with Image.open(path) as image, suppress(Exception):
+        image.load()
+    assert ran.exists(), "Pillow runs no Ghostscript any more, so nothing is left to prevent"
+    ran.unlink()
+    return path
+
+
+def test_an_eps_file_with_another_name_reaches_no_program(eps):
+    with pytest.raises(InputError, match=r"a\.png cannot be read"):
+        read_image(eps, 2)
+    assert not (eps.parent / "ran").exists()
+
+
+def test_an_eps_file_as_a_texture_reaches_no_program(eps):
+    lines = ["mtllib a.mtl", "usemtl a", "v 0 0 0", "v 1 0 0", "v 0 1 0", "vt 0 0", "vt 1 0"]
+    (eps.parent / "a.mtl").write_text("newmtl a\nmap_Kd a.png\n")
+    (eps.parent / "a.obj").write_text("\n".join([*lines, "vt 0 1", "f 1/1 2/2 3/3\n"]))
+    with pytest.raises(InputError, match=r"a\.obj"):
+        load_mesh(eps.parent / "a.obj")
+    assert not (eps.parent / "ran").exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "missing"])
+def test_only_regular_files_are_opened(tmp_path, kind):
+    path = tmp_path / "a.png"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=r"a\.png (is not a regular file|does not exist)"):
+        read_image(path, 2)
