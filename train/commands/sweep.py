@@ -35,7 +35,8 @@ from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system.user_errors import user_message, writable_folder
 from train.system.verbosity import is_verbose, shortened
-from train.training.run import load_runs
+from train.training.initial import with_label
+from train.training.run import Run, load_inputs, load_runs
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
 MAX_TABLE_LINES = 10
@@ -51,9 +52,9 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
         words: Words of the command line: settings and flags.
 
     Raises:
-        InputError: If two runs have the same settings, or if the folder of a
-            run has a run with other settings. This is checked before the
-            training.
+        InputError: If a run has a wrong setting or cannot read its inputs, if
+            two runs have the same settings, or if the folder of a run has a run
+            with other settings. This is checked before the training.
         SystemExit: With status 1, if a run is not finished at the end.
     """
     runs = _expand([word for word in words if not word.startswith("-")])
@@ -70,8 +71,17 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has two runs with the same settings: give each value once")
+    # Settings of the runs that have not begun, by the texts among their settings.
+    new_runs: dict[frozenset[str], tuple[Path, ExperimentSettings]] = {}
     for folder, overrides in zip(folders, runs, strict=True):
-        _require_usable_folder(folder, overrides, overwrite)
+        settings = with_label(read_settings(ExperimentSettings, compose("train", overrides)))
+        if _is_new(folder, settings, overwrite):
+            new_runs.setdefault(frozenset(filter(_is_text, overrides)), (folder, settings))
+    # Numbers are checked now. The files and networks that texts name are checked by loading them.
+    # The nodes of a cluster have other devices, so their runs are not loaded here.
+    for folder, settings in () if "launcher=slurm" in runs[0] else new_runs.values():
+        data, initial = load_inputs(settings)
+        Run(settings, data, folder, initial).load()
     # The names of the folders leave out settings that are the same in all runs.
     excluded = ",".join(map(quoted, shared_keys))
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{excluded}]")
@@ -98,12 +108,12 @@ def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
     return [override.partition("=")[0] for override in shared]
 
 
-def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bool) -> None:
-    """Check that a training run of a sweep may write to its folder.
+def _is_new(folder: Path, settings: ExperimentSettings, overwrite: bool) -> bool:
+    """Return whether a run of a sweep is new: its folder holds no run that goes on there.
 
     Args:
         folder: Folder of the run.
-        overrides: Settings of the run, such as ("seed=0", "train.epochs=3").
+        settings: Settings of the run.
         overwrite: Whether results of other commands in the folder may be
             replaced.
 
@@ -112,10 +122,16 @@ def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bo
             results of another command.
     """
     if is_finished(folder) or checkpoint.exists(folder):
-        settings = read_settings(ExperimentSettings, compose("train", overrides))
         require_same_run(folder, settings, finished=True)
-    else:
-        require_new_run(folder, "sweep", overwrite, resume=True)
+        return False
+    require_new_run(folder, "sweep", overwrite, resume=True)
+    return True
+
+
+def _is_text(override: str) -> bool:
+    """Return whether the value of a setting is neither a number nor true, false or null."""
+    value = OverridesParser.create().parse_override(override).value()
+    return not (value is None or isinstance(value, int | float))
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
@@ -215,7 +231,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
         folder: Folder of the run.
         overrides: Settings of the run, such as "seed=0", as Hydra escapes them.
     """
-    settings = read_settings(ExperimentSettings, config)
+    settings = with_label(read_settings(ExperimentSettings, config))
     settings.train.resume = checkpoint.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
     (run,) = load_runs({folder: settings}, command)

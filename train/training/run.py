@@ -133,7 +133,8 @@ class Run:
         for name, photographs in settings.evaluate.folders.items():
             require_outside(self.folder / name, photographs)
             _require_names(settings, self.data)
-            find_photographs(photographs, self.data.classes, settings.label)
+            with keyed("evaluate.photos"):
+                find_photographs(photographs, self.data.classes, settings.label)
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier = self._require_folder()
@@ -571,9 +572,7 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
         InputError: If the data set, the initial network, the settings or a
             folder cannot be used.
     """
-    shared_settings = next(iter(methods.values()))
-    initial = load_initial(shared_settings)
-    data = load_data(shared_settings, initial)
+    data, initial = load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
     for run in runs:
         run.load()
@@ -581,6 +580,12 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     for run in reversed(runs):
         run.begin()
     return runs
+
+
+def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
+    """Load the data set of a run, and the initial network if the run has one."""
+    initial = load_initial(settings)
+    return load_data(settings, initial), initial
 
 
 def _require_names(settings: ExperimentSettings, data: DataSet) -> None:

@@ -230,24 +230,46 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
             raise ZeroDivisionError("a mistake of the program")
         fit(run)
 
-    overrides = ["train.epochs=1", "train.learning_rate=-1,0.05,0.5"]
-    wrong = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=-1")
+    overrides = ["train.epochs=1", "train.learning_rate=0.05,0.5"]
     unlucky = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.5")
     with monkeypatch.context() as patch:
         patch.setattr(Run, "fit", broken)
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
-    assert "1 of 3 runs are finished\n" in printed
-    for folder, reason in [(wrong, "train.learning_rate=-1.0"), (unlucky, "ZeroDivisionError")]:
-        failure = (folder / FAILURE).read_text()
-        assert reason in failure
-        assert f"{folder}: failed: {failure}" in printed
+    assert "1 of 2 runs are finished\n" in printed
+    failure = (unlucky / FAILURE).read_text()
+    assert "ZeroDivisionError" in failure
+    assert f"{unlucky}: failed: {failure}" in printed
 
-    assert run_sweep(tmp_path, *overrides) == 1
-    printed = capsys.readouterr().out
-    assert "2 of 3 runs are finished\n" in printed
-    assert f"{wrong}: failed: " in printed
+    assert run_sweep(tmp_path, *overrides) == 0
+    assert "2 of 2 runs are finished\n" in capsys.readouterr().out
     assert not (unlucky / FAILURE).exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "start"),
+    [
+        ("train.learning_rat=1", "train.learning_rat is not a setting"),
+        ("train.learning_rate=0.05,-1", "train.learning_rate=-1.0"),
+        ("train.epochs=1,many", "train.epochs=many must be a whole number"),
+        ("augment=none,randm", "augment=randm is not a choice"),
+        ("train.soup=false,true", "train.soup=True needs a network to begin with"),
+        ("data.path=missing.npz", "data.path=missing.npz does not exist"),
+        ("train.init_from=null,missing.pt", "train.init_from"),
+        ("evaluate.photos=null,missing", "evaluate.photos: missing is not a folder"),
+        ("model.name=wideresnet,torchvision:resnet", "model.name"),
+        ("label=null", "label is not set"),
+    ],
+)
+def test_a_wrong_setting_of_any_run_fails_once_before_a_run_begins(
+    run_sweep, tmp_path, monkeypatch, capsys, override, start
+):
+    monkeypatch.chdir(tmp_path)
+    assert run_sweep(tmp_path / "sweep", override, "seed=0,1") == USER_ERROR
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"error: {start}")
+    assert printed.err.count("error:") == 1
+    assert not [*(tmp_path / "sweep").rglob("*.*")]
 
 
 def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, tmp_path):
