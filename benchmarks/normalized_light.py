@@ -113,7 +113,8 @@ def render(options: argparse.Namespace) -> None:
     for name, settings in parts(options.data, options.renders).items():
         folder = options.renders / name
         if not (folder / "lab.json").exists():
-            count = write_laboratory(LabSettings(out=str(folder), overwrite=True, **settings))
+            lab = LabSettings(out=str(folder), label="orange", overwrite=True, **settings)
+            count = write_laboratory(lab)
             print(f"{name}: {count} renders", flush=True)
 
 

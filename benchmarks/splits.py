@@ -346,7 +346,9 @@ def make(options: argparse.Namespace) -> None:
         divide_photographs(options.data / "photos", options.splits)
     for name, settings in parts(options.data.resolve(), extra).items():
         if not options.part or name in options.part:
-            lab = LabSettings(out=str(options.splits / name), size=options.size, **settings)
+            lab = LabSettings(
+                out=str(options.splits / name), label=LABEL, size=options.size, **settings
+            )
             print(name, write_laboratory(lab), "renders")
 
 

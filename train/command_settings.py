@@ -275,8 +275,9 @@ class LabSettings(Settings):
 
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
     label: Any = setting(
-        "orange",
-        "Positive class, or several. An object of each and one other object stand in each setup.",
+        None,
+        "Positive class, or several. An object of each and one other object stand in each setup. "
+        "null: orange, the class of the default meshes.",
         is_text=True,
     )
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
@@ -363,6 +364,13 @@ class LabSettings(Settings):
     def __post_init__(self) -> None:
         """Check all values, and that each pattern and each environment gets as many setups."""
         super().__post_init__()
+        if self.label is None and self.meshes != LAB_MESHES:
+            raise InputError(
+                "label is not set: give the class of the meshes that are no hard negatives, "
+                "label=CLASS",
+                "label",
+            )
+        self.label = "orange" if self.label is None else self.label
         families = {family for pattern in self.patterns for family in pattern.split("+")}
         for family in sorted(families):
             require_choice("patterns", family, PATTERNS)
@@ -510,9 +518,10 @@ class EvaluateSettings(ClassifierSettings):
         None, "python:package.module:function, if such a function made the run's network."
     )
     label: Any = setting(
-        "orange",
-        "Positive class, whose recall and false positives count, or several. "
-        "It is the class of a folder without sub-folders.",
+        None,
+        "Positive class, whose recall and false positives count, or several. It is the class of a "
+        "folder without sub-folders. null: what the run was trained for, or else each class that "
+        "has a sub-folder.",
         is_text=True,
     )
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
@@ -540,8 +549,8 @@ class EvaluateSettings(ClassifierSettings):
         """Check all values, and that the settings name one network."""
         super().__post_init__()
         require_calibration(self.false_positive_rate, self.calibrate)
-        # This call only checks the label.
-        label_names(self.label)
+        if self.label is not None:
+            label_names(self.label)  # This call only checks the label.
         if (self.run is None) == (self.classifier is None):
             raise InputError(
                 f"run={self.run} and classifier={self.classifier} do not name one network: "
@@ -613,7 +622,9 @@ class FitSettings(Settings):
         minimum=0,
         maximum=MAX_BOUNCES,
     )
-    label: str = setting("orange", "Class of the printed attack.")
+    label: str | None = setting(
+        None, "Class of the printed attack. null: the class that the name of the mesh tells."
+    )
     size: int = setting(64, "Pixels per side that are compared.", minimum=16, maximum=512)
     out: str = setting(
         "runs/fit",
@@ -664,8 +675,9 @@ class PublishSettings(Settings):
         "Folder of photographs as for pnb-evaluate. null: the threshold that it has, if any.",
     )
     label: Any = setting(
-        "orange",
-        "Class of the threshold, or several, each with its own.",
+        None,
+        "Class of the threshold, or several, each with its own. null: what the run was trained "
+        "for.",
         is_text=True,
     )
     model: str | None = setting_like(EvaluateSettings, "model", None)

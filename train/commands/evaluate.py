@@ -5,10 +5,12 @@ from pathlib import Path
 from augment.classifiers import Classifier
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from train.command_settings import EvaluateSettings
+from train.data.photographs import class_folders
 from train.evaluation.scores.scoring import format_overall, format_scores
 from train.functions.evaluate import evaluate as evaluate_network
+from train.report.summary import trained_labels
 from train.runs.saved_networks import load_chosen, load_run
-from train.settings import label_names
+from train.settings import label_names, published
 from train.system.device import choose_device
 from train.system.user_errors import keyed
 from train.system.verbosity import is_verbose
@@ -25,14 +27,21 @@ def evaluate(settings: EvaluateSettings) -> None:
             the photographs cannot be read.
     """
     network = _load_network(settings)
+    label = settings.label
+    if (
+        label is None
+        and settings.run
+        and class_folders(published(Path(settings.photos)), network.classes)
+    ):
+        label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
-        for name in label_names(settings.label):
+        for name in [] if label is None else label_names(label):
             network.label(name)
     with keyed(folder="photos"):
         scores = evaluate_network(
             network,
             settings.photos,
-            settings.label,
+            label,
             by=settings.by,
             calibrate=settings.calibrate,
             false_positive_rate=settings.false_positive_rate,
@@ -42,6 +51,9 @@ def evaluate(settings: EvaluateSettings) -> None:
             out=settings.out,
             overwrite=settings.overwrite,
         )
+    if settings.label is None:
+        source = "each class with a sub-folder" if label is None else f"those of {settings.run}"
+        print(f"positive classes: {', '.join(scores.predicted.labels)} ({source})")
     text = format_scores(scores) if is_verbose() else format_overall(scores)
     print(f"{text}\ntable, scores and image: {Path(settings.out)}")
 

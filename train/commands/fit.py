@@ -149,7 +149,7 @@ def attack_command(settings: AttackExperimentSettings) -> list[str]:
     words = [
         "pnb-attack",
         "attack=lighting",
-        f"label={settings.label}",
+        *([] if settings.label is None else [f"label={settings.label}"]),
         f"scene.meshes=[{{mesh: '{mesh['mesh']}', albedo_scale: {mesh['albedo_scale']:g}}}]",
         f"scene.polar={scene.polar:.3f}",
         f"scene.azimuth={scene.azimuth:.3f}",
@@ -180,7 +180,7 @@ def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, t
         Background and rendered image, encoded, shape
         (3, ATTACKED_SIZE, ATTACKED_SIZE) each.
     """
-    mesh = read_object(settings.scene.meshes[0], settings.label, "scene.meshes[0]")
+    mesh = read_object(settings.scene.meshes[0], settings.label or "", "scene.meshes[0]")
     device = torch.device("cpu")
     scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
     first_example = torch.arange(1)

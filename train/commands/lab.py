@@ -5,6 +5,7 @@ from pathlib import Path
 from train.command_settings import LabSettings
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.report.results import require_replaceable
+from train.settings import label_names
 
 
 def render_laboratory(settings: LabSettings) -> None:
@@ -19,4 +20,5 @@ def render_laboratory(settings: LabSettings) -> None:
     """
     require_replaceable(Path(settings.out), "out", settings.overwrite)
     count = write_laboratory(settings)
-    print(f"{settings.out}: {count} renders under {settings.setups} setups")
+    classes = " and ".join(label_names(settings.label))
+    print(f"{settings.out}: {count} renders of {classes} and others in {settings.setups} setups")

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifiers import Classifier
+from renderer.errors import InputError
 from train.command_settings import PublishSettings
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
 from train.networks import PYTHON
 from train.report.results import require_replaceable
-from train.report.summary import summarize
+from train.report.summary import summarize, trained_labels
 from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published
 from train.system.user_errors import keyed, writable_folder
@@ -45,8 +46,15 @@ def publish_network(settings: PublishSettings) -> None:
         # `load_run` raises an InputError if nobody could load the published network.
         network = load_run(path, model=settings.model)
         if settings.calibrate and settings.false_positive_rate:
+            label = settings.label if settings.label is not None else trained_labels(folder)
+            if not label:
+                raise InputError(
+                    f"label is not set, and run={folder} records no positive class: "
+                    "set label=CLASS",
+                    "label",
+                )
             state["operating_point"] = _calibrate(
-                network, settings.calibrate, settings.label, settings.false_positive_rate
+                network, settings.calibrate, label, settings.false_positive_rate
             )
     out.mkdir(parents=True, exist_ok=True)
     publish(out / PUBLISHED, state)

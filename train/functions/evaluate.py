@@ -30,6 +30,10 @@ from train.settings import label_names, published
 from train.system.device import MixedPrecision, choose_precision
 from train.system.user_errors import keyed, writable_folder
 
+# Largest number of classes that are positive because they have a sub-folder. The scores of each
+# class take as much time and memory as all photographs.
+MAX_LABELS = 50
+
 
 def evaluate(
     network: Classifier | Callable[[Tensor], Tensor],
@@ -167,6 +171,12 @@ def _choose_labels(
         raise InputError(
             f"folder={folder} has no sub-folder of a class of the network ({known}, ...): "
             "name the sub-folders by classes, or give classes or label"
+        )
+    if len(labels) > MAX_LABELS:
+        raise InputError(
+            f"folder={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
+            "are scored one by one: choose the positive classes with label",
+            "label",
         )
     return labels
 

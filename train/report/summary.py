@@ -261,6 +261,22 @@ def summarize(folder: Path) -> RunSummary:
     return summary
 
 
+def trained_labels(folder: Path) -> list[str]:
+    """Return the positive classes for which a run, or a published network, was trained.
+
+    Returns:
+        Names of the classes. Empty if the folder records none.
+    """
+    try:
+        run = summarize(folder)
+    except InputError:
+        return []
+    if "label" in run.settings:
+        return label_names(run.settings["label"])
+    scored = [[*scores.labels] for scores in run.photographs.values()]
+    return scored[0] if scored else []
+
+
 def _read(folder: Path) -> RunSummary | None:
     """Read the settings and scores in a folder.
 

@@ -1,6 +1,6 @@
 """The initial network, with whose weights a run begins, and the choice of validation images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,7 +14,12 @@ from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
 from train import console
-from train.class_names import with_class_names, with_classes_of_meshes
+from train.class_names import (
+    class_of_name,
+    name_of_mesh,
+    with_class_names,
+    with_classes_of_meshes,
+)
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, describe
@@ -186,6 +191,8 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     names = [] if settings.label is None else label_names(settings.label)
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
+    if len(names) == 1:
+        _print_assumed_class(settings.scene.meshes, names[0])
     if names and not may_have_index:
         return settings
     initial = load_initial(settings)
@@ -200,6 +207,17 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
             "label",
         )
     return with_classes_of_meshes(settings, initial.classes)
+
+
+def _print_assumed_class(meshes: Sequence[Any], label: str) -> None:
+    """Print which mesh files are taken for objects of a class that their names do not tell."""
+    others = [
+        item
+        for item in meshes
+        if isinstance(item, str) and class_of_name(name_of_mesh(item), [label]) is None
+    ]
+    if others:
+        console.warning("label=%s is the class of %s", label, ", ".join(others))
 
 
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:

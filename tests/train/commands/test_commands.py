@@ -26,8 +26,10 @@ from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network
 from train import console
 from train.command import USER_ERROR
+from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
+from train.report.summary import trained_labels
 from train.runs.run_lock import LOCK, sole_writer
 from train.runs.saved_networks import load_run
 
@@ -83,6 +85,44 @@ class TestEvaluation:
         assert call(*EVALUATE_CLASSIFIER, "classifier=run:1.10", "out=classifier") == 0
         same = (here / "classifier" / "predictions.csv").read_bytes()
         assert (scores / "predictions.csv").read_bytes() == same
+
+
+class TestEvaluationWithoutALabel:
+    """60 bottles in a folder without class folders were scored as oranges."""
+
+    def test_needs_one_for_a_folder_without_class_folders(self, call, here, capsys):
+        save_noise(here / "bottles" / "a.png", 64, np.random.default_rng(0))
+        words = [*EVALUATE[:2], "photos=bottles", *EVALUATE[3:]]
+        assert call(*words) == USER_ERROR
+        assert "give classes or label" in capsys.readouterr().err
+        assert call(*words, "label=fig", "out=scores") == 0
+        assert "1 images of fig" in capsys.readouterr().out
+
+    @pytest.mark.parametrize("recorded", [False, True])
+    def test_takes_the_class_of_the_run_or_else_those_with_a_folder(
+        self, call, here, capsys, monkeypatch, recorded
+    ):
+        save_noise(here / "2024" / "fig" / "a.png", 64, np.random.default_rng(0))
+        if recorded:
+            monkeypatch.setattr("train.commands.evaluate.trained_labels", lambda run: ["orange"])
+        assert call(*EVALUATE, "out=scores") == 0
+        summary = json.loads((here / "scores" / "summary.json").read_text())
+        assert summary["label"] == ("orange" if recorded else ["fig", "orange"])
+        assert "orange" in capsys.readouterr().out.partition("\n")[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"), [("best", ["orange"]), ("none", ["orange"]), ("laboratory", [])]
+)
+def test_published_networks_record_what_they_were_trained_for(name, labels):
+    assert trained_labels(Path("pretrained", name)) == labels
+
+
+def test_a_laboratory_of_other_meshes_needs_a_label():
+    assert LabSettings(out="lab").label == "orange"
+    assert LabSettings(out="lab", meshes=["can.glb"], label="can").label == "can"
+    with pytest.raises(InputError, match=r"^label is not set"):
+        LabSettings(out="lab", meshes=["can.glb"])
 
 
 class TestExportOfALightThatIsNegativeInPlaces:

@@ -45,7 +45,7 @@ def coarse_patterns() -> Iterator[None]:
 
 def settings(out: Path, **changes) -> LabSettings:
     small = {"setups": 4, "patterns": ["stripes", "half"], "size": 8, "spp": 4, "bounces": 2}
-    return LabSettings(**{"out": str(out), "meshes": MESHES, **small, **changes})
+    return LabSettings(**{"out": str(out), "meshes": MESHES, "label": "orange", **small, **changes})
 
 
 def draw(
