@@ -30,7 +30,16 @@ COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 # they also have, are checked separately.
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 # Names of the parameters of lens distortion in transforms.json.
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTION = (
+    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4"),
+    *("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"),
+)
+# Entries of transforms.json that name another kind of camera, as instant-ngp, Blender and
+# others write them.
+OTHER_CAMERAS = (
+    *("is_fisheye", "fisheye", "ortho_scale", "orthographic", "is_orthographic"),
+    *("equirectangular", "latlong", "rolling_shutter", "distortion_params"),
+)
 # Advice at the end of errors about lens distortion.
 UNDISTORT = "undistort the images first, for example with colmap image_undistorter"
 # Exceptions that Python raises if a file lacks an entry or has a wrong one.
@@ -57,8 +66,9 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
         Cameras by the names of their images, in the order of the file.
 
     Raises:
-        InputError: If a file is missing or damaged, has no cameras, or if a
-            camera has distortion.
+        InputError: If a file is missing or damaged, has no cameras, or has two
+            images of one name, or if a camera is not perspective or has
+            distortion.
 
     Example:
         >>> import json
@@ -99,15 +109,15 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
     require_file(cameras_path, "give a folder with cameras.txt and images.txt")
     # Intrinsic matrix and image size (width, height)
     # of each camera by its id in the file.
-    intrinsics_and_size = {}
-    cameras = {}
+    intrinsics_and_size: dict[str, tuple[np.ndarray, tuple[int, int]]] = {}
+    cameras: dict[str, PinholeCamera] = {}
     # The error below names the file that is being read.
     path = cameras_path
     try:
         for line in _lines(cameras_path):
             camera_id, model, width, height, *parameters = line.split()
             size = (int(width), int(height))
-            intrinsics_and_size[camera_id] = (_colmap_intrinsics(model, parameters), size)
+            _add(intrinsics_and_size, camera_id, (_colmap_intrinsics(model, parameters), size))
         path = folder / COLMAP_IMAGES
         for line in _image_lines(path):
             _, qw, qx, qy, qz, tx, ty, tz, camera_id, image_name = line.split(maxsplit=9)
@@ -117,7 +127,7 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
             view_matrix = np.column_stack([rotation, translation])
             intrinsics, size = intrinsics_and_size[camera_id]
             camera = PinholeCamera.from_matrix(view_matrix, intrinsics, size)
-            cameras[image_name.strip()] = camera
+            _add(cameras, image_name.strip(), camera)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except _DAMAGED_FILE_ERRORS as error:
@@ -127,18 +137,25 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
     return cameras
 
 
+def _add(values: dict[str, Any], name: str, value: object) -> None:
+    """Add a value to a dictionary, and raise InputError if it has the name already."""
+    if name in values:
+        raise InputError(f"{name} occurs twice: give each image and camera a name of its own")
+    values[name] = value
+
+
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines of a text file that are neither empty nor comments."""
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if line.strip() and not line.startswith("#"):
+    for line in path.read_text(encoding="utf-8-sig").splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
             yield line
 
 
 def _image_lines(path: Path) -> Iterator[str]:
     """Yield the line with the pose of each image from the file images.txt of COLMAP.
 
-    The file has two lines for each image. The second line lists points in the
-    image. It may be empty, and is skipped.
+    A second line of an image lists points in the image: x, y and the number of a
+    point in space for each. It may be empty or missing.
 
     Args:
         path: Path of images.txt.
@@ -146,11 +163,25 @@ def _image_lines(path: Path) -> Iterator[str]:
     Yields:
         First line of each image.
     """
-    lines = iter(path.read_text(encoding="utf-8").splitlines())
-    for line in lines:
-        if line.strip() and not line.startswith("#"):
+    require_file(path, "give a folder with cameras.txt and images.txt")
+    may_be_points = False
+    for line in _lines(path):
+        if may_be_points and _is_points(line):
+            may_be_points = False
+        else:
             yield line
-            next(lines, "")
+            may_be_points = True
+
+
+def _is_points(line: str) -> bool:
+    """Return whether a line consists of triples of two numbers and a whole number."""
+    words = line.split()
+    try:
+        np.array(words, dtype=float)
+        np.array(words[2::3], dtype=int)
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
 
 
 def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
@@ -232,7 +263,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
             distortion.
     """
     require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
-    cameras = {}
+    cameras: dict[str, PinholeCamera] = {}
     try:
         scene = json.loads(path.read_text(encoding="utf-8-sig"))
         for frame in scene["frames"]:
@@ -243,7 +274,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
             camera_to_world = np.array(frame["transform_matrix"], dtype=float)
             view_matrix = np.linalg.inv(camera_to_world)
             camera = PinholeCamera.from_matrix(view_matrix, intrinsics, size, "opengl")
-            cameras[str(frame["file_path"])] = camera
+            _add(cameras, str(frame["file_path"]), camera)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except _DAMAGED_FILE_ERRORS as error:
@@ -272,6 +303,11 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
     model = entries.get("camera_model", "PINHOLE")
     if model not in PERSPECTIVE:
         raise InputError(f"camera_model={model} is not supported: {UNDISTORT}")
+    for name in OTHER_CAMERAS:
+        value = entries.get(name)
+        # The motion of a rolling shutter is a list of numbers.
+        if any(value) if isinstance(value, list) else value:
+            raise InputError(f"{name}={value} is not supported: give perspective cameras")
     distortion_keys = [name for name in DISTORTION if entries.get(name)]
     if distortion_keys:
         raise InputError(
@@ -285,11 +321,21 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
     # point are then computed for an image of one pixel.
     width = int(entries.get("w", 1))
     height = int(entries.get("h", width))
-    if "fl_x" in entries:
-        focal_x = float(entries["fl_x"])
-    else:
-        focal_x = width / 2 / math.tan(float(entries["camera_angle_x"]) / 2)
-    focal_y = float(entries.get("fl_y", focal_x))
+    # Pixels are square if only one of the two is given.
+    given = [_focal_length(entries, "x", width), _focal_length(entries, "y", height)]
+    known = [length for length in given if length is not None]
+    if not known:
+        raise KeyError("fl_x")
+    focal_x, focal_y = known[0], known[-1]
     center_x = float(entries.get("cx", width / 2))
     center_y = float(entries.get("cy", height / 2))
     return _intrinsic_matrix(focal_x, focal_y, center_x, center_y), (width, height)
+
+
+def _focal_length(entries: Mapping[str, Any], axis: str, side: int) -> float | None:
+    """Read the focal length in pixels along an axis, "x" or "y". None if the file has none."""
+    if f"fl_{axis}" in entries:
+        return float(entries[f"fl_{axis}"])
+    if f"camera_angle_{axis}" in entries:
+        return side / 2 / math.tan(float(entries[f"camera_angle_{axis}"]) / 2)
+    return None

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,17 +28,29 @@ def expected_positions(view: int, focal_y: float = FOCAL_Y) -> np.ndarray:
     return np.stack([column - WIDTH / 2, HEIGHT / 2 - row], axis=1) / (HEIGHT / 2)
 
 
-def write_colmap(folder: Path, model: str, parameters: list[float]) -> None:
-    """Write the text files of a model with two images of one camera."""
+def write_colmap(
+    folder: Path,
+    model: str,
+    parameters: list[float],
+    points_of_images: Sequence[str | None] = ("", "1.5 2.5 -1 3.5 4.5 12"),
+) -> None:
+    """Write the text files of a model with two images of one camera.
+
+    Args:
+        folder: Folder of the files.
+        model: Camera model of COLMAP.
+        parameters: Its parameters.
+        points_of_images: Second line of each image. None leaves the line out.
+    """
     values = " ".join(map(str, parameters))
     camera = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {model} {WIDTH} {HEIGHT} {values}\n"
     (folder / "cameras.txt").write_text(camera)
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
-    points_of_images = ["", "1.5 2.5 -1 3.5 4.5 12"]
     for view, points in enumerate(points_of_images):
         quaternion = ROTATIONS[view].as_quat(scalar_first=True)
         numbers = " ".join(map(str, [*quaternion, *TRANSLATIONS[view]]))
-        lines += [f"{view + 1} {numbers} 7 {NAMES[view]}", points]
+        lines.append(f"{view + 1} {numbers} 7 {NAMES[view]}")
+        lines += [] if points is None else points.split("\n")
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
 
 
@@ -66,6 +79,67 @@ def require_expected(path: Path, focal_y: float = FOCAL_Y) -> None:
 def test_points_are_where_cameras_of_colmap_see_them(tmp_path):
     write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
     require_expected(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        (None, None),
+        (None, ""),
+        ("# comment", "  # comment"),
+        ("\n# comment", None),
+        ("1.5 2.5 -1", None),
+        ("100 200 7 3 4 8 5 6 9 10 11 12", "1 2 3 4 5 6 7 8 9"),
+        ("1e2 2.5 -1", "1 2 -1\n\n"),
+    ],
+)
+def test_images_of_colmap_are_read_with_and_without_their_lines_of_points(tmp_path, points):
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y], points)
+    require_expected(tmp_path)
+
+
+def test_a_name_that_occurs_twice_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.NAMES", ["a b.png", "a b.png"])
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
+    with pytest.raises(InputError, match=r"images\.txt: a b\.png occurs twice"):
+        renderer.load_cameras(tmp_path)
+    write_transforms(tmp_path / "a.json", camera_angle_x=1.0)
+    with pytest.raises(InputError, match=r"a\.json: a b\.png occurs twice"):
+        renderer.load_cameras(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"is_fisheye": True},
+        {"ortho_scale": 2.5},
+        {"rolling_shutter": [0, 0, 0.1, 0]},
+        {"distortion_params": [0.1, 0, 0, 0]},
+        {"ftheta_p1": 0.4},
+    ],
+)
+@pytest.mark.parametrize("of_frame", [False, True])
+def test_entries_that_name_another_kind_of_camera_are_refused(tmp_path, entries, of_frame):
+    path = tmp_path / "a.json"
+    write_transforms(path, camera_angle_x=1.0, **({} if of_frame else entries))
+    if of_frame:
+        scene = json.loads(path.read_text())
+        scene["frames"][1] |= entries
+        path.write_text(json.dumps(scene))
+    with pytest.raises(InputError, match=next(iter(entries))):
+        renderer.load_cameras(path)
+
+
+def test_entries_that_change_no_image_are_ignored(tmp_path):
+    """Poses stay in the coordinates of the file, whatever was applied to them before."""
+    ignored = {"is_fisheye": False, "ortho_scale": None, "rolling_shutter": [0, 0, 0, 0]}
+    ignored |= {"aabb_scale": 16, "scale": 0.5, "offset": [1, 2, 3], "applied_scale": 0.25}
+    angles = {
+        "camera_angle_x": 2 * math.atan(WIDTH / 2 / FOCAL_X),
+        "camera_angle_y": 2 * math.atan(HEIGHT / 2 / FOCAL_Y),
+    }
+    write_transforms(tmp_path / "a.json", **angles, **ignored, cx=CENTER_X, cy=CENTER_Y)
+    require_expected(tmp_path / "a.json")
 
 
 def test_a_simple_pinhole_has_one_focal_length(tmp_path):
