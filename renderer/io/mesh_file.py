@@ -2,6 +2,8 @@
 
 import io
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
@@ -11,13 +13,16 @@ import torch
 from PIL import Image
 
 from renderer.errors import MAX_MAGNITUDE
-from renderer.geometry.mesh import Mesh
+from renderer.geometry.mesh import NO_TEXTURE, Mesh
+from renderer.geometry.polygons import triangulate
 from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
-_TOLERANCE = 1e-3
+TOLERANCE = 1e-3
+# Opacity above which a surface counts as opaque.
+OPAQUE = 1 - TOLERANCE
 
 
 class Part(NamedTuple):
@@ -121,19 +126,110 @@ def require_bounded(**values: np.ndarray) -> None:
             raise ValueError(f"{name} are not finite or beyond {MAX_MAGNITUDE:g}")
 
 
+def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
+    """Parse numbers between blanks or line breaks."""
+    is_blank = np.frombuffer(b" " + text, dtype=np.uint8) <= ord(" ")
+    count = np.count_nonzero(is_blank[:-1] & ~is_blank[1:])
+    with warnings.catch_warnings():
+        # NumPy stops with a warning at a word that is no number.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        numbers: np.ndarray = np.fromstring(text, dtype, sep=" ")
+    if len(numbers) != count:
+        raise ValueError(f"number {len(numbers) + 1} of {count} is damaged: export the file again")
+    return numbers
+
+
+def words_per_line(text: bytes) -> np.ndarray:
+    """Count the words of each line of a text that ends with a line break."""
+    characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
+    is_blank = characters <= ord(" ")
+    lines = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
+    return np.bincount(lines, minlength=text.count(b"\n"))
+
+
+def triangles_of(
+    file: MeshFile, vertices: np.ndarray, indices: np.ndarray, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Divide the faces of a file into triangles.
+
+    Args:
+        file: File, for notes about unusual faces.
+        vertices: Vertex positions, shape (V, 3).
+        indices: Vertex indices of all faces, one face after the other, shape (C,).
+        sizes: Number of corners of each face, shape (P,).
+
+    Returns:
+        A tuple of
+        - the places in `indices` of the corners of the triangles, shape (T, 3);
+        - the face of each triangle, shape (T,).
+    """
+    require_bounded(coordinates=vertices)
+    highest = len(vertices) - 1
+    if len(indices) and not 0 <= indices.min() <= indices.max() <= highest:
+        raise ValueError(f"a face has a vertex that is not from 0 to {highest}")
+    is_face = sizes >= 3
+    if not is_face.all():
+        file.ignore("faces with fewer than 3 corners")
+    places = np.flatnonzero(is_face.repeat(sizes))
+    corners, polygons, crossing_count = triangulate(vertices[indices[places]], sizes[is_face])
+    if crossing_count:
+        file.assume(f"{crossing_count} faces intersect themselves, so their shape is unclear")
+    return places[corners], np.flatnonzero(is_face)[polygons]
+
+
+def colored_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    uvs: np.ndarray | None = None,
+    texture_ids: np.ndarray | None = None,
+    textures: Sequence[np.ndarray] = (),
+) -> Mesh:
+    """Create a matte mesh from the arrays of a file.
+
+    Args:
+        vertices: Vertex positions, shape (V, 3).
+        faces: Vertex indices, shape (F, 3).
+        colors: sRGB-encoded colors in [0, 1] that broadcast to (F, 3, 3).
+        uvs: Texture coordinates of the corners, or NaN, shape (F, 3, 2). None
+            without textures.
+        texture_ids: Index of the texture of each face, or `NO_TEXTURE`, shape (F,).
+            None without textures.
+        textures: Textures, uint8, shape (H, W, 3) each.
+    """
+    mesh = Mesh.plain(vertices, faces)
+    corner_colors = np.broadcast_to(colors, mesh.corner_colors.shape).astype(np.float32)
+    mesh = replace(mesh, corner_colors=corner_colors)
+    if not textures or uvs is None or texture_ids is None:
+        return mesh
+    is_textured = texture_ids != NO_TEXTURE
+    if np.isnan(uvs[is_textured]).any():
+        raise ValueError("faces with a texture have no texture coordinates")
+    require_bounded(texture_coordinates=uvs[is_textured])
+    return replace(
+        mesh,
+        corner_uvs=np.where(is_textured[:, None, None], uvs, 0).astype(np.float32),
+        texture_ids=texture_ids.astype(np.int32),
+        textures=tuple(textures),
+    )
+
+
 def unit_colors(colors: np.ndarray, file: MeshFile) -> np.ndarray:
-    """Convert colors to [0, 1]: unsigned integers by their maximum, and numbers from 0 to 255."""
-    if colors.dtype.kind == "u":
+    """Convert colors to [0, 1].
+
+    Unsigned integers of 8 and 16 bits are divided by their maximum. Other numbers
+    are from 0 to 1, or from 0 to 255.
+    """
+    if colors.dtype in (np.uint8, np.uint16):
         return colors / np.iinfo(colors.dtype).max
-    colors = colors.astype(np.float64)
-    highest = colors.max(initial=0)
-    if highest > 1 + _TOLERANCE and highest <= 255 and (colors == np.round(colors)).all():
-        file.assume("colors above 1 are taken as values from 0 to 255")
+    is_whole = (colors == np.round(colors)).all()
+    if colors.dtype.kind in "iu" or (is_whole and 1 + TOLERANCE < colors.max(initial=0) <= 255):
+        file.assume("colors are taken as values from 0 to 255")
         colors = colors / 255
     # A comparison with NaN is False, so `not` also finds NaN.
-    if not ((colors >= -_TOLERANCE) & (colors <= 1 + _TOLERANCE)).all():
-        raise ValueError("colors are out of range: give values from 0 to 1 or bytes")
-    return colors.clip(0, 1)
+    if not ((colors >= -TOLERANCE) & (colors <= 1 + TOLERANCE)).all():
+        raise ValueError("colors are out of range: give values from 0 to 1, or bytes")
+    return colors.astype(np.float64).clip(0, 1)
 
 
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:

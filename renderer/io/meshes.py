@@ -33,7 +33,10 @@ from renderer.image import encode
 from renderer.io.images import eight_bits
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.io.obj import read_obj
+from renderer.io.off import read_off
+from renderer.io.ply import read_ply
 from renderer.io.skins import skinned, with_skins_as_attributes
+from renderer.io.stl import read_stl
 from renderer.validation import as_path, require_flag
 
 # Suffixes of archive files, which are not read. trimesh could read them,
@@ -44,7 +47,7 @@ ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 # a file. For .obj, .ply and .dae files, only the log tells.
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")
 # Readers of our own. trimesh reads the other formats.
-READERS = {"obj": read_obj}
+READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
 # Number that stands for the type float32 in glTF 2.0 (section 3.6.2.2).
 FLOAT = 5126
 # Numbers for the kinds of glTF primitives that consist

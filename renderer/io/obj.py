@@ -1,14 +1,25 @@
 """Read .obj files and their material libraries, which are .mtl files."""
 
 import re
-import warnings
 from typing import NamedTuple
 
 import numpy as np
 
-from renderer.geometry.mesh import NO_TEXTURE, Mesh
-from renderer.geometry.polygons import triangulate
-from renderer.io.mesh_file import MeshFile, Part, as_utf8, product, require_bounded, unit_colors
+from renderer.geometry.mesh import NO_TEXTURE
+from renderer.io.mesh_file import (
+    OPAQUE,
+    TOLERANCE,
+    MeshFile,
+    Part,
+    as_utf8,
+    colored_mesh,
+    parse_numbers,
+    product,
+    require_bounded,
+    triangles_of,
+    unit_colors,
+    words_per_line,
+)
 
 # Statements that describe the surface or name groups of faces.
 _READ = {"v", "vt", "vn", "f", "usemtl", "mtllib", "g", "o"}
@@ -26,12 +37,8 @@ _OPTION = re.compile(
 _HARMLESS_OPTIONS = {"-blendu", "-blendv", "-texres", "-bm", "-boost"}
 # Options of textures that leave the colors as they are if they have these values.
 _NEUTRAL_VALUES = {"-o": [0, 0, 0], "-s": [1, 1, 1], "-t": [0, 0, 0], "-mm": [0, 1]}
-# Index for a corner without texture coordinates or normal.
-_ABSENT = -1
 # End of the text of a corner that leaves out an index.
 _LEFT_OUT = -(10**18)
-# Opacity above which a surface counts as opaque.
-_OPAQUE = 0.999
 
 # Keywords of the properties of a material, with their values.
 _Properties = list[tuple[str, str]]
@@ -71,10 +78,7 @@ class _Lines(NamedTuple):
         if text.count(self.keyword) != text.count(b"\n"):
             raise ValueError(f"a line {self.keyword.decode()} is damaged: export the file again")
         text = text.replace(self.keyword, b"")
-        characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
-        is_blank = characters <= ord(" ")
-        line_of_word = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
-        return np.bincount(line_of_word, minlength=text.count(b"\n")), text
+        return words_per_line(text), text
 
 
 class _Material(NamedTuple):
@@ -102,43 +106,36 @@ def read_obj(file: MeshFile) -> list[Part]:
     vertices, vertex_colors = _vertices(lines["v"], file)
     uvs, _ = _table(lines["vt"], (1, 2, 3))
     normals, _ = _table(lines["vn"], (3,))
-    require_bounded(coordinates=vertices, normals=normals, texture_coordinates=uvs)
+    require_bounded(normals=normals, texture_coordinates=uvs)
     line_numbers, indices, sizes = _polygons(lines, file)
-    if not len(sizes):
+    corners, polygons = triangles_of(file, vertices, indices[:, 0], sizes)
+    if not len(corners):
         return []
-    triangles, polygons, crossing_count = triangulate(vertices[indices[:, 0]], sizes)
-    if crossing_count:
-        file.assume(f"{crossing_count} faces intersect themselves, so their shape is unclear")
-    corners = indices[triangles]
+    faces, uv_ids, normal_ids = np.moveaxis(indices[corners], 2, 0)
     materials, material_of_polygon = _materials(lines, line_numbers, file)
     material_of_face = material_of_polygon[polygons]
     colors = np.array([material.color for material in materials])[material_of_face, None]
     if vertex_colors is not None:
-        colors = product(colors, vertex_colors[corners[..., 0]])
+        colors = product(colors, vertex_colors[faces])
     # Textures by their names, because several materials may have the same.
     names = list(dict.fromkeys(material.texture for material in materials if material.texture))
     ids = [names.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
-    texture_ids = np.array(ids, dtype=np.int32)[material_of_face]
-    is_textured = texture_ids != NO_TEXTURE
-    if (corners[is_textured, :, 1] == _ABSENT).any():
-        raise ValueError("faces with a texture have no texture coordinates")
-    corner_uvs = np.zeros((len(corners), 3, 2), dtype=np.float32)
-    corner_uvs[is_textured] = uvs[corners[is_textured, :, 1], :2]
+    # The row at the end is for corners without texture coordinates, whose index is -1.
+    corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
     is_clamped = np.array([material.is_clamped for material in materials])[material_of_face]
-    if is_clamped.any() and not (np.abs(corner_uvs[is_clamped] - 0.5) <= 0.5).all():
+    if (np.abs(corner_uvs[is_clamped] - 0.5) > 0.5).any():
         raise ValueError("textures with the option -clamp are not supported beyond their edges")
-    mesh = Mesh(
-        vertices=vertices,
-        faces=corners[..., 0],
-        corner_colors=np.broadcast_to(colors, (len(corners), 3, 3)).astype(np.float32),
-        corner_uvs=corner_uvs,
-        texture_ids=texture_ids,
-        textures=tuple(file.texture(name) for name in names),
+    mesh = colored_mesh(
+        vertices,
+        faces,
+        colors,
+        corner_uvs,
+        np.array(ids)[material_of_face],
+        [file.texture(name) for name in names],
     )
     if not len(normals):
         return [Part(mesh)]
-    # A row of zeros at the end is the normal of corners without a normal.
-    return [Part(mesh, np.concatenate([normals, np.zeros((1, 3))])[corners[..., 2]])]
+    return [Part(mesh, np.append(normals, [[0.0] * 3], axis=0)[normal_ids])]
 
 
 def _cleaned(text: bytes) -> bytes:
@@ -170,17 +167,6 @@ def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
     return lines
 
 
-def _numbers(text: bytes, dtype: type, count: int) -> np.ndarray:
-    """Parse numbers between blanks, and check how many they are."""
-    with warnings.catch_warnings():
-        # NumPy stops with a warning at a word that is no number.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        numbers: np.ndarray = np.fromstring(text, dtype, sep=" ")
-    if len(numbers) != count:
-        raise ValueError(f"number {len(numbers) + 1} of {count} is damaged: export the file again")
-    return numbers
-
-
 def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Parse lines of numbers as an array with zeros at the end of short lines.
 
@@ -198,7 +184,7 @@ def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
         )
     table = np.zeros((len(counts), max(lengths)))
     is_given = np.arange(max(lengths)) < counts[:, None]
-    table[is_given] = _numbers(text, np.float64, counts.sum())
+    table[is_given] = parse_numbers(text, np.float64)
     return table, counts
 
 
@@ -224,7 +210,7 @@ def _polygons(
         A tuple of
         - the numbers of the lines of the faces, shape (P,);
         - the indices of the position, the texture coordinates and the normal of
-          each corner of all faces, or `_ABSENT`, shape (C, 3);
+          each corner of all faces, or -1, shape (C, 3);
         - the number of corners of each face, shape (P,).
     """
     line_numbers = lines["f"].numbers()
@@ -243,11 +229,8 @@ def _polygons(
                 f"a face has the index {wrong[0]} of {keyword}, "
                 f"but the file has {len(numbers)} lines {keyword}"
             )
-        indices[:, column] = np.where(is_given, resolved, _ABSENT)
-    is_face = sizes >= 3
-    if not is_face.all():
-        file.ignore("faces with fewer than 3 corners")
-    return line_numbers[is_face], indices[is_face.repeat(sizes)], sizes[is_face]
+        indices[:, column] = np.where(is_given, resolved, -1)
+    return line_numbers, indices, sizes
 
 
 def _corners(words: list[bytes]) -> np.ndarray:
@@ -267,7 +250,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
     if columns.max() > 2:
         raise ValueError("a corner of a face has more than three indices")
     table = np.full((len(words), 3), _LEFT_OUT)
-    table[corners, columns] = _numbers(text.replace(b"/", b" "), np.int64, len(columns))
+    table[corners, columns] = parse_numbers(text.replace(b"/", b" "), np.int64)
     return table
 
 
@@ -355,7 +338,7 @@ def _material(name: str, library: dict[str, _Properties] | None, file: MeshFile)
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:
                 file.ignore(keyword)
-    if not opacities.get("d", 1 - opacities.get("tr", 0)) >= _OPAQUE:
+    if not opacities.get("d", 1 - opacities.get("tr", 0)) >= OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
     return material
 
@@ -364,7 +347,7 @@ def _color(text: str) -> tuple[float, ...]:
     """Parse a color of one gray value, or of red, green and blue."""
     values = [float(word) for word in text.partition("#")[0].split()]
     # A comparison with NaN is False, so `not` also finds NaN.
-    if len(values) not in (1, 3) or not all(0 <= value <= 1.001 for value in values):
+    if len(values) not in (1, 3) or not all(0 <= value <= 1 + TOLERANCE for value in values):
         raise ValueError(f'"Kd {text}" is not a color: give red, green and blue from 0 to 1')
     return tuple(min(value, 1.0) for value in values * (3 // len(values)))
 

@@ -23,6 +23,10 @@ WHITE = (1.0, 1.0, 1.0)
 GRAY = (0.5, 0.5, 0.5)
 IGNORED = "ignored"
 REFUSED = "refused"
+ASSUMED = "assumed"
+# Words in the warnings.
+WARNINGS = {IGNORED: "ignored", ASSUMED: "taken as"}
+RGB = "uchar red;uchar green;uchar blue"
 
 Files = Mapping[str, str | bytes]
 
@@ -35,7 +39,7 @@ class Row(NamedTuple):
         feature: Feature of the format.
         files: Contents of the files. The first file is the mesh, a white triangle
             with the corners (0, 0, 0), (1, 0, 0) and (0, 1, 0), apart from the feature.
-        outcome: `IGNORED`, `REFUSED`, or the color of all corners that is read.
+        outcome: `IGNORED`, `REFUSED`, `ASSUMED`, or the color of all corners that is read.
     """
 
     format: str
@@ -73,6 +77,57 @@ def obj(
     }
 
 
+def ply(
+    vertex: str = "",
+    face: str = "",
+    header: str = "",
+    values: tuple[str, str] = ("", ""),
+    corners: tuple[str, ...] = ("0 0 0", "1 0 0", "0 1 0"),
+    tail: str = "",
+) -> dict[str, str | bytes]:
+    """Return a .ply file with more properties of vertices and faces, and their values."""
+    lines = ["ply", "format ascii 1.0", *header.split(";")]
+    lines += ["element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"property {name}" for name in vertex.split(";") if name]
+    lines += ["element face 1", "property list uchar int vertex_indices"]
+    lines += [f"property {name}" for name in face.split(";") if name]
+    lines += [*tail.split(";")[:-1], "end_header"]
+    lines += [f"{corner} {values[0]}" for corner in corners]
+    lines += [f"3 0 1 2 {values[1]}", tail.split(";")[-1]]
+    text = "\n".join(line for line in lines if line)
+    images = {
+        f"{name}.png": png_of(*color) for name, color in (("red", (255, 0, 0)), ("b", (0, 0, 9)))
+    }
+    return {"mesh.ply": text, **images}
+
+
+def off(header: str = "OFF", vertex: str = "", face: str = "") -> dict[str, str | bytes]:
+    """Return an .off file with more numbers for each vertex and for the face."""
+    corners = ("0 0 0", "1 0 0", "0 1 0")
+    lines = [header, "3 1 0", *(f"{corner} {vertex}" for corner in corners), f"3 0 1 2 {face}"]
+    return {"mesh.off": "\n".join(lines)}
+
+
+def stl(attribute: int, header: bytes = b"", face_count: int = 1) -> dict[str, str | bytes]:
+    """Return a binary .stl file."""
+    numbers = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], dtype="<f4").tobytes()
+    start = header.ljust(80, b" ") + face_count.to_bytes(4, "little")
+    return {"mesh.stl": start + numbers + attribute.to_bytes(2, "little")}
+
+
+STL_TEXT = """solid vertex
+facet normal 0 0 1
+ outer loop
+  vertex 0 0 0
+\tVERTEX 1e0 0 0
+  vertex 0 1 0
+ endloop
+endfacet
+endsolid"""
+UV = "list uchar float texcoord"
+UVS = "6 0 0 1 0 0 1"
+IMAGE = "comment TextureFile red.png"
+IMAGES = f"{IMAGE};comment TextureFile b.png"
 TEXTURED = "f 1/1 2/2 3/3"
 ROWS = [
     Row("obj", "triangle", obj(), WHITE),
@@ -189,6 +244,152 @@ ROWS = [
         Row("obj", option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), REFUSED)
         for option in ("-s 2 2 1", "-o 0.5", "-t 1", "-mm 0 2", "-cc on", "-imfchan r")
     ),
+    Row("ply", "triangle", ply(), WHITE),
+    Row("ply", "uchar red", ply("uchar red;uchar green;uchar blue", values=("255 0 0", "")), RED),
+    Row(
+        "ply",
+        "ushort red",
+        ply("ushort red;ushort green;ushort blue", values=("65535 0 0", "")),
+        RED,
+    ),
+    Row("ply", "float red", ply("float red;float green;float blue", values=("1 0 0", "")), RED),
+    Row("ply", "int red", ply("int red;int green;int blue", values=("255 0 0", "")), ASSUMED),
+    Row(
+        "ply",
+        "float red to 255",
+        ply("float red;float green;float blue", values=("255 0 0", "")),
+        ASSUMED,
+    ),
+    Row(
+        "ply",
+        "float red 2.5",
+        ply("float red;float green;float blue", values=("2.5 0 0", "")),
+        REFUSED,
+    ),
+    Row("ply", "r g b", ply("uchar r;uchar g;uchar b", values=("255 0 0", "")), RED),
+    Row(
+        "ply",
+        "diffuse_red",
+        ply("uchar diffuse_red;uchar diffuse_green;uchar diffuse_blue", values=("255 0 0", "")),
+        RED,
+    ),
+    Row(
+        "ply",
+        "red and r",
+        ply("uchar r;uchar g;uchar b;uchar red;uchar green;uchar blue", values=("9 9 9 8 8 8", "")),
+        REFUSED,
+    ),
+    Row("ply", "alpha 255", ply(f"{RGB};uchar alpha", values=("255 0 0 255", "")), RED),
+    Row("ply", "alpha", ply(f"{RGB};uchar alpha", values=("255 0 0 25", "")), REFUSED),
+    Row("ply", "face red", ply(face=RGB, values=("", "255 0 0")), RED),
+    Row("ply", "face and vertex red", ply(RGB, RGB, values=("255 255 0", "0 255 255")), GREEN),
+    Row("ply", "nx, ny, nz", ply("float nx;float ny;float nz", values=("0 0 1", "")), WHITE),
+    Row("ply", "confidence", ply("float confidence", values=("0.5", "")), IGNORED),
+    Row("ply", "face flags", ply(face="int flags", values=("", "1")), IGNORED),
+    Row("ply", "material_index", ply(face="int material_index", values=("", "1")), REFUSED),
+    Row("ply", "edges", ply(tail="element edge 1;property int vertex1;0"), IGNORED),
+    Row("ply", "materials", ply(tail="element material 1;property int red;0"), REFUSED),
+    Row(
+        "ply",
+        "multi_texture_face",
+        ply(tail="element multi_texture_face 1;property int tx;0"),
+        REFUSED,
+    ),
+    *(
+        Row(
+            "ply",
+            f"texture, {u}",
+            ply(f"float {u};float {v}", header=IMAGE, values=("0 0", "")),
+            RED,
+        )
+        for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+    ),
+    Row("ply", "s without texture", ply("float s;float t", values=("0 0", "")), WHITE),
+    Row("ply", "texture without uvs", ply(header=IMAGE), REFUSED),
+    Row("ply", "texcoord", ply(face=UV, header=IMAGE, values=("", UVS)), RED),
+    Row("ply", "texcoord of no face", ply(face=UV, header=IMAGE, values=("", "0")), REFUSED),
+    Row("ply", "short texcoord", ply(face=UV, header=IMAGE, values=("", "4 0 0 1 1")), REFUSED),
+    Row("ply", "texcoord without texture", ply(face=UV, values=("", UVS)), WHITE),
+    Row(
+        "ply",
+        "texnumber 0",
+        ply(face=f"{UV};int texnumber", header=IMAGES, values=("", f"{UVS} 0")),
+        RED,
+    ),
+    Row(
+        "ply",
+        "texnumber -1",
+        ply(face=f"{UV};int texnumber", header=IMAGES, values=("", f"{UVS} -1")),
+        WHITE,
+    ),
+    Row(
+        "ply",
+        "texnumber 2",
+        ply(face=f"{UV};int texnumber", header=IMAGES, values=("", f"{UVS} 2")),
+        REFUSED,
+    ),
+    Row(
+        "ply",
+        "two textures without texnumber",
+        ply(face=UV, header=IMAGES, values=("", UVS)),
+        REFUSED,
+    ),
+    Row(
+        "ply",
+        "missing texture",
+        ply("float s;float t", header="comment TextureFile x.png", values=("0 0", "")),
+        REFUSED,
+    ),
+    Row("ply", "too many numbers", ply(values=("0", "")), REFUSED),
+    Row("ply", "too few numbers", ply("float s;float t", values=("0", "")), REFUSED),
+    Row("ply", "word", ply("float s", values=("x", "")), REFUSED),
+    Row("ply", "nan", ply(corners=("0 0 nan", "1 0 0", "0 1 0")), REFUSED),
+    Row("ply", "fraction of a byte", ply(RGB, values=("0.5 0 0", "")), REFUSED),
+    Row("ply", "byte 256", ply(RGB, values=("256 0 0", "")), REFUSED),
+    Row("ply", "element without properties", ply(tail="element x 1000000000000;"), REFUSED),
+    Row("off", "triangle", off(), WHITE),
+    Row("off", "OFF3 1 0", {"mesh.off": off()["mesh.off"].replace("OFF\n", "OFF")}, WHITE),
+    Row("off", "COFF 255", off("COFF", "255 0 0"), RED),
+    Row("off", "COFF 255 and alpha", off("COFF", "255 0 0 255"), RED),
+    Row("off", "COFF 1.0", off("COFF", "1.0 0.0 0.0"), RED),
+    Row("off", "COFF and alpha", off("COFF", "1.0 0 0 0.5"), REFUSED),
+    Row("off", "COFF without colors", off("COFF"), REFUSED),
+    Row("off", "OFF with colors", off("OFF", "1 0 0"), REFUSED),
+    Row("off", "NOFF", off("NOFF", "0 0 1"), WHITE),
+    Row("off", "NCOFF", off("CNOFF", "0 0 1 255 0 0"), RED),
+    Row("off", "STOFF", off("STOFF", "0.5 0.5"), WHITE),
+    Row("off", "STCNOFF", off("STCNOFF", "0 0 1 255 0 0 255 0.5 0.5"), RED),
+    Row("off", "4OFF", off("4OFF", "1"), REFUSED),
+    Row("off", "nOFF", off("nOFF"), REFUSED),
+    Row("off", "binary", off("OFF BINARY"), REFUSED),
+    Row("off", "face color 255", off(face="255 0 0"), RED),
+    Row("off", "face color 255 and alpha", off(face="255 0 0 255"), RED),
+    Row("off", "face color 1.0", off(face="1.0 0.0 0.0"), RED),
+    Row("off", "face alpha", off(face="255 0 0 9"), REFUSED),
+    Row("off", "face color 256", off(face="256 0 0"), REFUSED),
+    Row("off", "color of a map", off(face="7"), REFUSED),
+    Row("off", "comments", off("# OFF\nOFF # 1 2 3\n\n", face="255 0 0 # red"), RED),
+    Row("off", "missing vertex", {"mesh.off": off()["mesh.off"].replace("3 0", "3 9")}, REFUSED),
+    Row("off", "no faces", {"mesh.off": off()["mesh.off"].rpartition("\n")[0]}, REFUSED),
+    Row("stl", "text", {"mesh.stl": STL_TEXT}, WHITE),
+    Row("stl", "text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
+    Row(
+        "stl",
+        "four vertices",
+        {"mesh.stl": STL_TEXT.replace(" endl", "vertex 0 0 0\nendl")},
+        REFUSED,
+    ),
+    Row("stl", "half a file", {"mesh.stl": STL_TEXT[:90]}, REFUSED),
+    Row("stl", "binary", stl(0), WHITE),
+    Row("stl", "binary that begins with solid", stl(0, b"solid thing"), WHITE),
+    Row("stl", "binary that is truncated", stl(0, face_count=2), REFUSED),
+    Row("stl", "VisCAM", stl(0x8000 | 31 << 10), RED),
+    Row("stl", "VisCAM that begins with solid", stl(0x8000 | 31 << 10, b"solid"), RED),
+    Row("stl", "attribute without a color", stl(31), IGNORED),
+    Row("stl", "Magics", stl(31, b"COLOR=\x00\xff\x00\xff"), RED),
+    Row("stl", "Magics for all faces", stl(0x8000, b"COLOR=\x00\xff\x00\xff"), GREEN),
+    Row("stl", "Magics and alpha", stl(31, b"COLOR=\x00\xff\x00\x09"), REFUSED),
+    Row("stl", "Magics and material", stl(31, b"COLOR=\0\0\0\xff,MATERIAL=" + bytes(12)), IGNORED),
 ]
 
 
@@ -197,8 +398,8 @@ def test_a_feature_is_read_or_ignored_with_a_warning_or_refused(tmp_path, row: R
     if row.outcome == REFUSED:
         with pytest.raises(InputError, match=next(iter(row.files))):
             color_of(tmp_path, row.files)
-    elif row.outcome == IGNORED:
-        with pytest.warns(UserWarning, match="ignored") as caught:
+    elif row.outcome in WARNINGS:
+        with pytest.warns(UserWarning, match=WARNINGS[row.outcome]) as caught:
             color_of(tmp_path, row.files)
         assert len(caught) == 1
     else:

@@ -1,0 +1,92 @@
+"""Read .off files with the colors of vertices and faces."""
+
+import re
+
+import numpy as np
+
+from renderer.io.mesh_file import (
+    OPAQUE,
+    MeshFile,
+    Part,
+    as_utf8,
+    colored_mesh,
+    parse_numbers,
+    product,
+    triangles_of,
+    unit_colors,
+    words_per_line,
+)
+
+# Beginning of a file. It tells whether vertices have texture coordinates (ST), colors
+# (C), normals (N), a weight (4) or any number of coordinates (n). Some files have the
+# number of vertices directly after "OFF".
+_HEADER = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?:OFF|off)")
+
+
+def read_off(file: MeshFile) -> list[Part]:
+    """Read an .off file as one part, or none if the file has no faces.
+
+    Raises:
+        ValueError: If the file is damaged, or has features that would change the
+            shape or the base color and are not supported.
+    """
+    text = re.sub(rb"#.*", b"", as_utf8(file.content).replace(b"\r", b"\n"))
+    header = _HEADER.match(text)
+    if header is None:
+        raise ValueError("the file does not begin with OFF")
+    has_uvs, has_colors, has_normals, has_weights, has_dimension = map(bool, header.groups())
+    lines = [line for line in text[header.end() :].split(b"\n") if line.strip()]
+    counts = lines[0].split() if lines else []
+    is_plain = all(count.isdigit() for count in counts) and len(counts) >= 2
+    if has_weights or has_dimension or not is_plain:
+        raise ValueError("only .off files in ASCII form with three coordinates are supported")
+    vertex_count, face_count = map(int, counts[:2])
+    if len(lines) < 1 + vertex_count + face_count:
+        raise ValueError("the file is truncated: export it again")
+
+    numbers, lengths = _numbers(lines[1 : 1 + vertex_count])
+    width = lengths.max(initial=3)
+    color_start = 3 + 3 * has_normals
+    color_width = width - color_start - 2 * has_uvs
+    if (lengths != width).any() or color_width not in ((3, 4) if has_colors else (0,)):
+        raise ValueError(f"the vertices have other numbers than {header[0].decode()} announces")
+    table = numbers.reshape(-1, width)
+    vertices = table[:, :3]
+    color_numbers = table[:, color_start : color_start + color_width].ravel()
+    vertex_colors = _colors(color_numbers, np.full(vertex_count, color_width), file)
+
+    numbers, lengths = _numbers(lines[1 + vertex_count : 1 + vertex_count + face_count])
+    whole_numbers = numbers.astype(np.int64)
+    # Place of each number in its line, in which the number of corners is first.
+    places = np.arange(len(numbers)) - (np.cumsum(lengths) - lengths).repeat(lengths)
+    sizes = whole_numbers[places == 0]
+    is_index = places <= sizes.repeat(lengths)
+    color_widths = lengths - 1 - sizes
+    if not np.isin(color_widths, (0, 3, 4)).all() or (whole_numbers != numbers)[is_index].any():
+        raise ValueError("a face is not a number of vertices, the vertices, and maybe a color")
+    face_colors = _colors(numbers[~is_index], color_widths, file)
+    indices = whole_numbers[is_index & (places > 0)]
+    corners, polygons = triangles_of(file, vertices, indices, sizes)
+    if not len(corners):
+        return []
+    faces = indices[corners]
+    colors = product(vertex_colors[faces], face_colors[polygons, None])
+    normals = table[:, 3:6][faces] if has_normals else None
+    return [Part(colored_mesh(vertices, faces, colors), normals)]
+
+
+def _numbers(lines: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Parse the numbers in lines, and count the numbers of each line."""
+    text = b"".join(line + b"\n" for line in lines)
+    return parse_numbers(text, np.float64), words_per_line(text)
+
+
+def _colors(numbers: np.ndarray, widths: np.ndarray, file: MeshFile) -> np.ndarray:
+    """Convert rows of 3 or 4 numbers to sRGB-encoded colors, which are white for empty rows."""
+    if 1 < numbers.max(initial=0) <= 255 and (numbers == np.round(numbers)).all():
+        numbers = numbers.clip(0).astype(np.uint8)
+    colors = np.ones((len(widths), 4))
+    colors[np.arange(4) < widths[:, None]] = unit_colors(numbers, file)
+    if colors[:, 3].min(initial=1) < OPAQUE:
+        raise ValueError("the file has transparent colors, which are not supported")
+    return colors[:, :3]

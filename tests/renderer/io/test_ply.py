@@ -1,0 +1,188 @@
+"""Binary .ply files, triangle strips, and polygons in all formats that have polygons."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from oracles import corners_of
+
+from renderer.errors import InputError
+from renderer.io.meshes import load_mesh
+
+CODES = {
+    "char": "b",
+    "uchar": "B",
+    "short": "h",
+    "ushort": "H",
+    "int": "i",
+    "uint": "I",
+    "float": "f",
+    "double": "d",
+    "uint8": "B",
+    "int32": "i",
+    "float64": "d",
+}
+# A concave pentagon, a triangle and a quadrilateral, with a color for each vertex.
+VERTICES = np.array(
+    [[0, 0, 0], [4, 0, 0], [4, 4, 0], [2, 1, 0], [0, 4, 0], [0, 0, 1], [4, 0, 1], [0, 0, 5]]
+)
+FACES = ([0, 1, 2, 3, 4], [0, 1, 5], [1, 6, 7, 0])
+COLORS = np.random.default_rng(0).integers(0, 256, (len(VERTICES), 3))
+AREAS = (16 - 6, 2, 12)
+
+
+def write_ply(
+    path: Path,
+    form: str,
+    faces: list[list[int]] | tuple[list[int], ...] = FACES,
+    position: str = "float",
+    length: str = "uchar",
+    index: str = "int",
+    line_break: str = "\n",
+    element: str = "face",
+) -> Path:
+    """Write the vertices and faces as ASCII or with struct, without a library for .ply files."""
+    lines = ["ply", f"format {form} 1.0", "comment end_header", f"element vertex {len(VERTICES)}"]
+    lines += [f"property {position} {axis}" for axis in "xyz"] + ["property short quality"]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    lines += [f"element {element} {len(faces)}", f"property list {length} {index} vertex_index"]
+    lines += ["property int flag", "end_header", ""]
+    rows = [
+        *(
+            (3 * [position] + ["short"] + 3 * ["uchar"], [*vertex, -7, *color])
+            for vertex, color in zip(VERTICES, COLORS, strict=True)
+        ),
+        *(([length] + len(face) * [index] + ["int"], [len(face), *face, 9]) for face in faces),
+    ]
+    if form == "ascii":
+        lines[-1:] = [" ".join(map(str, values)) for _, values in rows]
+        body = b""
+    else:
+        order = "<" if form == "binary_little_endian" else ">"
+        body = b"".join(
+            struct.pack(order + "".join(CODES[name] for name in types), *values)
+            for types, values in rows
+        )
+    path.write_bytes(line_break.join(lines).encode() + body)
+    return path
+
+
+FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
+
+
+@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    "types",
+    [
+        {},
+        {"position": "double", "length": "int", "index": "ushort"},
+        {"position": "float64", "length": "uint8", "index": "int32"},
+        {"position": "int", "length": "ushort", "index": "char"},
+    ],
+)
+@pytest.mark.parametrize("line_break", ["\n", "\r\n", "\r"])
+def test_all_encodings_of_a_ply_give_the_same_mesh(tmp_path, form, types, line_break):
+    mesh = load_mesh(write_ply(tmp_path / "mesh.ply", form, line_break=line_break, **types))
+    assert_array_equal(np.unique(mesh.vertices, axis=0), np.unique(VERTICES, axis=0))
+    areas = np.add.reduceat(mesh.face_areas(), [0, 3, 4])
+    assert_allclose(areas, AREAS)
+    found = {
+        tuple(corner): tuple(np.rint(255 * color))
+        for corner, color in zip(
+            mesh.vertices[mesh.faces].reshape(-1, 3), mesh.corner_colors.reshape(-1, 3), strict=True
+        )
+    }
+    assert found == {tuple(v): tuple(c) for v, c in zip(VERTICES, COLORS, strict=True)}
+
+
+@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.parametrize("faces", [[[0, 1, 5], [1, 6, 5]], FACES])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_truncated_ply_is_refused(tmp_path, form, faces):
+    path = write_ply(tmp_path / "mesh.ply", form, faces)
+    content = path.read_bytes()
+    start = content.index(b"\nend_header") + len("\nend_header\n")
+    for length in range(start, len(content), 7):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match=r"mesh\.ply"):
+            load_mesh(path)
+
+
+@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.parametrize("index", [-1, len(VERTICES)])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_missing_vertex_is_refused(tmp_path, form, index):
+    path = write_ply(tmp_path / "mesh.ply", form, [[0, 1, index]])
+    with pytest.raises(InputError, match="vertex"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_more_rows_than_the_file_has_are_refused_before_memory_is_allocated(tmp_path, form):
+    path = write_ply(tmp_path / "mesh.ply", form)
+    content = path.read_bytes()
+    for element in (b"element vertex ", b"element face "):
+        path.write_bytes(content.replace(element, element + b"9" * 12))
+        with pytest.raises(InputError, match="truncated"):
+            load_mesh(path)
+
+
+@pytest.mark.filterwarnings("ignore:.*quality")
+@pytest.mark.parametrize("form", FORMS)
+def test_triangle_strips_are_unrolled_with_alternating_orientation(tmp_path, form):
+    strips = [[0, 1, 4, 2, -1, 0, 5, 1], [5, 6, 7]]
+    path = write_ply(tmp_path / "mesh.ply", form, strips, element="tristrips")
+    expected = [[0, 1, 4], [4, 1, 2], [0, 5, 1], [5, 6, 7]]
+    found = [
+        {tuple(np.roll(face, turn, axis=0).ravel()) for turn in range(3)}
+        for face in corners_of(load_mesh(path))
+    ]
+    assert found == [
+        {tuple(np.roll(VERTICES[face], turn, axis=0).ravel()) for turn in range(3)}
+        for face in expected
+    ]
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "off"])
+def test_random_polygons_have_the_area_of_the_shoelace_formula(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    polygons = []
+    for count in rng.integers(3, 12, 60):
+        angles = 2 * np.pi * (np.arange(count) + rng.uniform(0, 0.9, count)) / count
+        radii = rng.uniform(0.2, 1, count)
+        polygons.append(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1))
+    areas = [
+        abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
+        for x, y in (polygon.T for polygon in polygons)
+    ]
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
+    vertices = np.concatenate(
+        [polygon @ turn + [9 * index, 0, 0] for index, polygon in enumerate(polygons)]
+    )
+    ends = np.cumsum([len(polygon) for polygon in polygons])
+    faces = [range(end - len(polygon), end) for end, polygon in zip(ends, polygons, strict=True)]
+    if suffix == "obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+        lines += ["f " + " ".join(str(index + 1) for index in face) for face in faces]
+    else:
+        counts = f"{len(vertices)} {len(faces)} 0"
+        header = f"""ply
+format ascii 1.0
+element vertex {len(vertices)}
+property double x
+property double y
+property double z
+element face {len(faces)}
+property list uchar int vertex_indices
+end_header"""
+        lines = [header] if suffix == "ply" else ["OFF", counts]
+        lines += [f"{x} {y} {z}" for x, y, z in vertices]
+        lines += [" ".join(map(str, [len(face), *face])) for face in faces]
+    path = tmp_path / f"mesh.{suffix}"
+    path.write_text("\n".join(lines))
+    mesh = load_mesh(path)
+    sizes = np.array([len(polygon) for polygon in polygons])
+    assert_allclose(np.add.reduceat(mesh.face_areas(), np.cumsum(sizes - 2) - sizes + 2), areas)
