@@ -3,21 +3,19 @@
 import io
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 import torch
-from PIL import Image
 
 from renderer.errors import MAX_MAGNITUDE
 from renderer.geometry.mesh import NO_TEXTURE, Mesh
 from renderer.geometry.polygons import triangulate
 from renderer.image import decode, encode
 from renderer.io.files import file_below
-from renderer.io.images import eight_bits
+from renderer.io.images import eight_bits, identify
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
 TOLERANCE = 1e-3
@@ -76,7 +74,7 @@ class MeshFile:
     def texture(self, name: str) -> np.ndarray:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
         if name not in self._textures:
-            with Image.open(io.BytesIO(self.read(name))) as image:
+            with identify(io.BytesIO(self.read(name))) as image:
                 pixels = eight_bits(image)
             if (
                 pixels.has_transparency_data
@@ -197,20 +195,24 @@ def colored_mesh(
             None without textures.
         textures: Textures, uint8, shape (H, W, 3) each.
     """
-    mesh = Mesh.plain(vertices, faces)
-    corner_colors = np.broadcast_to(colors, mesh.corner_colors.shape).astype(np.float32)
-    mesh = replace(mesh, corner_colors=corner_colors)
+    corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
     if not textures or uvs is None or texture_ids is None:
-        return mesh
-    is_textured = texture_ids != NO_TEXTURE
-    if np.isnan(uvs[is_textured]).any():
-        raise ValueError("faces with a texture have no texture coordinates")
-    require_bounded(texture_coordinates=uvs[is_textured])
-    return replace(
-        mesh,
-        corner_uvs=np.where(is_textured[:, None, None], uvs, 0).astype(np.float32),
+        texture_ids = np.full(len(faces), NO_TEXTURE)
+    else:
+        is_textured = texture_ids != NO_TEXTURE
+        if np.isnan(uvs[is_textured]).any():
+            raise ValueError("faces with a texture have no texture coordinates")
+        require_bounded(texture_coordinates=uvs[is_textured])
+        corner_uvs[is_textured] = uvs[is_textured]
+    return Mesh(
+        vertices=vertices.astype(np.float64),
+        faces=faces,
+        corner_colors=np.broadcast_to(colors, (len(faces), 3, 3)).astype(np.float32),
+        corner_uvs=corner_uvs,
         texture_ids=texture_ids.astype(np.int32),
         textures=tuple(textures),
+        # Sharp edges are found later, when equal positions have become one vertex.
+        normal_ids=faces,
     )
 
 
