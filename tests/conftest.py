@@ -10,9 +10,29 @@ from ipaddress import ip_address
 
 import pytest
 import torch
+from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from renderer.visibility.rasterizers import Rasterizer
+
+# Property tests draw the same examples everywhere. With `-m slow`, they draw 30 times as many, and
+# others in each run.
+settings.register_profile("same", derandomize=True, max_examples=40, deadline=None)
+settings.register_profile("search", max_examples=1200, deadline=None)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose how property tests draw their examples."""
+    settings.load_profile("search" if config.option.markexpr == "slow" else "same")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Select the property tests for `-m slow`, too."""
+    if config.option.markexpr == "slow":
+        for item in items:
+            if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+                item.add_marker("slow")
 
 
 @pytest.fixture(autouse=True, scope="session")

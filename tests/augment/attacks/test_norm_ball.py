@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
@@ -44,7 +44,6 @@ PAIRS = arrays(np.float64, (2, 4, 6), elements=COORDINATES)  # values and center
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NORMS)
 @given(pair=PAIRS, radius=RADII)
-@settings(max_examples=40, deadline=None)
 def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
     """The nearest point p to v is in the ball and has (v - p)·(q - p) ≤ 0 for all its points q.
 
@@ -65,7 +64,6 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NORMS)
 @given(pair=PAIRS, radius=RADII)
-@settings(max_examples=20, deadline=None)
 def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
     values, center = torch.from_numpy(pair).to(dtype)
     nearest = project(StepSettings(name, radius), values, center)
@@ -121,7 +119,6 @@ REACHES = arrays(np.float64, (2, 3), elements=st.one_of(st.floats(0, 2), st.just
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NORMS)
 @given(pair=SMALL_PAIRS, reaches=REACHES, radius=st.floats(0.01, 4))
-@settings(max_examples=30, deadline=None)
 def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
     name,
     dtype,

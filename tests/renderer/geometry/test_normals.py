@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from oracles import draw
 from scipy.spatial.transform import Rotation
@@ -59,11 +59,12 @@ def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     divided by the length of the cross product.
 
     Args:
-        corners: Corners of a triangle with an area, shape (3, 3).
+        corners: Corners of a triangle, shape (3, 3).
 
     Returns:
         Normal, shape (3,), and its derivative by the corners, shape
-        (3, 3 corners, 3). Both are rounded to float64 at the end.
+        (3, 3 corners, 3). Both are rounded to float64 at the end. Without an
+        area, both are zero.
     """
     a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
     opposite_edges = [
@@ -74,6 +75,8 @@ def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     cross = exact_cross_product(opposite_edges[2], [-value for value in opposite_edges[1]])
     # Division by the largest component keeps tiny areas in the range of float64.
     largest = max(map(abs, cross))
+    if not largest:
+        return np.zeros(3), np.zeros((3, 3, 3))
     direction = np.array([float(value / largest) for value in cross])
     length = np.linalg.norm(direction)
     normal = direction / length
@@ -109,17 +112,18 @@ def require_exact(corners: torch.Tensor, tolerance: float) -> None:
         assert error <= 2 * tolerance * np.linalg.norm(expected_slopes[:, corner])
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     log_height=st.floats(-12, 0),
     log_edge=st.floats(-6, 0),
     seed=st.integers(0, 2**20),
 )
+@example(log_height=-9.220229640656948, log_edge=-5.520005482948768, seed=579921)
 def test_slivers_have_exact_normals_and_derivatives_up_to_rounding(log_height, log_edge, seed):
     """Plain float64 would be off by 1e-4 at a relative height of 1e-12.
 
     The last steps of each component have two or three roundings. Faces that are
-    less than about thirty times as wide as high lose a few times that.
+    less than about thirty times as wide as high lose a few times that. The
+    corners of the given example lie on a line in float32.
     """
     height = 10**log_height
     corners = sliver(height, 10**log_edge, seed)

@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -315,7 +315,6 @@ def test_points_that_are_not_finite_are_refused(rasterizer, value):
         rasterizer.rasterize(points, faces, 4)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
 @given(image=small_images(), closed=st.booleans())
 def test_the_cpu_equals_the_reference_on_any_triangles(image, closed):
     (points, faces), resolution = image
@@ -337,7 +336,6 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides():
 
 
 @needs_numba
-@settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     view_count=st.integers(0, 3),
@@ -374,7 +372,6 @@ def test_numba_equals_numpy_to_the_bit(
 
 
 @needs_egl
-@settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 40),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
@@ -424,7 +424,6 @@ def scenes_by_dtype(make_scene) -> dict[torch.dtype, Scene]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 @given(start=SKY_STARTS, values=st.tuples(FINITE, FINITE, FINITE), radius=RADII)
-@settings(max_examples=30, deadline=None)
 def test_a_sky_stays_in_its_domain_and_its_ball(
     scenes_by_dtype,
     norm,
@@ -459,7 +458,6 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
 
 
 @given(start=SKY_STARTS, values=st.tuples(FINITE, FINITE, FINITE), radius=RADII)
-@settings(max_examples=30, deadline=None)
 def test_in_a_cube_the_nearest_sky_is_that_of_each_axis(scenes_by_dtype, start, values, radius):
     scene = scenes_by_dtype[torch.float64]
     sky = make_parameter("skylight", scene, sky_at(start, norm="linf", radius=radius))

@@ -5,7 +5,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest, mannwhitneyu
 from scipy.stats import bootstrap as scipy_bootstrap
@@ -29,7 +29,6 @@ from train.evaluation.scores.predictions import rank_classes
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)
 
 
-@settings(deadline=None)
 @given(positives=SCORES, negatives=SCORES)
 def test_auc_is_the_mann_whitney_statistic_in_which_ties_count_half(positives, negatives):
     statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
@@ -48,7 +47,6 @@ def lowest_threshold(positives: list[float], negatives: list[float], rate: str) 
     raise AssertionError("no score exceeds the highest one")
 
 
-@settings(deadline=None)
 @given(positives=SCORES, negatives=SCORES)
 def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positives, negatives):
     _, *recalls = auc_and_recalls(np.array(positives), np.array(negatives))
