@@ -81,6 +81,7 @@ class ClassifierSettings(Settings):
         minimum=1,
         maximum=MAX_SIZE,
     )
+    trust: bool = setting_like(NetworkSettings, "trust", False)
 
     def __post_init__(self) -> None:
         """Check all values, and convert those that YAML reads as another type."""
@@ -681,6 +682,7 @@ class PublishSettings(Settings):
         is_text=True,
     )
     model: str | None = setting_like(EvaluateSettings, "model", None)
+    trust: bool = setting_like(NetworkSettings, "trust", False)
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
     def __post_init__(self) -> None:

@@ -283,6 +283,7 @@ def build_network(
     mean: Color | None = None,
     std: Color | None = None,
     classifier: bool = False,
+    trust_code: bool = False,
     **shape: Any,
 ) -> nn.Module:
     """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits.
@@ -298,6 +299,7 @@ def build_network(
         std: Standard deviation of the pixels of the data, RGB. None for 0.25.
         classifier: Whether `augment.build_classifier` builds the network, with
             pretrained weights. It then takes `name`.
+        trust_code: Whether the classifier may be a file of TorchScript or `torch.export`.
         **shape: `depth`, `width` and `dropout` of "wideresnet".
 
     Returns:
@@ -310,7 +312,7 @@ def build_network(
     """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
-        built = build_classifier(name, size, classes, normalization)
+        built = build_classifier(name, size, classes, normalization, trust_code)
         module = cast(nn.Module, built.function)
         return module.requires_grad_(True)
     mean, std = mean or MEAN, std or STD

@@ -496,6 +496,12 @@ class NetworkSettings(Settings):
         "{white_balance, percentile, level, gamma}. A training sees such images, too, and its "
         "network remembers it. null: as the network does. This is not `normalization`.",
     )
+    trust: bool = setting(
+        False,
+        "Load a file of TorchScript or torch.export. It is a program that can run any code, like "
+        "a python: function: set this only if you made it or trust its author. State dicts, "
+        "safetensors and ONNX are data, and may come from strangers.",
+    )
 
     def __post_init__(self) -> None:
         """Check all values, and convert those that YAML reads as another type."""

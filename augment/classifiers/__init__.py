@@ -31,7 +31,7 @@ from augment.classifiers.sources import (
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from renderer.errors import InputError
-from renderer.validation import as_path, require_kind
+from renderer.validation import as_path, require_flag, require_kind
 
 # A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
 PYTHON = "python:"
@@ -120,8 +120,13 @@ def load_classifier(
     size: int | None = None,
     normalization: Normalization = None,
     normalize_light: NormalizeLight = None,
+    trust_code: bool = False,
 ) -> Classifier:
     """Load a classifier by name, on the CPU.
+
+    Files of weights (safetensors, state dicts) and of ONNX may come from
+    strangers. Files of TorchScript and of `torch.export` are programs that can
+    run any code, and so are the functions that `python:` names.
 
     Args:
         name: `efficientnet_lite0`, `efficientnet_lite1`, `efficientnet_lite2`,
@@ -141,14 +146,17 @@ def load_classifier(
         normalize_light: How the light of each image is normalized first: True
             for the defaults, or a mapping with fields of
             `NormalizedLightSettings`. This is independent of `normalization`.
+        trust_code: Whether `name` may be a file of TorchScript or
+            `torch.export`. Set it only if you made the file or trust its author.
 
     Returns:
         The classifier.
 
     Raises:
-        InputError: If the name is unknown, if the weights are missing, damaged
-            or of another network, if the classes are not as many as the
-            network has, or if a package is not installed.
+        InputError: If the name is unknown or is a program that is not trusted,
+            if the weights are missing, damaged or of another network, if the
+            classes are not as many as the network has, or if a package is not
+            installed.
 
     Example:
         >>> import norm_balls as nb
@@ -159,17 +167,19 @@ def load_classifier(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
     facts = as_facts(classes, size, normalization)
-    classifier = _load(name, path, facts)
+    require_flag("trust_code", trust_code)
+    classifier = _load(name, path, facts, trust_code)
     return classifier.normalizing_light(normalize_light)
 
 
-def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
+def _load(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
     """Load a classifier by name, without the normalization of light.
 
     Args:
         name: Name of a source with its model, or path of a file with a network.
         path: File of weights. None for the weights of the source.
         facts: Classes, image size and normalization that the user gave.
+        trust_code: Whether the name may be that of a program.
 
     Raises:
         InputError: If the name is unknown, or an argument does not fit the source.
@@ -192,7 +202,7 @@ def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
                 "weights",
             )
         with progress_message(f"loading {name}"):
-            return load_file(name, facts)
+            return load_file(name, facts, trust_code)
     choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
     choices.append(f"a file ({', '.join(SUFFIXES)})")
     raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
@@ -203,6 +213,7 @@ def build_classifier(
     size: int,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
+    trust_code: bool = False,
 ) -> Classifier:
     """Build a classifier with random weights.
 
@@ -215,10 +226,12 @@ def build_classifier(
         classes: Names of the classes. None for those of the source.
         normalization: Mean and standard deviation of the channels, before the
             network of a file. All other sources have their own normalization.
+        trust_code: Whether the name may be that of a program, as for `load_classifier`.
     """
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
-        return build_file(name, size, as_facts(classes, normalization=normalization))
+        facts = as_facts(classes, normalization=normalization)
+        return build_file(name, size, facts, trust_code)
     known = SOURCES[source + colon]
     arguments: list[Any] = [model, size] if colon else [size]
     if known.takes_facts:

@@ -1,8 +1,14 @@
-"""Classifiers from files that contain a whole network: TorchScript, `torch.export` and ONNX."""
+"""Classifiers from files that contain a whole network: TorchScript, `torch.export` and ONNX.
+
+TorchScript and `torch.export` are programs: they can overwrite files, and loading them can run any
+code. They are loaded only if the user trusts them. ONNX is data.
+"""
 
 import importlib
 import io
+import json
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +29,10 @@ ONNX = ".onnx"
 TORCHSCRIPT = (".pt", ".pth", ".ts", ".jit", ".torchscript")
 # Endings of the names of all files that contain a network.
 SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
+# Beginnings of the names of members of a file of `torch.export` that run code when they are read.
+CODE_MEMBERS = ("custom_obj_", "opaque_obj_")
+# Part of the names of their compiled members.
+COMPILED = "/aotinductor/"
 # Pixels per side of the images of a network whose size is unknown.
 DEFAULT_SIZE = 224
 
@@ -57,7 +67,7 @@ def is_network_file(name: str) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
+def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = False) -> Classifier:
     """Load a classifier from a file that contains its network.
 
     Args:
@@ -66,17 +76,18 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
         facts: Classes, size and normalization. If no size is given, the size is
             read from the file. If the file does not tell it, it is 224. If no
             normalization is given, the network gets images in [0, 1].
+        trust_code: Whether the file may be a program, which can run any code.
 
     Returns:
         The classifier.
 
     Raises:
-        InputError: If the file is missing or contains something else, or if
-            classes or size do not fit.
+        InputError: If the file is missing, contains something else or is a
+            program that is not trusted, or if classes or size do not fit.
     """
     path = Path(name)
     require_file(path, "give the path of a file that contains a network")
-    content = _read(path)
+    content = _read(path, trust_code)
     batch_size, _, height, _ = content.shape
     network = content.network
     if batch_size is not None:
@@ -89,29 +100,35 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
     return as_classifier(network, size, facts.classes, facts.normalization, name=name)
 
 
-def build_file(name: str, size: int, facts: NetworkFacts = NO_FACTS) -> Classifier:
+def build_file(
+    name: str, size: int, facts: NetworkFacts = NO_FACTS, trust_code: bool = False
+) -> Classifier:
     """Load a classifier from a file, for images of another size.
 
     Args:
         name: Path of the file, see `load_file`.
         size: Pixels per side of the images.
         facts: Classes and normalization.
+        trust_code: Whether the file may be a program, which can run any code.
 
     Returns:
         The classifier.
     """
-    return load_file(name, replace(facts, size=size))
+    return load_file(name, replace(facts, size=size), trust_code)
 
 
-def _read(path: Path) -> Content:
+def _read(path: Path, trust_code: bool) -> Content:
     """Read a file with a network, in the format that the suffix of its name tells.
 
     Args:
         path: File of TorchScript, `torch.export` or ONNX.
+        trust_code: Whether it may be TorchScript or `torch.export`.
 
     Raises:
-        InputError: If the file is damaged or has another format.
+        InputError: If the file is not trusted, is damaged or has another format.
     """
+    if path.suffix.lower() == EXPORTED or is_torchscript(path):
+        _require_trust(path, trust_code)
     readers = {EXPORTED: _read_exported, ONNX: read_onnx}
     read = readers.get(path.suffix.lower(), _read_torchscript)
     try:
@@ -124,6 +141,17 @@ def _read(path: Path) -> Content:
             "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)",
             "name",
         ) from error
+
+
+def _require_trust(path: Path, trust_code: bool) -> None:
+    """Raise InputError if a program, a file of TorchScript or `torch.export`, is not trusted."""
+    if not trust_code:
+        raise InputError(
+            f"name={path} is a program, which can run any code and overwrite your files: "
+            "set trust=true (trust_code=True in Python) if you made the file or trust its author, "
+            "otherwise ask for a state dict, safetensors or ONNX",
+            "name",
+        )
 
 
 def _read_torchscript(path: Path) -> Content:
@@ -176,7 +204,11 @@ def _read_exported(path: Path) -> Content:
 
     Args:
         path: The file. Its network has one input, the images.
+
+    Raises:
+        InputError: If the file has members that run code when they are read.
     """
+    _require_plain_members(path)
     program = torch.export.load(path)
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
@@ -184,6 +216,50 @@ def _read_exported(path: Path) -> Content:
     # whole numbers, and the others are symbols.
     sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
     return Content(Exported(program.module()), sizes)
+
+
+def _require_plain_members(path: Path) -> None:
+    """Raise InputError if a member of a file of `torch.export` runs code when it is read.
+
+    These are pickled objects that `torch.load(weights_only=True)` refuses, tensors that are pickled
+    (`use_pickle`), custom and opaque objects, and compiled libraries. A name that occurs twice
+    could hide one of them.
+    """
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        for name in names:
+            file_name = Path(name).name
+            if (
+                names.count(name) > 1
+                or file_name.startswith(CODE_MEMBERS)
+                or COMPILED in name
+                or (file_name.endswith(".json") and _uses_pickle(json.loads(archive.read(name))))
+                or (file_name.endswith(".pt") and not _is_readable(archive.read(name)))
+            ):
+                raise InputError(
+                    f"name={path}: its member {name} could run any code when it is read: "
+                    "export the network with tensors alone as its constants and example inputs",
+                    "name",
+                )
+
+
+def _uses_pickle(config: Any) -> bool:
+    """Return whether a value read from JSON has, at any depth, an entry use_pickle that is true."""
+    if isinstance(config, list):
+        return any(map(_uses_pickle, config))
+    if not isinstance(config, dict):
+        return False
+    return bool(config.get("use_pickle")) or any(map(_uses_pickle, config.values()))
+
+
+def _is_readable(content: bytes) -> bool:
+    """Return whether torch can read pickled bytes without running code. No bytes are readable."""
+    try:
+        if content:
+            torch.load(io.BytesIO(content), weights_only=True)
+    except Exception:  # `torch.load` raises errors of many types.
+        return False
+    return True
 
 
 class Exported(Wrapper):

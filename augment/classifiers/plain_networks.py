@@ -226,7 +226,8 @@ def require_evaluation_mode(network: object, argument: str) -> None:
     if "eval" in vars(network):
         raise InputError(
             f"{argument} is a module of torch.export, which has no eval(): save it by "
-            "torch.export.save, and give norm_balls.load_classifier('network.pt2')"
+            "torch.export.save, and give norm_balls.load_classifier('network.pt2', "
+            "trust_code=True)"
         )
     raise InputError(
         f"{argument} is a network in training mode: call the method eval() of the network first"

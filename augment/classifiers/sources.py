@@ -534,7 +534,10 @@ def advice_for_pickles(path: Path) -> str | None:
         file does not contain a network.
     """
     if is_torchscript(path):
-        return f"is a TorchScript file, which contains its own network: set classifier={path}"
+        return (
+            "is a TorchScript file, which contains its own network: "
+            f"set classifier={path} trust=true"
+        )
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except Exception:  # `torch.save` did not write the file.

@@ -379,7 +379,7 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
     networks = {CLASSIFIER: classifier}
     if settings.hardened:
         with keyed(name="hardened"):
-            networks[HARDENED] = load_network(settings.hardened)
+            networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
     return networks
 
 

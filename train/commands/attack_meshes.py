@@ -523,7 +523,7 @@ def load_targets(
             label = class_name(attacked.classes, settings.label, "label")
     classifiers = []
     for item in settings.transfer.classifiers:
-        classifier = _load_classifier(item).to(device)
+        classifier = _load_classifier(item, settings.trust).to(device)
         # `label` raises an InputError if the classifier lacks the class.
         classifier.label(label)
         classifiers.append(classifier)
@@ -537,12 +537,13 @@ def load_targets(
     return TransferTargets(classifiers, settings.transfer.azimuths, objects)
 
 
-def _load_classifier(item: Any) -> Classifier:
+def _load_classifier(item: Any, trust: bool) -> Classifier:
     """Load one classifier that the setting `transfer.classifiers` names.
 
     Args:
         item: Name of the classifier, or a dictionary with the keys "classifier"
             and "weights".
+        trust: Whether it may be a file of TorchScript or `torch.export`.
 
     Raises:
         InputError: If the dictionary has another key, or if the classifier
@@ -556,7 +557,8 @@ def _load_classifier(item: Any) -> Classifier:
                 "give the name of a classifier, or {classifier: NAME, weights: FILE}",
             )
     with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
-        return load_network(str(values.get("classifier")), values.get("weights"))
+        name = str(values.get("classifier"))
+        return load_network(name, values.get("weights"), trust_code=trust)
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:

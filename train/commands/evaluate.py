@@ -72,6 +72,6 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
     # are therefore an error here.
     given_values = as_facts(settings.classes, settings.size, settings.normalization)
     require_no_facts(f"run={settings.run}", given_values)
-    classifier = load_run(settings.run, settings.weights, settings.model)
+    classifier = load_run(settings.run, settings.weights, settings.model, settings.trust)
     # The returned copy normalizes the light of each image, unless the setting is None.
     return classifier.normalizing_light(settings.normalize_light)

@@ -41,7 +41,10 @@ CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
 # The first training on photographs takes these settings from the main training.
-SHARED = ("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light")
+SHARED = (
+    *("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light"),
+    "trust",
+)
 SHARED_IN_TRAIN = (
     *("init_from", "precision", "device", "threads", "deterministic", "checkpoint_every"),
     *("resume", "cache"),
@@ -128,6 +131,8 @@ def _train_on_photographs(
     return replace(
         settings,
         photographs_first=False,
+        # The file of the first network names the code that the user has named for it.
+        trust=True,
         train=replace(settings.train, init_from=str(first)),
         # The file of the first network has its weights, classes and normalization.
         weights=None,

@@ -195,7 +195,7 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
         raise InputError(
             "network contains a module of torch.jit, whose copy cannot be trained: "
             "write it with torch.jit.save to network.pt, and give "
-            "norm_balls.load_classifier('network.pt')"
+            "norm_balls.load_classifier('network.pt', trust_code=True)"
         )
     return copy
 

@@ -53,6 +53,7 @@ def load_network(
     size: int | None = None,
     normalization: Normalization = None,
     normalize_light: NormalizeLight = None,
+    trust_code: bool = False,
 ) -> Classifier:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
@@ -66,6 +67,7 @@ def load_network(
         size: Pixels per side of the images.
         normalization: Normalization of the images.
         normalize_light: Normalization of the light of each image.
+        trust_code: Whether a file of TorchScript or `torch.export` may be loaded.
 
     Returns:
         The classifier.
@@ -85,9 +87,9 @@ def load_network(
         # Error messages about the argument `run` begin with `name` instead, the argument of
         # this function.
         with keyed(run="name"):
-            classifier = load_run(name.removeprefix(RUN), weights)
+            classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
         return classifier.normalizing_light(normalize_light)
-    return load_classifier(name, weights, classes, size, normalization, normalize_light)
+    return load_classifier(name, weights, classes, size, normalization, normalize_light, trust_code)
 
 
 def _find_run(path: Path) -> Path | None:
@@ -112,6 +114,7 @@ def load_chosen(settings: ClassifierSettings) -> Classifier:
         settings.size,
         settings.normalization,
         settings.normalize_light,
+        settings.trust,
     )
 
 
@@ -119,6 +122,7 @@ def load_run(
     run: str | Path,
     weights: str | Path | None = None,
     model: str | None = None,
+    trust_code: bool = False,
 ) -> Classifier:
     """Load the network that a training run selected, or a published network.
 
@@ -128,13 +132,15 @@ def load_run(
         model: "python:package.module:function" if this function of the user built the network.
             The file of the network names the function, too, but code from a file is never run
             unless the user names it. None for any other network.
+        trust_code: Whether the run may have hardened a network in a file of TorchScript or
+            `torch.export`, which is then loaded again, and can run any code.
 
     Returns:
         The network.
 
     Raises:
-        InputError: If there is no such network, if `weights` is not None, or if `model` is
-            missing.
+        InputError: If there is no such network, if `weights` is not None, or if `model` or
+            `trust_code` is missing.
 
     Example:
         >>> import norm_balls as nb
@@ -161,7 +167,8 @@ def load_run(
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
         light = shape.pop(NORMALIZE_LIGHT, None)
-        network = with_normalized_light(build_network(classes, size, **shape), light)
+        built = build_network(classes, size, trust_code=trust_code, **shape)
+        network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
         classifier.operating_points = _operating_points(state)

@@ -22,7 +22,7 @@ from train.class_names import (
 )
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
-from train.networks import CLASSIFIER, describe
+from train.networks import CLASSIFIER, PYTHON, describe
 from train.runs.saved_networks import (
     NORMALIZE_LIGHT,
     RUN,
@@ -168,6 +168,13 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     require_no_facts(f"train.init_from={name}", given)
     with keyed(run="train.init_from"):
         path, state = load_selected(source)
+    built_by = str(state["architecture"].get("name"))
+    if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
+        raise InputError(
+            f"the network in {path} is built by {built_by}: give model.name={built_by} to run "
+            "that code",
+            "train.init_from",
+        )
     return Initial(path, state["architecture"], plain_weights(state))
 
 
@@ -240,7 +247,12 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         # Any other classifier has a size of its own.
         known_size = size if is_file else None
         classifier = load_classifier(
-            name, settings.weights, settings.classes, known_size, settings.normalization
+            name,
+            settings.weights,
+            settings.classes,
+            known_size,
+            settings.normalization,
+            trust_code=settings.trust,
         )
     network = cast(nn.Module, classifier.function)
     if not list(network.parameters()):

@@ -672,7 +672,7 @@ def build_trainer(
         with keyed(**keys_of("model", settings.model)):
             # The shape of a classifier has the normalization of the classifier.
             arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
-            network = build_network(data.classes, data.size, **arguments)
+            network = build_network(data.classes, data.size, trust_code=settings.trust, **arguments)
     facts = {
         "classes": list(data.classes),
         "size": data.size,

@@ -1,5 +1,10 @@
 """Classifiers from files that contain a whole network."""
 
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 
@@ -38,7 +43,7 @@ def save_exported(network: nn.Module, folder: Path) -> Path:
 def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save):
     network = small_network()
     path = save(network, tmp_path)
-    classifier = load_classifier(str(path), classes=["a", "b", "c"], size=SIZE)
+    classifier = load_classifier(str(path), classes=["a", "b", "c"], size=SIZE, trust_code=True)
     images = torch.rand(5, 3, SIZE, SIZE, requires_grad=True)
     expected = network(images)
     found = classifier(images)
@@ -51,7 +56,7 @@ def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save)
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_path):
     path = save_torchscript(small_network(), tmp_path)
-    original = load_classifier(str(path), size=SIZE).function
+    original = load_classifier(str(path), size=SIZE, trust_code=True).function
     copied = deepcopy(original)
     images = torch.rand(2, 3, SIZE, SIZE)
     before = original(images)
@@ -67,7 +72,7 @@ def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_pat
 def test_names_that_are_not_as_many_as_the_outputs_of_a_file_are_counted(tmp_path):
     path = save_torchscript(small_network(), tmp_path)
     with pytest.raises(InputError, match="classes has 2 names"):
-        load_classifier(str(path), classes=["a", "b"], size=SIZE)
+        load_classifier(str(path), classes=["a", "b"], size=SIZE, trust_code=True)
 
 
 def test_onnx_gives_the_scores_of_its_graph(tmp_path):
@@ -87,3 +92,96 @@ def test_onnx_gives_the_scores_of_its_graph(tmp_path):
     given = torch.rand(4, 3, SIZE, SIZE)
     assert classifier.size == SIZE
     torch.testing.assert_close(classifier(given), given.mean((2, 3)), rtol=1e-5, atol=1e-6)
+
+
+class Payload:
+    """Object whose pickle creates a file when it is loaded."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def replace_member(path: Path, ending: str, change: Callable[[bytes], bytes]) -> None:
+    """Write an archive again with another content of the member whose name has an ending."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    [changed] = [name for name in members if name.endswith(ending)]
+    members[changed] = change(members[changed])
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+class Overwriting(nn.Module):
+    """Network that sets a file to zeros, as a program of TorchScript can."""
+
+    def __init__(self, path: str):
+        super().__init__()
+        self.path = path
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        victim = torch.from_file(self.path, True, 4, dtype=torch.uint8)
+        return images.mean((2, 3)) + victim.zero_().sum()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("suffix", ["pt", "pth", "ts", "jit", "torchscript", "PT"])
+def test_torchscript_cannot_overwrite_files_unless_it_is_trusted(tmp_path, suffix):
+    victim = tmp_path / "victim.txt"
+    victim.write_bytes(b"text")
+    path = tmp_path / f"network.{suffix}"
+    torch.jit.script(Overwriting(str(victim))).save(path)
+    with pytest.raises(InputError, match="trust=true"):
+        load_classifier(str(path), size=SIZE)
+    with pytest.raises(InputError):
+        load_classifier("torchvision:squeezenet1_1", path)
+    assert victim.read_bytes() == b"text"
+    load_classifier(str(path), size=SIZE, trust_code=True)
+    assert victim.read_bytes() == bytes(4)
+
+
+def pickled(value: object) -> bytes:
+    content = io.BytesIO()
+    torch.save(value, content)
+    return content.getvalue()
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+@pytest.mark.parametrize("variant", ["example inputs", "use_pickle"])
+def test_a_pickle_in_an_exported_network_does_not_run(tmp_path, variant, trusted):
+    path = save_exported(small_network(), tmp_path)
+    created = tmp_path / "created"
+    if variant == "example inputs":
+        replace_member(path, "sample_inputs/model.pt", lambda _: pickled(Payload(created)))
+    else:
+        names: list[str] = []
+
+        def with_pickle(content: bytes) -> bytes:
+            config = json.loads(content)
+            first = next(iter(config["config"].values()))
+            first["use_pickle"] = True
+            names.append(first["path_name"])
+            return json.dumps(config).encode()
+
+        replace_member(path, "weights_config.json", with_pickle)
+        replace_member(path, names[0], lambda _: pickled(Payload(created)))
+    with pytest.raises(InputError, match="any code"):
+        load_classifier(str(path), size=SIZE, trust_code=trusted)
+    assert not created.exists()
+    with pytest.raises(Exception):  # noqa: B017 - the payload is no tensor
+        torch.export.load(path)
+    assert created.exists(), "the file has no payload"
+
+
+@pytest.mark.parametrize(
+    "name", ["data/constants/opaque_obj_0", "data/constants/custom_obj_0", "data/aotinductor/a.so"]
+)
+def test_objects_that_are_no_tensors_are_refused_in_an_exported_network(tmp_path, name):
+    path = save_exported(small_network(), tmp_path)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(f"network/{name}", pickle.dumps(Payload(tmp_path / "created")))
+    with pytest.raises(InputError, match="any code"):
+        load_classifier(str(path), size=SIZE, trust_code=True)

@@ -232,12 +232,12 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
     monkeypatch.chdir(here)
     network = trained_network().eval()
     words = [f"train.init_from={save_torchscript(network)}", f"normalization={normalization}"]
-    words += ["classes=classes.txt", f"data.size={SIZE}", "data.path=photos"]
+    words += ["trust=true", "classes=classes.txt", f"data.size={SIZE}", "data.path=photos"]
     scene = ["scene.meshes=[solid:orange]", "label=Orange"]
     settings = train_command.read(["experiment=classifier", *words, *scene])
     initial = load_initial(settings)
     shape = _network_shape(settings, initial)
-    built = build_network(initial.classes, SIZE, **shape)
+    built = build_network(initial.classes, SIZE, trust_code=True, **shape)
     initial.copy_to(built, shape | {"classes": list(initial.classes), "size": SIZE})
     images = renders()[0][:4]
     given = images if normalization == "null" else Normalize(MEAN, STD)(images)
@@ -267,6 +267,7 @@ def test_a_network_in_a_file_is_attacked_audited_and_hardened(
     monkeypatch.chdir(here)
     name = save(nn.Sequential(Normalize(MEAN, STD), trained_network()).eval())
     network = [f"classifier={name}", "classes=classes.txt", f"size={SIZE}", "device=cpu"]
+    network += ["trust=true"]
     label = f"label={CLASSES.index('Orange')}"
     scene = ["scene.meshes=solid:orange:0", "renderer.shadows=false", "attack.max_steps=1"]
     assert call("attack", *network, label, *scene, "attack.checks=false", "out=attack") == 0
@@ -274,14 +275,17 @@ def test_a_network_in_a_file_is_attacked_audited_and_hardened(
     assert call("audit", *network, label, *meshes, "out=audit") == 0
     assert (here / "audit" / "report.html").is_file()
 
-    start = [f"train.init_from={name}", "classes=classes.txt", f"data.size={SIZE}"]
+    start = [f"train.init_from={name}", "classes=classes.txt", f"data.size={SIZE}", "trust=true"]
     folder = harden(*start, label)
     images = renders()[0][:4]
     original = load_original(name)
     before = original(images)
     original.load_state_dict(torch.load(folder / "weights.pt"))
-    torch.testing.assert_close(load_run(folder)(images), original(images), **ROUNDING)
+    hardened = load_run(folder, trust_code=True)
+    torch.testing.assert_close(hardened(images), original(images), **ROUNDING)
     assert not torch.allclose(original(images), before)
+    with pytest.raises(InputError, match="trust=true"):
+        load_run(folder)
 
 
 class Normalize(nn.Module):

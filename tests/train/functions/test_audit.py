@@ -110,7 +110,7 @@ def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, 
     else:
         sizes = ({0: torch.export.Dim("batch")},)
         torch.export.save(torch.export.export(network, (images,), dynamic_shapes=sizes), path)
-    classifier = nb.load_classifier(str(path), classes=CLASSES, size=SIZE)
+    classifier = nb.load_classifier(str(path), classes=CLASSES, size=SIZE, trust_code=True)
     options |= {"classes": None, "size": None}
     found = nb.audit(classifier, [mesh], label=0, **options)
     assert counts_of(found) == counts_of(expected)
