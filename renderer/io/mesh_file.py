@@ -211,8 +211,6 @@ def colored_mesh(
         corner_uvs=corner_uvs,
         texture_ids=texture_ids.astype(np.int32),
         textures=tuple(textures),
-        # Sharp edges are found later, when equal positions have become one vertex.
-        normal_ids=faces,
     )
 
 
