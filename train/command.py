@@ -220,6 +220,7 @@ class Command:
         prints nothing. All other errors are raised.
         """
         try:
+            require_current_folder()
             yield
             # If the output is a closed pipe, this raises BrokenPipeError.
             print(end="", flush=True)
@@ -253,6 +254,16 @@ class Command:
             return self.help.format(OmegaConf.structured(self.settings))
         # Hydra's own --help lists the files of all groups of conf/, which is slower.
         return self.help.format(self.compose(overrides))
+
+
+def require_current_folder() -> None:
+    """Raise InputError if the current folder was deleted, so that relative paths mean nothing."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            f"the current folder cannot be used ({error.strerror}): change to another folder"
+        ) from error
 
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:

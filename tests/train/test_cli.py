@@ -290,6 +290,15 @@ def test_a_warning_of_a_library_is_one_line_of_a_command():
     assert ended.stderr == "warning: clamped\n"
 
 
+def test_a_current_folder_that_was_deleted_is_one_line_of_a_command(tmp_path):
+    code = "import os, scripts.light as light; os.mkdir(name := os.environ['GONE']); os.chdir(name)"
+    code += "; os.rmdir(name); light.main()"
+    ended = run_python(f"import os; os.environ['GONE'] = {str(tmp_path / 'gone')!r}; {code}")
+    assert ended.returncode == USER_ERROR
+    assert ended.stderr.startswith("error: the current folder cannot be used")
+    assert ended.stderr.count("\n") == 1
+
+
 def test_an_error_of_the_program_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError), LIGHT.handle_errors():
         raise ZeroDivisionError

@@ -765,6 +765,8 @@ def read_attack(folder: Path) -> AttackSummary:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         # A line has the key "example" or, if it is about the whole attack, "checks".
         examples = [line for line in lines if "example" in line]
+        if len({line["example"] for line in examples}) < len(examples):
+            raise ValueError("it has an example twice")
         checks = [dict(line["checks"]) for line in lines if "checks" in line]
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(

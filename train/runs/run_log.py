@@ -1,7 +1,9 @@
 """Write and read the metrics and the images of a training run."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -56,6 +58,9 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         for line in lines:
             if any(not isinstance(value, int | float) for value in line.values()):
                 raise ValueError("a value is not a number")
+        epochs = [line.get("epoch", math.inf) for line in lines]
+        if not all(first < second for first, second in pairwise(epochs)):
+            raise ValueError("epochs are repeated, or follow the final scores")
         return lines
 
 

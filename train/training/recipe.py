@@ -127,10 +127,11 @@ def last_layer(network: nn.Module) -> str:
 
 
 def _last_called_layer(network: nn.Module, size: int) -> str:
-    """Return the name of the layer that a network calls last.
+    """Return the name of the layer with a matrix or kernels that a network calls last.
 
     The order of the calls may differ from the order of the parameters, which is
-    that of the definitions.
+    that of the definitions. Normalizations and activations with parameters do not
+    count, unless a network has no other layer.
 
     Args:
         network: Network with parameters.
@@ -140,19 +141,21 @@ def _last_called_layer(network: nn.Module, size: int) -> str:
         Name of the layer. A network of TorchScript or torch.export calls no
         modules, so it is the module that has the last parameter.
     """
-    called: list[str] = []
+    called: list[tuple[bool, str]] = []
     hooks = []
     for name, module in network.named_modules():
         own = list(module.parameters(recurse=False))
         is_layer = own and len(own) == len(list(module.parameters()))
         if is_layer and not isinstance(module, torch.jit.ScriptModule):
-            hooks.append(module.register_forward_hook(lambda *_, name=name: called.append(name)))
+            call = (any(parameter.ndim > 1 for parameter in own), name)
+            hooks.append(module.register_forward_hook(lambda *_, call=call: called.append(call)))
     device = next(network.parameters()).device
     with eval_mode(network), torch.no_grad():
         network(torch.full((1, 3, size, size), 0.5, device=device))
     for hook in hooks:
         hook.remove()
-    return called[-1] if called else last_layer(network)
+    names = [name for has_matrix, name in called if has_matrix] or [name for _, name in called]
+    return names[-1] if names else last_layer(network)
 
 
 def _module_of(parameter: str) -> str:
@@ -173,6 +176,8 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         InputError: If there is no module of this name, or if it has no
             parameters.
     """
+    if next(network.parameters(), None) is None:
+        raise InputError("the network has no parameters: give a network that can be trained")
     if stage == ALL_BUT_LAST:
         last = _last_called_layer(network, size)
         for name, parameter in network.named_parameters():
@@ -227,7 +232,8 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
         or if `settings.feature_norm` is None.
 
     Raises:
-        InputError: If all features are 0, or if the network returns NaN.
+        InputError: If all features are 0, if the network returns NaN, or if its
+            last layer has no features or no gradients.
     """
     if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
@@ -261,11 +267,19 @@ def feature_norm(network: nn.Module, images: Tensor) -> float:
         >>> round(feature_norm(network, torch.full((5, 3, 2, 2), 0.5)), 3)
         1.732
     """
-    layer = network.get_submodule(last_layer(network))
+    name = last_layer(network)
+    layer = network.get_submodule(name)
     weights = [parameter for parameter in layer.parameters() if parameter.ndim > 1]
     squares = []
     with eval_mode(network):
         for image in images.split(1):
-            gradients = torch.autograd.grad(network(image).max(), weights)
+            logit = network(image).max()
+            if not (weights and logit.requires_grad):
+                raise InputError(
+                    f"the logits of the network do not depend on weights of its last layer "
+                    f"{name!r} by gradients: train other layers with freeze=MODULE",
+                    "feature_norm",
+                )
+            gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
     return math.sqrt(fmean(squares))

@@ -259,6 +259,27 @@ def test_only_the_last_layer_of_a_script_learns():
     assert learning == ["2.weight", "2.bias"]
 
 
+@pytest.mark.parametrize("last", [nn.BatchNorm1d(4), nn.LayerNorm(4), nn.PReLU(), nn.Softmax(1)])
+def test_the_last_layer_with_a_matrix_learns_whatever_is_called_after_it(last):
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)
+    freeze(network, "all_but_last", size=2)
+    learning = [name for name, value in network.named_parameters() if value.requires_grad]
+    assert learning == ["1.weight", "1.bias"]
+
+
+def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
+    with pytest.raises(InputError, match="no parameters"):
+        freeze(nn.Sequential(nn.Flatten()), "all_but_last", size=2)
+    vectors = nn.Sequential(nn.Flatten(), nn.LayerNorm(12))
+    freeze(vectors, "all_but_last", size=2)
+    detached = HeadFirst()
+    detached.head.register_forward_hook(lambda module, inputs, output: output.detach())
+    settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
+    for network in (vectors, detached):
+        with pytest.raises(InputError, match="do not depend on weights"):
+            scale_learning_rate(settings, network, torch.full((1, 3, 2, 2), 0.5))
+
+
 class Scaled(nn.Module):
     """Classifier whose features are multiplied by a factor, and the weights of the layer divided.
 
