@@ -23,6 +23,7 @@ from renderer.geometry.mesh import Mesh, normalize
 from renderer.geometry.shapes import SOLIDS, solid
 from renderer.image import to_bytes
 from renderer.light.presets import ambient, directional
+from renderer.memory import require_memory
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import choose
 from train import console
@@ -61,6 +62,8 @@ def load_shapes(
     Returns:
         The data set.
     """
+    count = len(CLASSES) * (train + test)
+    require_memory(f"{count} images of {size} pixels", 3 * size**2 * count, torch.device("cpu"))
     cache = cache or TensorCache()
     settings = replace(SETTINGS, size=size)
     splits = []

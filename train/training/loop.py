@@ -10,7 +10,7 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,6 +25,7 @@ from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
+from renderer.memory import require_memory
 from train import console
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
@@ -267,6 +268,7 @@ class Trainer:
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
+        self._limit_batch_size(split, len(train))
         with SignalHandler() as signals:
             while self.epoch < self.settings.epochs:
                 if self._train_epoch(split, train, signals, log):
@@ -278,6 +280,37 @@ class Trainer:
                     self._save()
                 if is_stopping:
                     signals.stop()
+
+    def _limit_batch_size(self, split: Split, image_count: int) -> None:
+        """Limit the batch size to the images of a round, and check that a batch fits in memory.
+
+        A larger batch would only hold copies of the images.
+
+        Args:
+            split: Images and labels.
+            image_count: Number of training images in `split`.
+
+        Raises:
+            InputError: If the memory is too small for the activations of a batch.
+        """
+        settings = self.settings
+        limits = (settings.images_per_epoch, self.service.settings.regenerate_every)
+        in_round = min([image_count, *(limit for limit in limits if limit)]) + len(self.service)
+        # Each process divides its part of a batch into equal parts.
+        shares = distributed.world_size() * settings.accumulation_steps
+        largest = math.ceil(in_round / shares) * shares
+        if settings.batch_size > largest:
+            console.warning(
+                "train.batch_size=%d is more than the %d images that a round shows: it is %d",
+                settings.batch_size,
+                in_round,
+                largest,
+            )
+            self.settings = replace(settings, batch_size=largest)
+        at_once = self.settings.batch_size // shares
+        (image,) = split.squares([torch.zeros(1, dtype=torch.int64)])
+        needed = at_once * activation_bytes(deepcopy(self.model), image.shape[-1])
+        require_memory(f"the activations of batch_size={at_once}", needed, self.device)
 
     def _train_epoch(
         self,
@@ -704,6 +737,32 @@ class Trainer:
         """
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
+
+
+def activation_bytes(model: nn.Module, size: int) -> int:
+    """Measure the memory that a training step keeps for each image until its backward pass.
+
+    Args:
+        model: Network, from images in [0, 1] of shape (N, 3, size, size) to logits.
+        size: Pixels per side of the images.
+    """
+    totals = []
+    device = next(model.parameters()).device
+    for count in (1, 2):
+        kept: dict[int, int] = {}
+
+        def keep(tensor: Tensor, kept: dict[int, int] = kept) -> Tensor:
+            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
+        with eval_mode(model), torch.enable_grad(), hooks:
+            # The result holds the kept tensors, whose addresses would otherwise be used again.
+            result = model(torch.full((count, 3, size, size), 0.5, device=device))
+        totals.append(sum(kept.values()))
+        del result
+    # The difference leaves out the weights, which all images share.
+    return max(0, totals[1] - totals[0])
 
 
 def _require_equal_shares(settings: TrainSettings) -> None:

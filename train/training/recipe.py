@@ -276,9 +276,9 @@ def feature_norm(network: nn.Module, images: Tensor) -> float:
             logit = network(image).max()
             if not (weights and logit.requires_grad):
                 raise InputError(
-                    f"the logits of the network do not depend on weights of its last layer "
-                    f"{name!r} by gradients: train other layers with freeze=MODULE",
-                    "feature_norm",
+                    f"freeze={ALL_BUT_LAST}: the logits do not depend on weights of the last "
+                    f"layer, {name!r}, by gradients: name the last module that stays as it is",
+                    "freeze",
                 )
             gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))

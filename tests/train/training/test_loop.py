@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from augment.progress import Phases
 from augment.service import AugmentationService
 from augment.settings import AugmentationSettings
+from renderer import memory
 from renderer.errors import InputError
 from train.data.sets import Split
 from train.networks import WideResNet
@@ -22,7 +23,7 @@ from train.settings import TrainSettings
 from train.system.device import MixedPrecision
 from train.system.processes import Interrupted
 from train.training import loop
-from train.training.loop import Trainer, evaluate
+from train.training.loop import Trainer, activation_bytes, evaluate
 from train.training.recipe import SCHEDULE_FACTORS, freeze
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
@@ -149,6 +150,39 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
         assert lines[step]["train/learning_rate"] == pytest.approx(rate)
     torch.testing.assert_close(linear.weight, parameters[0])
     torch.testing.assert_close(linear.bias, parameters[1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [({}, 40), ({"images_per_epoch": 9}, 9), ({"accumulation_steps": 16}, 48)],
+)
+def test_a_batch_larger_than_the_data_is_the_data(tmp_path, settings, expected):
+    """A batch of 960,000 was filled up with copies of 40 images."""
+    trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=960_000, **settings)
+    fit_noise(trainer)
+    assert trainer.settings.batch_size == expected
+    same = make_trainer(
+        tmp_path / "same", color_network(), epochs=1, batch_size=expected, **settings
+    )
+    (tmp_path / "same").mkdir()
+    fit_noise(same)
+    torch.testing.assert_close(trainer.model.state_dict(), same.model.state_dict(), rtol=0, atol=0)
+
+
+def test_a_step_keeps_the_inputs_of_each_layer_that_learns():
+    """A layer keeps its input for the gradient of its weights: 3 × 8 × 8 and 5 × 8 × 8 floats."""
+    network = nn.Sequential(nn.Conv2d(3, 5, 1), nn.Conv2d(5, 2, 1))
+    assert activation_bytes(network, 8) == 4 * 64 * (3 + 5)
+    network[0].requires_grad_(False)
+    assert activation_bytes(network, 8) == 4 * 64 * 5
+    assert network.training
+
+
+def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "meminfo").write_text("MemAvailable: 100 kB\n")
+    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
+    with pytest.raises(InputError, match=r"batch_size=16 need .* free"):
+        fit_noise(make_trainer(tmp_path))
 
 
 def test_the_schedule_goes_on_within_an_epoch(tmp_path):
