@@ -36,7 +36,6 @@ from PIL import Image
 from renderer.camera import Camera
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
-from renderer.geometry.normals import corner_normals
 from renderer.image import decode, encode, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
@@ -389,7 +388,7 @@ def write_mitsuba_scene(
         sampler = {"type": "multijitter", "sample_count": SAMPLES}
         sensors.append({**sensor_of(camera, settings.size), "sampler": sampler})
     objects = [integrator(settings.bounces, emitter_samples), sky, *local_emitters, *sensors]
-    normals = corner_normals(mesh.vertices, mesh.faces, settings.normals)
+    normals = mesh.written_normals(settings.normals)
     for number, part in enumerate(split_parts(mesh, normals, settings.encoding)):
         writer = _PartWriter(folder, number, part, settings.encoding, albedo_scale)
         objects.append(writer.write())

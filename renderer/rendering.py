@@ -86,8 +86,10 @@ def render(
     dtype and the device of the light. They are computed in float32 or float64.
 
     Gradients with respect to the vertices do not include visibility changes,
-    unless `silhouettes` is True. Gradients with respect to vertices, albedo and
-    gloss do not include changes of shadows and bounces of environment light.
+    unless `silhouettes` is True. Without it, they also hold the barycentric
+    coordinates of each sample fixed, as if its point moved with the face. Gradients
+    with respect to vertices, albedo and gloss do not include changes of shadows and
+    bounces of environment light.
 
     Args:
         mesh: Mesh with N vertices and F faces.
@@ -111,8 +113,9 @@ def render(
         samples: Number of samples along one side of a pixel. None for 2, or for 8
             if `silhouettes` is True.
         encoding: Encoding of the image values, "linear" or "srgb".
-        normals: "smooth" interpolates the normals of the vertices. "flat" uses one
-            normal per face.
+        normals: "smooth" interpolates the normals of the vertices, which differ
+            between both sides of a sharp edge (see `Mesh.normal_ids`). "flat" uses
+            one normal per face.
         shadows: True if the mesh casts shadows of environment light on itself.
         bounces: Number of bounces of light between the surfaces of the mesh. One
             or more includes shadows.
@@ -321,8 +324,9 @@ def precompute_transfer(
         gloss: Specular reflection. None uses the gloss of the mesh.
         samples: Number of samples along one side of a pixel.
         encoding: Encoding of the image values, "linear" or "srgb".
-        normals: "smooth" interpolates the normals of the vertices. "flat" uses one
-            normal per face.
+        normals: "smooth" interpolates the normals of the vertices, which differ
+            between both sides of a sharp edge (see `Mesh.normal_ids`). "flat" uses
+            one normal per face.
         shadows: True if the mesh casts shadows of environment light on itself.
         bounces: Number of bounces of light between the surfaces of the mesh. One
             or more includes shadows.

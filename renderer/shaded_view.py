@@ -55,8 +55,8 @@ class ShadedView:
     light, the change of this light by shadows and bounces, and local light from
     lamps and projectors.
 
-    Arrays use these letters: the mesh has V vertices and F faces. S samples in P
-    pixels of the image are covered: they show the shape.
+    Arrays use these letters: the mesh has V vertices and F faces, of which G are
+    seen. S samples in P pixels of the image are covered: they show the shape.
 
     Attributes:
         mesh: Mesh of the shape.
@@ -72,8 +72,9 @@ class ShadedView:
             vertices include the movement of silhouettes.
         gloss: Gloss (specular reflection) of the shape. None uses the gloss of the
             mesh.
-        vertex_normals: Unit normals of the vertices, shape (V, 3). None computes
-            the normals if they are needed.
+        corner_normals: Unit normals of the corners of the F faces (see
+            `Mesh.corner_normals`), shape (F, 3, 3). None computes the normals if
+            they are needed.
         lamp_view: Local light of an earlier render of the same shape, which is
             reused. None computes it.
         indirect: Function that takes the albedo at the samples and the SH
@@ -93,7 +94,7 @@ class ShadedView:
     rays: Rays | None = None
     is_moved: bool = True
     gloss: Gloss | None = None
-    vertex_normals: Tensor | None = None
+    corner_normals: Tensor | None = None
     lamp_view: LocalLightView | None = None
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None
     lamp_positions: Tensor | None = None
@@ -269,12 +270,13 @@ class ShadedView:
 
     @cached_property
     def _normals(self) -> Tensor | None:
-        """Vertex normals for smooth shading, shape (V, 3), or None for flat shading."""
+        """Normals at the corners of the G seen faces, shape (G, 3, 3), or None for flat shading."""
         if self.settings.normals == "flat":
             return None
-        if self.vertex_normals is not None:
-            return self.vertex_normals
-        return normals_in_sight(self.fragments, self.vertices, self._faces)
+        if self.corner_normals is not None:
+            return self.corner_normals[self.fragments.faces]
+        normal_ids = torch.from_numpy(self.mesh.normal_ids).to(self._faces)
+        return normals_in_sight(self.fragments, self.vertices, self._faces, normal_ids)
 
     @cached_property
     def _sample_gloss(self) -> SampleGloss | None:

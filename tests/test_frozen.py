@@ -502,7 +502,10 @@ def verify(request) -> Callable[..., None]:
         if recording and case == request.node.name:
             records.setdefault(fingerprint(), {})[case] = digest(tensors)
             RECORDS.write_text(json.dumps(records, indent=1, sort_keys=True) + "\n")
-        assert digest(tensors) == records[fingerprint()].get(case)
+        recorded = records[fingerprint()].get(case)
+        if recorded is None:
+            pytest.skip(f"{case} is not recorded for {fingerprint()}")
+        assert digest(tensors) == recorded
 
     return compare
 

@@ -673,6 +673,17 @@ MESHES = [
     ),
     *calls_of("corner_uvs", lambda x: mesh_of(corner_uvs=x), None, np.ones((4, 3)), "x"),
     *calls_of(
+        "normal_ids",
+        lambda x: mesh_of(normal_ids=x),
+        MESH.faces - 1,
+        MESH.faces + 2**32,
+        MESH.faces * 1.0,
+        MESH.faces[1:],
+    ),
+    *calls_of(
+        "crease", lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, crease=x), -1, 181, "x"
+    ),
+    *calls_of(
         "texture_ids",
         lambda x: mesh_of(texture_ids=x),
         None,

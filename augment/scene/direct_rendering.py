@@ -317,7 +317,7 @@ class DirectRenderer:
             rays=rays,
             is_moved=is_moved,
             gloss=gloss,
-            vertex_normals=self._vertex_normals(object_index) if shares_normals else None,
+            corner_normals=self._corner_normals(object_index) if shares_normals else None,
             lamp_view=lamp_view,
             indirect=indirect,
             lamp_positions=changed.positions,
@@ -330,9 +330,9 @@ class DirectRenderer:
             self._rays[object_index] = Rays(self.objects[object_index].mesh)
         return self._rays[object_index]
 
-    def _vertex_normals(self, object_index: int) -> Tensor:
-        """Return the vertex normals of an unmoved object with the given index, shape (V, 3)."""
-        return torch.from_numpy(self.objects[object_index].mesh.vertex_normals).to(self.like.device)
+    def _corner_normals(self, object_index: int) -> Tensor:
+        """Return the normals at the corners of an unmoved object, shape (F, 3, 3)."""
+        return torch.from_numpy(self.objects[object_index].mesh.corner_normals).to(self.like.device)
 
     def transport_near(
         self, example: int, object_index: int, camera: Camera, vertices: np.ndarray

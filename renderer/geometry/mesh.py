@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from renderer.errors import InputError, describe, require_range
+from renderer.errors import InputError, describe, require_choice, require_range
+from renderer.geometry.creases import CREASE, normal_groups
 from renderer.geometry.normals import doubled_area_vectors, plain_face_normals, vertex_normals
 from renderer.geometry.skin import Skin
-from renderer.settings import MAX_VERTICES
+from renderer.settings import MAX_VERTICES, NORMALS
 from renderer.validation import as_array, require_whole
 
 # Affine matrix, shape (4, 4), that rotates the y-axis
@@ -39,9 +40,14 @@ _KINDS = {
     "corner_uvs": "fiu",
     "texture_ids": "iu",
     "gloss": "fiu",
+    "normal_ids": "iu",
 }
+# Arrays of a mesh that may be None when it is created.
+_OPTIONAL = ("gloss", "normal_ids")
 # Names of the arrays of a mesh that have one row for each face.
-PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
+PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "normal_ids")
+# Largest index of a normal. A larger one is a mistake that would take all memory.
+MAX_NORMAL_ID = 2**31 - 1
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
 # Corners of the four triangles into which a triangle is
@@ -84,6 +90,11 @@ class Mesh:
             Empty if the mesh has no gloss textures.
         skin: Joints that move the vertices (linear blend skinning). None without
             joints.
+        normal_ids: Index of the normal of each of the three corners of each face,
+            int64, shape (F, 3). With `normals="smooth"`, corners with the same
+            index share a normal, which is computed anew if the vertices move. If
+            it is not given, edges at which faces meet at more than 40° are sharp.
+            `replace(mesh, normal_ids=mesh.faces)` makes all edges smooth.
 
     Raises:
         InputError: If an array has a wrong shape or type, if there are no faces,
@@ -110,18 +121,22 @@ class Mesh:
     gloss: np.ndarray | None = None
     gloss_textures: tuple[np.ndarray, ...] = ()
     skin: Skin | None = None
+    # Always an array after `__post_init__`.
+    normal_ids: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Convert lists to arrays, and check the shapes, types and indices in all fields."""
+        """Convert lists to arrays, check all fields, and find sharp edges."""
         # A frozen dataclass forbids assignments,
         # so fields are set by object.__setattr__.
         for name, kinds in _KINDS.items():
             value = getattr(self, name)
-            is_matte = name == "gloss" and value is None
-            if not isinstance(value, np.ndarray) and not is_matte:
+            is_missing = name in _OPTIONAL and value is None
+            if not isinstance(value, np.ndarray) and not is_missing:
                 object.__setattr__(self, name, as_array(name, value, kinds))
         self._require_shapes()
         self._require_indices()
+        if self.normal_ids is None:
+            object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
         textures = _as_textures("textures", self.textures, 3)
         object.__setattr__(self, "textures", textures)
         gloss_textures = _as_textures("gloss_textures", self.gloss_textures, 2)
@@ -146,6 +161,8 @@ class Mesh:
         }
         if self.gloss is not None:
             shapes["gloss"] = (face_count, 3)
+        if self.normal_ids is not None:
+            shapes["normal_ids"] = (face_count, 3)
         for name, shape in shapes.items():
             values = getattr(self, name)
             if values.shape != shape or values.dtype.kind not in _KINDS[name]:
@@ -165,9 +182,17 @@ class Mesh:
                 f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
                 f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
             )
+        if self.normal_ids is not None:
+            require_range("the smallest of normal_ids", self.normal_ids.min(), 0, MAX_NORMAL_ID)
+            require_range("the largest of normal_ids", self.normal_ids.max(), 0, MAX_NORMAL_ID)
 
     @staticmethod
-    def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
+    def plain(
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        color: ArrayLike = (1.0, 1.0, 1.0),
+        crease: float = CREASE,
+    ) -> Mesh:
         """Create a mesh without textures.
 
         Args:
@@ -176,6 +201,8 @@ class Mesh:
                 counter-clockwise seen from outside, shape (F, 3).
             color: sRGB-encoded color in [0, 1], shape (3,), or one color per
                 vertex, shape (V, 3).
+            crease: Angle in degrees. With `normals="smooth"`, edges at which faces
+                meet at a larger angle are sharp. 180 makes all edges smooth.
 
         Returns:
             Matte mesh with float64 vertices.
@@ -206,13 +233,16 @@ class Mesh:
                 f"vertices, faces and color do not fit together ({error}): give the shapes "
                 "(V, 3), (F, 3) and (3,)"
             ) from error
-        return Mesh(
+        require_range("crease", crease, 0, 180)
+        mesh = Mesh(
             vertices=vertices,
             faces=faces,
             corner_colors=corner_colors,
             corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
             texture_ids=np.full(len(faces), NO_TEXTURE, dtype=np.int32),
+            normal_ids=faces,
         )
+        return replace(mesh, normal_ids=normal_groups(vertices, faces, crease=crease))
 
     def face_normals(self) -> np.ndarray:
         """Compute the outward unit normals of the F faces, shape (F, 3).
@@ -228,13 +258,32 @@ class Mesh:
         return np.linalg.norm(doubled_vectors, axis=1) / 2
 
     @cached_property
-    def vertex_normals(self) -> np.ndarray:
-        """Outward unit normals of the V vertices, shape (V, 3).
+    def corner_normals(self) -> np.ndarray:
+        """Outward unit normals of the corners with `normals="smooth"`, shape (F, 3, 3).
 
-        The normal of a vertex is the mean of the normals of the faces around the
-        vertex, weighted with the areas of the faces.
+        A normal is the mean of the normals of the faces that share it, weighted
+        with the areas of the faces.
         """
-        return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
+        arrays = (self.vertices, self.faces, self.normal_ids)
+        vertices, faces, normal_ids = map(torch.from_numpy, arrays)
+        normals = vertex_normals(vertices, faces, normal_ids, self.normal_ids.max() + 1)
+        return normals.numpy()[self.normal_ids]
+
+    def written_normals(self, normals: str) -> np.ndarray:
+        """Compute the unit normals of the corners for a file, shape (F, 3, 3).
+
+        Args:
+            normals: "flat" gives a corner the normal of its face, and "smooth" gives
+                it one of `corner_normals`. (0, 0, 1) replaces a normal of zero.
+
+        Raises:
+            InputError: If `normals` is neither "smooth" nor "flat".
+        """
+        require_choice("normals", normals, NORMALS)
+        values = self.corner_normals
+        if normals == "flat":
+            values = np.broadcast_to(self.face_normals()[:, None], values.shape)
+        return np.where(values.any(axis=-1, keepdims=True), values, [0.0, 0.0, 1.0])
 
     @cached_property
     def displayable(self) -> bool:
@@ -397,16 +446,20 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """
     faces = []
     texture_ids = []
-    # Numbers of vertices and textures of the meshes before the mesh
-    # of the loop. The indices of this mesh grow by these numbers.
+    normal_ids = []
+    # Numbers of vertices, textures and normals of the meshes before the
+    # mesh of the loop. The indices of this mesh grow by these numbers.
     vertex_count = 0
     texture_count = 0
+    normal_count = 0
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
+        normal_ids.append(mesh.normal_ids + normal_count)
         shifted_ids = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
         texture_ids.append(shifted_ids.astype(np.int32))
         vertex_count += len(mesh.vertices)
         texture_count += len(mesh.textures)
+        normal_count += mesh.normal_ids.max() + 1
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),
@@ -417,6 +470,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         gloss=_concatenate_gloss(meshes),
         gloss_textures=_concatenate_gloss_textures(meshes),
         skin=_concatenate_skins(meshes),
+        normal_ids=np.concatenate(normal_ids),
     )
 
 
@@ -573,6 +627,7 @@ def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         faces=mesh.faces[:, corner_order],
         corner_colors=mesh.corner_colors[:, corner_order],
         corner_uvs=mesh.corner_uvs[:, corner_order],
+        normal_ids=mesh.normal_ids[:, corner_order],
         skin=mesh.skin and mesh.skin.transformed(matrix),
     )
 
@@ -678,7 +733,7 @@ def _quartered(mesh: Mesh) -> Mesh:
     Returns:
         Mesh with 4 F faces. Its first V vertices are the old ones.
     """
-    edge_ends, edge_of_side = _shared_edges(mesh)
+    edge_ends, edge_of_side = _shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
     skin = mesh.skin
     if skin is not None:
@@ -689,6 +744,10 @@ def _quartered(mesh: Mesh) -> Mesh:
     # Vertices of the three corners and of the
     # three midpoints of each face, shape (F, 6).
     points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
+    # Two faces share the normal in the middle of an edge if they share the normals at both ends.
+    _, normal_of_side = _shared_edges(mesh.normal_ids)
+    midpoint_normals = mesh.normal_ids.max() + 1 + normal_of_side
+    normals = np.concatenate([mesh.normal_ids, midpoint_normals], axis=1)
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, midpoints]),
@@ -698,14 +757,15 @@ def _quartered(mesh: Mesh) -> Mesh:
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
         skin=skin,
+        normal_ids=normals[:, _QUARTERS].reshape(-1, 3),
     )
 
 
-def _shared_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _shared_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """List the E edges of a mesh. Sides of faces with the same two vertices are one edge.
 
     Args:
-        mesh: Mesh with F faces.
+        faces: Vertex indices of the faces, shape (F, 3).
 
     Returns:
         A tuple of
@@ -713,9 +773,9 @@ def _shared_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         - the index of the edge of each of the three sides of each face,
           shape (F, 3).
     """
-    vertex_count = len(mesh.vertices)
+    vertex_count = faces.max() + 1
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
-    side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
+    side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
     # A side from vertex a to vertex b gets the key a · V + b, for V
     # vertices. np.unique sorts these numbers faster than pairs of vertices.
     side_keys = side_ends @ [vertex_count, 1]

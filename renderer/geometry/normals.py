@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import require_choice, require_finite
-from renderer.settings import NORMALS
+from renderer.errors import require_finite
 from renderer.vectors import unit
 
 if TYPE_CHECKING:
@@ -70,22 +69,28 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
 
 
 def vertex_normals(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, "V 3"]:
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    normal_ids: Int[Tensor, "F 3"] | None = None,
+    count: int | None = None,
+) -> Float[Tensor, "N 3"]:
     """Compute the unit normals of vertices, differentiable with respect to the vertices.
 
     The normal of a vertex is the mean of the normals of the faces around the
-    vertex, weighted with the areas of the faces.
+    vertex, weighted with the areas of the faces. At sharp edges, a vertex has
+    several normals, each of which belongs to some of these faces.
 
     Args:
         vertices: Vertex positions, shape (V, 3).
         faces: Vertex indices of the faces, counter-clockwise seen from outside,
             shape (F, 3).
+        normal_ids: Index of the normal of each corner (see `Mesh.normal_ids`),
+            shape (F, 3). None for one normal per vertex.
+        count: Number N of normals. None for one normal per vertex.
 
     Returns:
-        Outward unit normals in the dtype of `vertices`, shape (V, 3). The normal
-        is zero for a vertex without faces, and for a vertex whose face normals
-        cancel.
+        Outward unit normals in the dtype of `vertices`, shape (N, 3). The normal
+        is zero for an index without faces, and where face normals cancel.
 
     Raises:
         InputError: If a position is NaN or infinite.
@@ -94,15 +99,14 @@ def vertex_normals(
     # face, shape (3 components, 3 F corners). The F first
     # corners come first, then all second and third corners.
     corner_vectors = area_vectors(vertices, faces).repeat(1, 3)
-    vertex_of_corner = faces.T.flatten()
-    zero_vectors = corner_vectors.new_zeros(3, len(vertices))
-    vertex_vectors = zero_vectors.index_add(1, vertex_of_corner, corner_vectors)
-    # Sum of the lengths of the area vectors around each vertex, shape (V,).
-    zero_lengths = corner_vectors.new_zeros(len(vertices))
+    normal_of_corner = (faces if normal_ids is None else normal_ids).T.flatten()
+    zero_vectors = corner_vectors.new_zeros(3, len(vertices) if count is None else count)
+    sums = zero_vectors.index_add(1, normal_of_corner, corner_vectors)
+    # Sum of the lengths of the area vectors of each normal, shape (N,).
     corner_lengths = _length(corner_vectors.detach())
-    length_sums = zero_lengths.index_add(0, vertex_of_corner, corner_lengths)
-    is_canceled = _length(vertex_vectors.detach()) <= CANCELLATION * length_sums
-    return unit(vertex_vectors.masked_fill(is_canceled, 0)).T.to(vertices.dtype)
+    length_sums = torch.zeros_like(sums[0]).index_add(0, normal_of_corner, corner_lengths)
+    is_canceled = _length(sums.detach()) <= CANCELLATION * length_sums
+    return unit(sums.masked_fill(is_canceled, 0)).T.to(vertices.dtype)
 
 
 def plain_face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -145,44 +149,6 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     ax, ay, az = corners[:, 1] - corners[:, 0]
     bx, by, bz = corners[:, 2] - corners[:, 0]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-
-
-def corner_normals(
-    vertices: np.ndarray, faces: np.ndarray, normals: str, crease: float = -2.0
-) -> np.ndarray:
-    """Compute a shading normal for each corner of each face.
-
-    Args:
-        vertices: Vertex positions, float64, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-        normals: "flat" gives a corner the normal of its face. "smooth" gives it
-            the normal of its vertex.
-        crease: Smallest cosine of the angle between the vertex normal and the
-            face normal at which "smooth" uses the vertex normal. At sharper
-            creases, the corner gets the face normal. The default -2 uses the
-            vertex normal at all angles.
-
-    Returns:
-        Unit normals, one row for each face and one column for each corner,
-        float64, shape (F, 3, 3). The normal is (0, 0, 1) if the face normal and
-        the vertex normal are both zero.
-
-    Raises:
-        InputError: If `normals` is neither "smooth" nor "flat".
-    """
-    require_choice("normals", normals, NORMALS)
-    face_normal = plain_face_normals(vertices, faces)
-    # The normal of a face, repeated for its three corners, shape (F, 3, 3).
-    normal_of_corner = np.broadcast_to(face_normal[:, None], (len(faces), 3, 3))
-    if normals == "smooth":
-        vertex_normal = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-        smooth_normal = vertex_normal[faces]
-        cosine = (smooth_normal * normal_of_corner).sum(axis=-1)
-        is_flat = ~smooth_normal.any(axis=-1) | (cosine < crease)
-        normal_of_corner = np.where(is_flat[..., None], normal_of_corner, smooth_normal)
-    has_normal = normal_of_corner.any(axis=-1, keepdims=True)
-    return np.where(has_normal, normal_of_corner, [0.0, 0.0, 1.0])
 
 
 def area_vectors(

@@ -12,12 +12,10 @@ import torch
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError, require_choice, require_range
+from renderer.errors import InputError, require_range
 from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
-from renderer.geometry.normals import corner_normals
 from renderer.image import decode
 from renderer.io.files import atomic_write
-from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
@@ -74,12 +72,11 @@ def export_mesh(
     """
     require_mesh("mesh", mesh)
     path = as_path("path", path)
-    require_choice("normals", normals, NORMALS)
     cameras = as_list("cameras", cameras, Camera, "a list of cameras")
     if first is not None:
         require_whole("first", first)
         require_range("first", first, 0, len(mesh.faces))
-    unit_normals = corner_normals(mesh.vertices, mesh.faces, normals)
+    unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
         raise InputError(
             f"{path} cannot be written as a mesh: choose a file name that ends in .glb"

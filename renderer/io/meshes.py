@@ -28,6 +28,7 @@ from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_file, single_line
+from renderer.geometry.creases import normal_groups
 from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.image import encode
 from renderer.io.images import eight_bits
@@ -149,7 +150,9 @@ def _merge_vertices(mesh: Mesh) -> Mesh:
         shares_of_merged = merged_keys[:, -1].astype(np.int64)
         skin = replace(skin, carried=distinct_shares[shares_of_merged])
     faces = vertex_of_corner.reshape(-1, 3)
-    return replace(mesh, vertices=merged_keys[:, :3], faces=faces, skin=skin)
+    vertices = merged_keys[:, :3]
+    normal_ids = normal_groups(vertices, faces)
+    return replace(mesh, vertices=vertices, faces=faces, skin=skin, normal_ids=normal_ids)
 
 
 def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[Part]:

@@ -59,7 +59,7 @@ def radiance(
     vertices: Float[Tensor, "V 3"],
     light: Float[Tensor, "coefficients 3"],
     albedo: Float[Tensor, "S 3"],
-    normals: Float[Tensor, "V 3"] | None = None,
+    normals: Float[Tensor, "G 3 3"] | None = None,
 ) -> Float[Tensor, "3 P"]:
     """Compute the linear radiance of the P covered pixels of a matte surface.
 
@@ -72,8 +72,9 @@ def radiance(
         light: SH coefficients of any degree, shape (K, 3).
         albedo: Linear albedo at the samples (see `renderer.surface.albedo`),
             shape (S, 3).
-        normals: Vertex normals for smooth shading, from `normals_in_sight`,
-            shape (V, 3). None for flat shading with the normals of the faces.
+        normals: Normals at the corners of the G seen faces for smooth shading,
+            from `normals_in_sight`, shape (G, 3, 3). None for flat shading with
+            the normals of the faces.
 
     Returns:
         Radiance, times the fraction of each pixel that the surface covers, in the
@@ -98,7 +99,7 @@ def radiance(
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
-        shading_normals = smooth_normals(fragments, normals.to(wide), vertices)
+        shading_normals = smooth_normals(fragments, normals.to(wide))
         incoming = irradiance(shading_normals.T, light, wide)
     reflected = incoming * weights.T
     # Each column of `reflected` is a pixel already if a pixel has one sample.
@@ -113,7 +114,7 @@ def glossy_radiance(
     vertices: Float[Tensor, "V 3"],
     light: Float[Tensor, "coefficients 3"],
     albedo: Float[Tensor, "S 3"],
-    normals: Float[Tensor, "V 3"] | None,
+    normals: Float[Tensor, "G 3 3"] | None,
     gloss: SampleGloss,
 ) -> Float[Tensor, "3 P"]:
     """Compute the linear radiance of the P covered pixels of a glossy surface.
@@ -126,8 +127,8 @@ def glossy_radiance(
         vertices: Vertex positions in world axes, shape (V, 3).
         light: SH coefficients of any degree, shape (K, 3).
         albedo: Linear albedo at the samples, shape (S, 3).
-        normals: Vertex normals for smooth shading, shape (V, 3), or None for
-            flat shading (see `radiance`).
+        normals: Normals at the corners of the seen faces for smooth shading,
+            shape (G, 3, 3), or None for flat shading (see `radiance`).
         gloss: Gloss at the samples (see `renderer.shading.gloss`).
 
     Returns:
@@ -144,7 +145,7 @@ def glossy_radiance(
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
         shading_normals = unit(face_normals).T[fragments.sample_to_seen_face].to(wide)
     else:
-        shading_normals = unit(smooth_normals(fragments, normals.to(wide), vertices).T).T
+        shading_normals = unit(smooth_normals(fragments, normals.to(wide)).T).T
     to_camera = toward_camera(fragments, vertices.to(wide))
     albedo = albedo.to(wide)
     light = light.to(wide)
@@ -574,62 +575,58 @@ def _diffuse_basis(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
 
 
 def normals_in_sight(
-    fragments: Fragments, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, "V 3"]:
-    """Compute the normals of the vertices of all faces that a view shows.
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    normal_ids: Int[Tensor, "F 3"],
+) -> Float[Tensor, "G 3 3"]:
+    """Compute the normals at the corners of the G faces that a view shows.
 
     Args:
         fragments: Samples of the view that show the mesh. Their faces are seen.
         vertices: Vertex positions in world axes, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
+        normal_ids: Index of the normal of each corner (see `Mesh.normal_ids`),
+            shape (F, 3).
 
     Returns:
-        Unit normals, float32 or float64, shape (V, 3). Vertices of faces that
-        are not seen have a zero or wrong normal, which no sample uses.
+        Unit normals, float32 or float64, shape (G, 3, 3).
     """
-    is_seen_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    is_seen_vertex[fragments.corners.T.flatten()] = True
-    # The normal of a vertex is an average over all faces around it. All faces with at
-    # least one vertex of a seen face are therefore needed.
-    has_seen_corner = is_seen_vertex.index_select(0, faces.flatten()).view(-1, 3)
-    first, second, third = has_seen_corner.T
-    needed_faces = faces[first | second | third]
+    # All first corners of the seen faces, then all second and third corners.
+    seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
+    count = int(normal_ids.max()) + 1
+    is_seen = torch.zeros(count, dtype=torch.bool, device=faces.device)
+    is_seen[seen_ids] = True
+    # A normal is an average over all faces that share it, so these are all needed.
+    first, second, third = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).T
+    is_needed = first | second | third
+    needed_faces = faces[is_needed]
+    needed_ids = normal_ids[is_needed]
     vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
-    if len(vertices) < SPARSE_VERTEX_RATIO * needed_faces.numel():
-        return vertex_normals(vertices, needed_faces)
-    # If the needed faces have few of the vertices, it is faster to renumber these vertices
-    # and to compute the normals of these only.
-    used_vertices, renumbered_faces = needed_faces.unique(return_inverse=True)
-    normals = vertex_normals(vertices.index_select(0, used_vertices), renumbered_faces)
-    zeros = torch.zeros_like(vertices, requires_grad=False)
-    return zeros.index_copy(0, used_vertices, normals)
+    if count < SPARSE_VERTEX_RATIO * needed_faces.numel():
+        normals = vertex_normals(vertices, needed_faces, needed_ids, count)
+    else:
+        # If few of the normals are needed, it is faster to renumber and compute only these.
+        used_ids, renumbered_ids = needed_ids.unique(return_inverse=True)
+        normals = vertex_normals(vertices, needed_faces, renumbered_ids, len(used_ids))
+        seen_ids = torch.searchsorted(used_ids, seen_ids)
+    return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
 
 
 def smooth_normals(
-    fragments: Fragments, normals: Float[Tensor, "V 3"], vertices: Float[Tensor, "V 3"]
+    fragments: Fragments, corner_normals: Float[Tensor, "G 3 3"]
 ) -> Float[Tensor, "S 3"]:
-    """Interpolate vertex normals at the samples of a view.
+    """Interpolate the normals at corners to the samples of a view.
 
     The normals of faces that are seen from behind are reversed, so that they
-    point to the side of the camera. A vertex normal is zero if the normals of
-    the faces around it cancel, as in a leaf with a front and a back. Each of
-    these faces then has its own normal there.
+    point to the side of the camera.
 
     Args:
         fragments: The S samples of the view that show the mesh.
-        normals: Vertex normals, shape (V, 3).
-        vertices: Vertex positions, shape (V, 3).
+        corner_normals: Normals at the corners of the G seen faces,
+            shape (G, 3, 3).
 
     Returns:
         Interpolated normals, which are not of unit length, shape (S, 3).
     """
-    corner_vertices = fragments.corners.T.flatten()
-    # Vertex normals with the axes: component, corner, seen face.
-    corner_normals = normals.T.index_select(1, corner_vertices).unflatten(1, (3, -1))
-    is_canceled = (corner_normals == 0).all(0)
-    if is_canceled.any():
-        face_normals = unit(area_vectors(vertices, fragments.corners)).to(corner_normals)
-        corner_normals = torch.where(is_canceled, face_normals[:, None], corner_normals)
-    facing_normals = corner_normals * fragments.facing.T.to(normals)
-    # `interpolate` takes the axes in the order: seen face, corner, component.
-    return fragments.interpolate(facing_normals.permute(2, 1, 0))
+    return fragments.interpolate(corner_normals * fragments.facing[:, :, None].to(corner_normals))

@@ -113,12 +113,13 @@ class Surface:
             return self.planes
         if self.moved is None:
             # The mesh caches these normals, so all its views share them.
-            vertex_normals = torch.from_numpy(self.mesh.vertex_normals)
+            corner_normals = torch.from_numpy(self.mesh.corner_normals)[self.fragments.faces]
         else:
             faces = torch.from_numpy(self.mesh.faces)
-            vertex_normals = normals_in_sight(self.fragments, self.vertices, faces)
+            normal_ids = torch.from_numpy(self.mesh.normal_ids)
+            corner_normals = normals_in_sight(self.fragments, self.vertices, faces, normal_ids)
         # The function `unit` takes vectors with their components along the first axis.
-        return unit(smooth_normals(self.fragments, vertex_normals, self.vertices).T).T
+        return unit(smooth_normals(self.fragments, corner_normals).T).T
 
     @cached_property
     def points(self) -> Tensor:

@@ -47,7 +47,7 @@ def shade(name: str, values: Tensor, smooth: bool = False) -> Tensor:
     arguments = {**GOOD, name: values}
     normals = None
     if smooth:
-        normals = normals_in_sight(FRAGMENTS, arguments["vertices"], FACES)
+        normals = normals_in_sight(FRAGMENTS, arguments["vertices"], FACES, FACES)
     return radiance(FRAGMENTS, **arguments, normals=normals)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from oracles import mesh_of
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, PinholeCamera
@@ -71,6 +72,11 @@ def ball() -> Mesh:
     )
 
 
+def can() -> Mesh:
+    """Return a can, whose lids are flat and whose side is round."""
+    return mesh_of(trimesh.creation.cylinder(0.8, 1.2), (0.5, 0.4, 0.3))
+
+
 def render_operator(operator: TransferOperator, light: Tensor, size: int) -> Tensor:
     """Return our radiance and coverage, shape (4, size, size)."""
     image = torch.zeros(4, size * size, dtype=torch.float64)
@@ -99,14 +105,17 @@ def test_a_mitsuba_map_equals_the_light_in_every_direction(tmp_path):
     torch.testing.assert_close(found, expected, rtol=0, atol=4e-4 * expected.max())
 
 
-@pytest.mark.parametrize(("encoding", "normals"), [("linear", "smooth"), ("srgb", "flat")])
-def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, encoding, normals):
+@pytest.mark.parametrize(
+    ("make_mesh", "encoding", "normals"),
+    [(ball, "linear", "smooth"), (ball, "srgb", "flat"), (can, "linear", "smooth")],
+)
+def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, encoding, normals):
     """Inside the silhouette, the mean error is below half of 1/255, and the root mean square
     error below 1/200. It is the noise of Mitsuba at the edges of texels.
 
     The lighting has no negative radiance.
     """
-    mesh = normalize(ball())
+    mesh = normalize(make_mesh())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8, encoding, normals)
     write_mitsuba_scene(

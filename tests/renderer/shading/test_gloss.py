@@ -553,7 +553,10 @@ def mitsuba_image(
     with mitsuba() as module:
         sampler = {"type": "multijitter", "sample_count": sample_count}
         sensor = sensor_of(CAMERA, size) | {"sampler": sampler}
-        mitsuba_mesh = shape(module, surface, mesh.vertices, mesh.faces, mesh.vertex_normals)
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        triangles = np.arange(len(corners)).reshape(-1, 3)
+        normals = mesh.corner_normals.reshape(-1, 3)
+        mitsuba_mesh = shape(module, surface, corners, triangles, normals)
         scene = {
             "type": "scene",
             "integrator": integrator(0, emitter_samples),

@@ -6,7 +6,7 @@ encoding. Differences are taken at fixed visibility.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from oracles import draw, patchwork, scipy_irradiance
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
+from renderer.geometry.creases import normal_groups
 from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, tonemap
 from renderer.light.harmonics import (
@@ -112,10 +113,11 @@ def test_second_derivatives_are_refused_instead_of_wrong():
         gradient.sum().backward()
 
 
-def dented_icosahedron(face_count: int = 20) -> Mesh:
-    """Return a dented icosahedron, or an open part of it."""
+def dented_icosahedron(face_count: int = 20, crease: float = 180) -> Mesh:
+    """Return a dented icosahedron, or an open part of it, which is sharp beyond an angle."""
     shape = trimesh.creation.icosahedron()
-    return patchwork(shape.vertices, shape.faces[:face_count])
+    mesh = patchwork(shape.vertices, shape.faces[:face_count])
+    return replace(mesh, normal_ids=normal_groups(mesh.vertices, mesh.faces, crease=crease))
 
 
 IN_FRONT = OrthographicCamera(57.3, 22.9, 2.2)
@@ -153,12 +155,14 @@ class Scene:
         if not self.smooth:
             return None
         faces = torch.from_numpy(self.mesh.faces)
-        return shading.normals_in_sight(self.fragments, vertices, faces)
+        normal_ids = torch.from_numpy(self.mesh.normal_ids)
+        return shading.normals_in_sight(self.fragments, vertices, faces, normal_ids)
 
 
 SCENES = {
     "closed": Scene(dented_icosahedron()),
     "closed, smooth": Scene(dented_icosahedron(), smooth=True),
+    "closed, partly sharp": Scene(dented_icosahedron(crease=50), smooth=True),
     "open, from in front": Scene(dented_icosahedron(13), smooth=True),
     "open, from behind": Scene(dented_icosahedron(13), BEHIND),
     "open, from behind, smooth": Scene(dented_icosahedron(13), BEHIND, smooth=True),
@@ -277,7 +281,8 @@ def test_the_gradient_by_a_vertex_is_zero_if_no_visible_face_depends_on_it(
     [gradient] = torch.autograd.grad(image(*inputs), inputs[0], upstream)
     moving = np.unique(scene.fragments.corners)
     if scene.smooth:
-        is_neighbor = np.isin(scene.mesh.faces, moving).any(axis=1)
+        seen_ids = scene.mesh.normal_ids[scene.fragments.faces]
+        is_neighbor = np.isin(scene.mesh.normal_ids, seen_ids).any(axis=1)
         moving = np.unique(scene.mesh.faces[is_neighbor])
     fixed = np.setdiff1d(np.arange(len(gradient)), moving)
     assert gradient[moving].any(dim=1).all()
@@ -302,7 +307,7 @@ def test_background_pixels_and_clamped_values_have_no_gradient(scene):
 def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surface():
     """The vertex normals are the corners, so the normal at a sample is the point itself."""
     hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
-    mesh = Mesh.plain(hull.vertices, hull.faces)
+    mesh = Mesh.plain(hull.vertices, hull.faces, crease=180)
     scene = Scene(mesh, size=24, samples=1, smooth=True)
     fragments = scene.fragments
     vertices = scene.vertices()

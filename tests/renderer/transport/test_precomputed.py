@@ -111,8 +111,9 @@ def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh, bounces
 
 
 def octahedron() -> Mesh:
-    """Return the octahedron |x| + |y| + |z| = 1."""
-    return mesh_of(trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)])))
+    """Return the octahedron |x| + |y| + |z| = 1 without sharp edges."""
+    hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
+    return Mesh.plain(hull.vertices, hull.faces, crease=180)
 
 
 def points_on_octahedron(operator: TransferOperator, camera: OrthographicCamera) -> np.ndarray:

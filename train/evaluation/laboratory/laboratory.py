@@ -19,7 +19,6 @@ from augment.random_streams import stream_seed
 from augment.scene.objects import load_object
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
-from renderer.geometry.normals import corner_normals
 from renderer.geometry.shapes import HARD_NEGATIVES
 from renderer.image import decode, encode
 from renderer.io.files import atomic_write
@@ -53,10 +52,6 @@ PROJECTOR_HALF_WIDTH = 2.6
 BUILT_IN_MAP_HEIGHT = 64
 # The table and the wall are squares. This is half of their width, in world units.
 PLANE_HALF_WIDTH = 100.0
-# A corner of a face is shaded with the smooth normal of its vertex only if the cosine
-# between this normal and the normal of the face is at least 0.85. At an edge with a
-# right angle, the cosine is at most 0.82, so that the edge looks sharp.
-MIN_SMOOTH_COSINE = 0.85
 # Mitsuba takes seeds from 0 to 2^32 - 1.
 SEED_COUNT = 2**32
 
@@ -89,7 +84,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
         Parts with one texture or none. Textures are linear RGB, shape
         (H, W, 3).
     """
-    normals = corner_normals(mesh.vertices, mesh.faces, "smooth", MIN_SMOOTH_COSINE)
+    normals = mesh.written_normals("smooth")
     parts = []
     for part in split_parts(mesh, normals, "srgb"):
         texture = part.texture

@@ -16,7 +16,6 @@ import trimesh
 
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
-from renderer.geometry.normals import corner_normals
 from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
@@ -534,13 +533,13 @@ def test_right_angles_stay_sharp(division_count):
     for _ in range(division_count):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     mesh = Mesh.plain(vertices, faces)
-    normals = corner_normals(mesh.vertices, mesh.faces, "smooth", lab.MIN_SMOOTH_COSINE)
+    [part] = lab.lab_parts(mesh, 1.0)
     expected = mesh.face_normals()[:, None].repeat(3, axis=1)
-    np.testing.assert_array_equal(normals, expected)
+    np.testing.assert_array_equal(part.normals, expected)
 
 
 def test_round_surfaces_are_smooth():
     ball = trimesh.creation.icosphere(subdivisions=3)
     mesh = Mesh.plain(ball.vertices, ball.faces)
-    normals = corner_normals(mesh.vertices, mesh.faces, "smooth", lab.MIN_SMOOTH_COSINE)
-    np.testing.assert_allclose(normals, mesh.vertices[mesh.faces], atol=0.02)
+    [part] = lab.lab_parts(mesh, 1.0)
+    np.testing.assert_allclose(part.normals, mesh.vertices[mesh.faces], atol=0.02)
