@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from renderer.errors import MAX_MAGNITUDE
-from renderer.geometry.mesh import NO_TEXTURE, Mesh
+from renderer.geometry.mesh import NO_TEXTURE, Mesh, transformed
 from renderer.geometry.polygons import triangulate
 from renderer.image import decode, encode
 from renderer.io.files import file_below
@@ -37,6 +37,20 @@ class Part(NamedTuple):
     mesh: Mesh
     normals: np.ndarray | None = None
     matrix: np.ndarray = np.eye(4)
+
+    def placed(self) -> tuple[Mesh, np.ndarray]:
+        """Return the mesh in the axes of the scene, and its normals there or zeros."""
+        mesh = transformed(self.mesh, self.matrix)
+        if self.normals is None:
+            return mesh, np.zeros((len(mesh.faces), 3, 3))
+        # The matrix of cofactors is the inverse of the transpose times the determinant,
+        # and exists even without an inverse.
+        u, v, w = self.matrix[:3, :3]
+        cofactors = np.array([np.cross(v, w), np.cross(w, u), np.cross(u, v)])
+        if u @ cofactors[0] < 0:
+            # `transformed` reverses the corners of a mirrored mesh.
+            return mesh, self.normals[:, [0, 2, 1]] @ -cofactors.T
+        return mesh, self.normals @ cofactors.T
 
 
 class MeshFile:

@@ -71,6 +71,10 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     them. Vertices at the same position are merged, so that no seam opens when a
     vertex is moved. Unused vertices are dropped.
 
+    Edges are sharp where the normals of the file differ between both sides and, in
+    a file without normals, where faces meet at more than 40° (see
+    `Mesh.normal_ids`). Apart from this, the normals of the file are not used.
+
     The color of a surface is the product of the material color, the texture, and
     the vertex or face colors, as far as the file has them. Without any of them,
     the color is white. Alpha, other material properties and the wrap mode of
@@ -111,10 +115,10 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     require_flag("gloss", gloss)
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     parts = read_parts(path, is_gltf, gloss)
-    placed_parts = [transformed(part.mesh, part.matrix) for part in parts]
-    if not placed_parts:
+    if not parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
-    mesh = _merge_vertices(concatenate(placed_parts))
+    placed_meshes, normals = zip(*(part.placed() for part in parts), strict=True)
+    mesh = _merge_vertices(concatenate(placed_meshes), np.concatenate(normals))
     # The matrices of a scene may have huge numbers or NaN. A
     # comparison with NaN is False, so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
@@ -130,11 +134,12 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
 
-def _merge_vertices(mesh: Mesh) -> Mesh:
+def _merge_vertices(mesh: Mesh, normals: np.ndarray) -> Mesh:
     """Return a copy of a mesh in which vertices at the same position are merged.
 
     Vertices that joints move in different ways are not merged. Vertices without
-    faces are dropped.
+    faces are dropped. `normals` are those of the file, or zero, shape (F, 3, 3).
+    They decide which edges are sharp.
     """
     # Vertices with equal keys are merged. The key is the position.
     vertex_keys = mesh.vertices
@@ -151,7 +156,7 @@ def _merge_vertices(mesh: Mesh) -> Mesh:
         skin = replace(skin, carried=distinct_shares[shares_of_merged])
     faces = vertex_of_corner.reshape(-1, 3)
     vertices = merged_keys[:, :3]
-    normal_ids = normal_groups(vertices, faces)
+    normal_ids = normal_groups(vertices, faces, normals)
     return replace(mesh, vertices=vertices, faces=faces, skin=skin, normal_ids=normal_ids)
 
 
@@ -213,12 +218,16 @@ def _read_parts(file: MeshFile, suffix: str, linear: bool, gloss: bool) -> list[
     specular_factors = _specular_factors(tree) if gloss else {}
     scene = _load(content, suffix, _Files(file))
     meshes = {}
+    normals = {}
     for name, geometry in scene.geometry.items():
         # The geometry may also be points or lines, which are skipped.
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
         mesh = _as_mesh(geometry, linear)
         meshes[name] = _with_gloss(mesh, geometry.visual, specular_factors) if gloss else mesh
+        # trimesh computes `vertex_normals` if the file has none, but not before they are used.
+        given = geometry._cache.cache.get("vertex_normals")
+        normals[name] = None if given is None else given[mesh.faces]
     # trimesh skips a glTF image that it cannot read, and
     # reports no error. Such a file then has too few textures.
     if sum(len(mesh.textures) for mesh in meshes.values()) < textured_count:
@@ -230,9 +239,10 @@ def _read_parts(file: MeshFile, suffix: str, linear: bool, gloss: bool) -> list[
         if name not in meshes:
             continue
         if has_skins:
-            parts.append(Part(skinned(meshes[name], node, scene, tree)))
+            # The normals are those before the joints moved. Their values are only compared.
+            parts.append(Part(skinned(meshes[name], node, scene, tree), normals[name]))
         else:
-            parts.append(Part(meshes[name], matrix=matrix))
+            parts.append(Part(meshes[name], normals[name], matrix))
     return parts
 
 
