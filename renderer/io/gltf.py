@@ -1,0 +1,234 @@
+"""Read meshes from glTF 2.0 files.
+
+Shape (with the default weights of morph targets and the default pose of
+joints), color, alpha and gloss are read. A feature that changes neither the
+shape nor the base color is ignored and named in a warning. A file that has any
+other feature is refused.
+
+A part is a mesh with one material (a primitive of glTF).
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+from renderer.geometry.mesh import NO_TEXTURE, Mesh
+from renderer.image import encode
+from renderer.io.cutout import cut_out
+from renderer.io.gltf_file import GltfFile
+from renderer.io.gltf_material import QUANTIZATION, Material, ignored_features, read_material
+from renderer.io.mesh_file import MeshFile, Part, require_bounded
+from renderer.io.skins import Skeleton
+from renderer.memory import require_memory
+
+# Kinds of primitives that consist of triangles (5.24.4).
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
+# Alpha from which on a texel with 8 bits counts as opaque.
+ALMOST_ONE = 1 - 0.5 / 255
+# Bytes that a face, and a joint of a vertex, take while the parts are read and joined.
+FACE_BYTES = 2000
+JOINT_BYTES = 100
+
+
+@dataclass(frozen=True)
+class _Primitive:
+    """Part in its own axes, with V vertices and F faces.
+
+    Attributes:
+        positions: Positions of the vertices, shape (V, 3).
+        faces: Vertex indices of the corners, shape (F, 3).
+        corners: Texture coordinates (2), alpha, linear color (3) and normal (3)
+            of the corners, shape (F, 3, 9). Normals of 0 if the file has none.
+        material: Material of the part.
+        joints: Attributes JOINTS_n and WEIGHTS_n of the vertices.
+    """
+
+    positions: np.ndarray
+    faces: np.ndarray
+    corners: np.ndarray
+    material: Material
+    joints: dict[str, np.ndarray]
+
+
+def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
+    """Read the parts of a .gltf or .glb file in the axes of its scene.
+
+    Raises:
+        Exception: Any exception, if the file is damaged or not supported.
+    """
+    file = GltfFile(mesh_file)
+    for feature in ignored_features(file.tree):
+        mesh_file.ignore(feature)
+    nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
+    skeleton = Skeleton(file) if "skins" in file.tree else None
+    _require_memory(file, nodes, 0 if skeleton is None else len(skeleton))
+    material = cache(lambda index: read_material(file, index, gloss))
+    part = cache(lambda *key: _read_part(file, material, *key))
+    placed_parts = []
+    for index in nodes:
+        node = file.tree["nodes"][index]
+        mesh = file.entry("meshes", node["mesh"])
+        weights = tuple(node.get("weights", mesh.get("weights", ())))
+        for number, primitive in enumerate(mesh["primitives"]):
+            if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
+                read = part(node["mesh"], number, weights)
+                placed_parts += _place(file, index, read, skeleton)
+    return placed_parts
+
+
+def _require_memory(file: GltfFile, nodes: list[int], joint_count: int) -> None:
+    """Check that the faces that the nodes show fit into the memory, before arrays are read.
+
+    A small file can show one mesh very often, or declare an array of zeros.
+    """
+    needed = 0
+    for index in nodes:
+        node = file.tree["nodes"][index]
+        for primitive in file.entry("meshes", node["mesh"])["primitives"]:
+            vertices = file.entry("accessors", primitive["attributes"]["POSITION"])["count"]
+            corners = vertices
+            if "indices" in primitive:
+                corners = file.entry("accessors", primitive["indices"])["count"]
+            faces = corners / 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else corners
+            copies = file.instance_count(index)
+            needed += copies * int(FACE_BYTES * faces + JOINT_BYTES * joint_count * vertices)
+    require_memory("its faces", needed, torch.device("cpu"))
+
+
+def _read_part(
+    file: GltfFile, material_of: Any, mesh: int, number: int, weights: tuple[float, ...]
+) -> _Primitive:
+    """Read a primitive of a mesh, with its morph targets at the given weights."""
+    primitive = file.tree["meshes"][mesh]["primitives"][number]
+    material: Material = material_of(primitive.get("material"))
+    attributes = _attributes(file, primitive, weights)
+    positions = attributes["POSITION"]
+    faces = _faces(file, primitive, len(positions))
+    colors = np.ones((len(positions), 4))
+    if "COLOR_0" in attributes:
+        given = attributes["COLOR_0"]
+        colors[:, : given.shape[1]] = np.clip(given, 0, 1)
+    colors *= material.color
+    uvs = np.zeros((len(positions), 2))
+    if material.placement is not None:
+        name = f"TEXCOORD_{material.placement.uv_set}"
+        if name not in attributes:
+            raise ValueError("the mesh has a texture, but no texture coordinates")
+        uvs = attributes[name]
+    require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
+    material, uvs = material.placed(uvs)
+    normals = attributes.get("NORMAL", np.zeros_like(positions))
+    values = np.concatenate([uvs, colors[:, 3:], colors[:, :3], normals], axis=1)
+    joints = {key: v for key, v in attributes.items() if key.startswith(("JOINTS", "WEIGHTS"))}
+    return _Primitive(positions, faces, values[faces], material, joints)
+
+
+def _attributes(
+    file: GltfFile, primitive: dict[str, Any], weights: tuple[float, ...]
+) -> dict[str, np.ndarray]:
+    """Read the attributes of the vertices of a primitive, with its morph targets (3.7.2.2)."""
+    attributes = {}
+    for name, index in primitive["attributes"].items():
+        values = file.array(index)
+        is_vector = not name.startswith("JOINTS")
+        if is_vector and values.dtype.kind in "iu":
+            # Colors and weights must be normalized. Files that forget to say so are common.
+            if name.startswith(("COLOR", "WEIGHTS")):
+                values = values / np.iinfo(values.dtype).max
+            elif QUANTIZATION not in file.tree.get("extensionsUsed", ()):
+                raise ValueError(f"{name} has integers without {QUANTIZATION}: export it again")
+        attributes[name] = values.astype(np.float64) if is_vector else values
+    targets = primitive.get("targets", [])
+    if weights and len(weights) != len(targets):
+        raise ValueError(f"it has {len(weights)} weights for {len(targets)} morph targets")
+    for weight, target in zip(weights, targets, strict=False):
+        for name, index in target.items():
+            if weight != 0 and name in attributes:
+                attributes[name] = attributes[name] + weight * file.array(index)
+    vertex_count = len(attributes["POSITION"])
+    for name, values in attributes.items():
+        if len(values) != vertex_count:
+            raise ValueError(f"{name} has {len(values)} entries for {vertex_count} vertices")
+    return attributes
+
+
+def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.ndarray:
+    """Return the vertex indices of the corners of the faces of a primitive (3.7.2.1)."""
+    indices = np.arange(vertex_count)
+    if "indices" in primitive:
+        indices = file.array(primitive["indices"]).ravel()
+        if indices.dtype.kind != "u" or indices.max(initial=0) >= vertex_count:
+            raise ValueError(f"it has indices of faces beyond its {vertex_count} vertices")
+        indices = indices.astype(np.int64)
+    mode = primitive.get("mode", TRIANGLES)
+    if mode == TRIANGLES:
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
+    if mode == FAN:
+        first = np.full(max(len(indices) - 2, 0), indices[0])
+        faces = np.stack([indices[1:-1], indices[2:], first], axis=1)
+    else:
+        faces = np.lib.stride_tricks.sliding_window_view(indices, 3).copy()
+        # Every second face of a strip has the opposite orientation.
+        faces[1::2] = faces[1::2][:, [0, 2, 1]]
+    # Faces that only join the parts of a strip have the same vertex twice.
+    is_face = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return faces[is_face]
+
+
+def _place(file: GltfFile, node: int, part: _Primitive, skeleton: Skeleton | None) -> list[Part]:
+    """Place a part in the scene, once for each copy that a node shows, and cut out its holes."""
+    if not len(part.faces):
+        return []
+    poses = file.instances(node)
+    vertices = part.positions
+    if skeleton is not None:
+        if len(poses) > 1:
+            raise ValueError("it shows several copies of a mesh in a file with joints")
+        carried, placed, pose = skeleton.posed(node, part.positions, part.joints)
+        poses = pose[None]
+        vertices = np.concatenate([vertices, placed, carried.reshape(len(vertices), -1)], axis=1)
+    vertices, faces, corners = _visible(part, vertices)
+    if not len(faces):
+        return []
+    texture_id = NO_TEXTURE if part.material.texture is None else 0
+    gloss = part.material.gloss
+    mesh = Mesh(
+        vertices=vertices[:, :3],
+        faces=faces,
+        corner_colors=encode(torch.from_numpy(corners[..., 3:6]), "srgb").float().numpy(),
+        corner_uvs=corners[..., :2].astype(np.float32),
+        texture_ids=np.full(len(faces), texture_id, dtype=np.int32),
+        textures=() if part.material.texture is None else (part.material.texture,),
+        gloss=None if gloss is None else np.float32(gloss)[None].repeat(len(faces), axis=0),
+        gloss_textures=(
+            () if part.material.gloss_texture is None else (part.material.gloss_texture,)
+        ),
+    )
+    normals = corners[..., 6:] if corners[..., 6:].any() else None
+    if skeleton is None:
+        return [Part(mesh, normals, pose) for pose in poses]
+    carried = vertices[:, 6:].reshape(len(vertices), -1, 4).astype(np.float32)
+    # The values of the normals are only compared, so they need not follow the joints.
+    posed, normals = Part(mesh, normals, poses[0]).placed()
+    posed = replace(posed, vertices=vertices[:, 3:6], skin=skeleton.skin(carried))
+    return [Part(posed, normals)]
+
+
+def _visible(part: _Primitive, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, faces and corners of the visible surface of a part (3.9.6)."""
+    material = part.material
+    if material.mode == "OPAQUE":
+        return vertices, part.faces, part.corners
+    cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
+    visible = cut_out(vertices, part.faces, part.corners, material.alpha, cutoff)
+    if material.mode == "BLEND" and visible[1] is not part.faces:
+        raise ValueError(
+            "its surface is transparent (alphaMode BLEND with alpha below 1): "
+            "make it opaque, or use alphaMode MASK"
+        )
+    return visible

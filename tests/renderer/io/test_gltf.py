@@ -1,0 +1,823 @@
+"""Features of glTF 2.0, compared with the formulas of its specification and with closed forms."""
+
+import base64
+import copy
+import io
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
+from oracles import corners_of, srgb_of
+from PIL import Image
+from scipy.spatial import KDTree
+
+from renderer import memory
+from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
+from renderer.image import decode
+from renderer.io.export import export_mesh
+from renderer.io.meshes import load_mesh, read_parts
+
+TYPES = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125}
+KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+SQUARE = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+# v points down in glTF.
+SQUARE_UVS = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]])
+SQUARE_FACES = np.uint16([0, 1, 2, 0, 2, 3])
+
+
+class Gltf:
+    """Tree of a .gltf file with one buffer."""
+
+    def __init__(self) -> None:
+        self.buffer = b""
+        self.tree: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "nodes": [{"mesh": 0}],
+            "scenes": [{"nodes": [0]}],
+            "scene": 0,
+            "accessors": [],
+            "bufferViews": [],
+            "materials": [],
+            "meshes": [],
+        }
+
+    def view(self, content: bytes, **entries: Any) -> int:
+        """Append bytes to the buffer, and return the index of their view."""
+        self.buffer += b"\0" * (-len(self.buffer) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(content), **entries}
+        self.buffer += content
+        self.tree["bufferViews"].append(view)
+        return len(self.tree["bufferViews"]) - 1
+
+    def array(self, values: np.ndarray, normalized: bool = False) -> int:
+        """Append an array, and return the index of its accessor."""
+        values = np.asarray(values)
+        width = values[0].size
+        accessor = {
+            "bufferView": self.view(values.tobytes()),
+            "componentType": TYPES.get(values.dtype.name, 5126),
+            "count": len(values),
+            "type": KINDS[width],
+            "normalized": normalized,
+        }
+        self.tree["accessors"].append(accessor)
+        return len(self.tree["accessors"]) - 1
+
+    def mesh(
+        self, attributes: dict[str, Any], indices: np.ndarray | None = None, **entries: Any
+    ) -> dict[str, Any]:
+        """Append a mesh with one primitive, and return the primitive."""
+        accessors = {
+            name: values if isinstance(values, int) else self.array(values)
+            for name, values in attributes.items()
+        }
+        primitive = {"attributes": accessors, **entries}
+        if indices is not None:
+            primitive["indices"] = self.array(indices)
+        self.tree["meshes"].append({"primitives": [primitive]})
+        return primitive
+
+    def texture(self, texels: np.ndarray, **sampler: int) -> dict[str, int]:
+        """Append a texture, and return a reference to it."""
+        content = io.BytesIO()
+        Image.fromarray(texels).save(content, "PNG")
+        for kind in ("images", "samplers", "textures"):
+            self.tree.setdefault(kind, [])
+        view = self.view(content.getvalue())
+        self.tree["images"].append({"bufferView": view, "mimeType": "image/png"})
+        self.tree["samplers"].append(sampler)
+        index = len(self.tree["textures"])
+        self.tree["textures"].append({"source": index, "sampler": index})
+        return {"index": index}
+
+    def square(self, **material: Any) -> "Gltf":
+        """Append a square with texture coordinates and a material."""
+        attributes = {"POSITION": SQUARE, "TEXCOORD_0": SQUARE_UVS}
+        self.mesh(attributes, SQUARE_FACES, material=len(self.tree["materials"]))
+        self.tree["materials"].append(material)
+        return self
+
+    def write(self, path: Path) -> Path:
+        """Write the file with its buffer as a data URI."""
+        tree = copy.deepcopy(self.tree)
+        uri = "data:application/octet-stream;base64," + base64.b64encode(self.buffer).decode()
+        tree["buffers"] = [{"byteLength": len(self.buffer), "uri": uri}]
+        path.write_text(json.dumps(tree))
+        return path
+
+    def load(self, folder: Path, gloss: bool = False) -> Mesh:
+        """Write the file and load it, with the axes of the file."""
+        return load_mesh(self.write(folder / "mesh.gltf"), up="z", gloss=gloss)
+
+
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Decode sRGB-encoded colors in [0, 1]."""
+    return decode(torch.from_numpy(np.float64(colors)), "srgb").numpy()
+
+
+def albedo_at(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
+    """Interpolate the linear albedo bilinearly at texture coordinates of the mesh, v up."""
+    [texture] = mesh.textures
+    height, width = texture.shape[:2]
+    position = np.array([uvs[:, 0] * width, (1 - uvs[:, 1]) * height]) - 0.5
+    start = np.floor(position).astype(int)
+    x, y = position - start
+    values = linear(texture / 255)
+    total = 0
+    for i, wx in ((0, 1 - x), (1, x)):
+        for j, wy in ((0, 1 - y), (1, y)):
+            texels = values[(start[1] + j) % height, (start[0] + i) % width]
+            total = total + (wx * wy)[:, None] * texels
+    return total
+
+
+# Arrays
+
+
+def triangle_corners(folder: Path, gltf: Gltf) -> np.ndarray:
+    """Load a file and return the corners of its faces."""
+    return corners_of(gltf.load(folder))
+
+
+POINTS = np.float32([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 2, 0], [0, 4, 1]])
+
+
+@pytest.mark.parametrize(
+    ("mode", "faces"),
+    [
+        (4, [[0, 1, 2]]),
+        (5, [[0, 1, 2], [1, 3, 2], [2, 3, 4]]),
+        (6, [[1, 2, 0], [2, 3, 0], [3, 4, 0]]),
+    ],
+)
+def test_triangles_strips_and_fans_have_the_faces_of_the_specification(tmp_path, mode, faces):
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS}, np.arange(5, dtype=np.uint8), mode=mode)
+    assert_array_equal(triangle_corners(tmp_path, gltf), POINTS[faces])
+
+
+def test_arrays_may_be_interleaved_and_have_no_indices(tmp_path):
+    gltf = Gltf()
+    records = np.zeros(3, dtype=[("position", "<f4", 3), ("color", "u1", 4)])
+    records["position"] = POINTS[:3]
+    records["color"] = [[51, 102, 255, 0]] * 3
+    view = gltf.view(records.tobytes(), byteStride=16)
+    for offset, kind, component in ((0, "VEC3", 5126), (12, "VEC4", 5121)):
+        gltf.tree["accessors"].append(
+            {
+                "bufferView": view,
+                "byteOffset": offset,
+                "componentType": component,
+                "count": 3,
+                "type": kind,
+                "normalized": component == 5121,
+            }
+        )
+    gltf.mesh({"POSITION": 0, "COLOR_0": 1})
+    mesh = gltf.load(tmp_path)
+    assert_array_equal(corners_of(mesh), POINTS[None, :3])
+    assert_allclose(mesh.corner_colors[0], [[srgb_of(0.2), srgb_of(0.4), 1]] * 3, atol=1e-6)
+
+
+@pytest.mark.parametrize("has_base", [False, True])
+def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
+    gltf = Gltf()
+    index = gltf.array(np.float32([[9, 9, 9], [1, 0, 0], [9, 9, 9]]))
+    accessor = gltf.tree["accessors"][index]
+    if not has_base:
+        del accessor["bufferView"]
+    accessor["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": gltf.view(np.uint16([0, 2]).tobytes()), "componentType": 5123},
+        "values": {"bufferView": gltf.view(np.float32([[3, 0, 0], [0, 3, 0]]).tobytes())},
+    }
+    gltf.mesh({"POSITION": index})
+    expected = [[3, 0, 0], [float(has_base), 0, 0], [0, 3, 0]]
+    assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
+
+
+@pytest.mark.parametrize(
+    "dtype",
+    [np.int8, np.uint8, np.int16, np.uint16, np.float32],
+)
+def test_quantized_positions_are_the_integers_of_the_file(tmp_path, dtype):
+    gltf = Gltf()
+    gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    gltf.tree["nodes"][0]["scale"] = [0.5, 0.5, 0.5]
+    gltf.mesh({"POSITION": POINTS[:3].astype(dtype)})
+    assert_array_equal(triangle_corners(tmp_path, gltf), POINTS[None, :3] / 2)
+
+
+def test_normalized_integers_are_those_of_the_specification(tmp_path):
+    """max(c / 127, -1), and alike for 16 bits."""
+    gltf = Gltf()
+    gltf.tree["extensionsUsed"] = ["KHR_mesh_quantization"]
+    points = np.int8([[-128, 0, 0], [127, 0, 0], [0, 64, 0]])
+    gltf.mesh({"POSITION": gltf.array(points, normalized=True)})
+    expected = [[-1, 0, 0], [1, 0, 0], [0, 64 / 127, 0]]
+    assert_allclose(triangle_corners(tmp_path, gltf), [expected], rtol=1e-12)
+
+
+# Colors
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("has_material", [False, True])
+def test_vertex_colors_of_every_type_are_multiplied_by_the_material(
+    tmp_path, dtype, channels, has_material
+):
+    largest = 1 if dtype == "float32" else np.iinfo(dtype).max
+    colors = np.array([[0.5, 0.25, 0.1, 0.3]] * 3)[:, :channels]
+    stored = (np.rint(colors * largest) if largest > 1 else colors).astype(dtype)
+    gltf = Gltf()
+    primitive = gltf.mesh(
+        {"POSITION": POINTS[:3], "COLOR_0": gltf.array(stored, largest > 1)},
+    )
+    factor = np.array([1.0, 1, 1])
+    if has_material:
+        factor = np.array([0.123456, 0.5, 0.7])
+        primitive["material"] = 0
+        model = {"baseColorFactor": [*factor, 0.2]}
+        gltf.tree["materials"].append({"pbrMetallicRoughness": model})
+    expected = srgb_of(stored[0, :3] / largest * factor)
+    assert_allclose(gltf.load(tmp_path).corner_colors[0], [expected] * 3, atol=1e-6)
+
+
+def color_texels(height: int, width: int, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, channels)).astype(np.uint8)
+
+
+def wrapped(index: np.ndarray, count: int, mode: int) -> np.ndarray:
+    """Return the texel of an index in the way of OpenGL."""
+    if mode == 33071:
+        return index.clip(0, count - 1)
+    if mode == 33648:
+        return np.minimum(index % (2 * count), 2 * count - 1 - index % (2 * count))
+    return index % count
+
+
+@pytest.mark.parametrize("wrap_u", [10497, 33071, 33648])
+@pytest.mark.parametrize("wrap_v", [10497, 33071, 33648])
+def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v):
+    """The texture coordinates of the square are from -0.7 to 2.3."""
+    texels = color_texels(3, 4)
+    gltf = Gltf()
+    texture = gltf.texture(texels, wrapS=wrap_u, wrapT=wrap_v)
+    gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
+    gltf.tree["accessors"][1]["bufferView"] = gltf.view((3 * SQUARE_UVS - 0.7).tobytes())
+    mesh = gltf.load(tmp_path)
+    weights = np.random.default_rng(1).dirichlet([1, 1, 1], (2, 50))
+    points = np.einsum("fnc,fci->fni", weights, corners_of(mesh)).reshape(-1, 3)
+    uvs = np.einsum("fnc,fci->fni", weights, mesh.corner_uvs).reshape(-1, 2)
+    # Position in the texture of the file, by the formula of OpenGL.
+    column = (3 * points[:, 0] - 0.7) * 4 - 0.5
+    row = (3 * (1 - points[:, 1]) - 0.7) * 3 - 0.5
+    expected = 0
+    for i in (0, 1):
+        for j in (0, 1):
+            x, y = np.floor(column).astype(int) + i, np.floor(row).astype(int) + j
+            weight = (1 - abs(column - x)) * (1 - abs(row - y))
+            texel = linear(texels / 255)[wrapped(y, 3, wrap_v), wrapped(x, 4, wrap_u)]
+            expected = expected + weight[:, None] * texel
+    assert_allclose(albedo_at(mesh, uvs), expected, atol=1e-5)
+
+
+def test_texture_coordinates_are_scaled_then_rotated_then_shifted(tmp_path):
+    """The corner (1, 0) turns towards (0, -1): counter-clockwise, as v points down."""
+    gltf = Gltf()
+    info = gltf.texture(color_texels(2, 2))
+    transform = {"offset": [0.1, 0.2], "rotation": math.pi / 6, "scale": [2, 3], "texCoord": 1}
+    info |= {"extensions": {"KHR_texture_transform": transform}, "texCoord": 0}
+    gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_texture_transform"]
+    gltf.square(pbrMetallicRoughness={"baseColorTexture": info})
+    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = attributes.pop("TEXCOORD_0")
+    mesh = gltf.load(tmp_path)
+    u, v = (SQUARE_UVS * [2, 3]).T
+    cosine, sine = math.cos(math.pi / 6), math.sin(math.pi / 6)
+    expected = np.stack([cosine * u + sine * v + 0.1, 1 - (-sine * u + cosine * v + 0.2)], axis=1)
+    assert_allclose(mesh.corner_uvs.reshape(-1, 2), expected[SQUARE_FACES], atol=1e-6)
+    assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
+
+
+# Alpha
+
+
+def hole(size: int, radius: float, width: float = 1) -> np.ndarray:
+    """Return texels with alpha 0 in a circle in the middle, whose border has a width in texels."""
+    position = np.arange(size) + 0.5 - size / 2
+    distance = np.hypot(position[:, None], position)
+    alpha = np.clip((distance - radius) / width + 0.5, 0, 1)
+    texels = np.full((size, size, 4), 200.0)
+    texels[..., 3] = 255 * alpha
+    return np.rint(texels).astype(np.uint8)
+
+
+def masked(texels: np.ndarray, mode: str = "MASK", **entries: Any) -> Gltf:
+    """Return a file with a square whose texture has alpha."""
+    gltf = Gltf()
+    model = {"baseColorTexture": gltf.texture(texels)}
+    return gltf.square(pbrMetallicRoughness=model, alphaMode=mode, **entries)
+
+
+def test_a_circle_of_alpha_is_cut_out(tmp_path):
+    mesh = masked(hole(64, 20)).load(tmp_path)
+    circle = math.pi * (20 / 64) ** 2
+    assert mesh.face_areas().sum() == pytest.approx(1 - circle, abs=1e-3 * circle)
+    # No corner is further inside of the circle than a fraction of a texel.
+    distance = np.linalg.norm(corners_of(mesh)[..., :2] - 0.5, axis=-1) * 64
+    assert distance.min() == pytest.approx(20, abs=0.15)
+    assert_allclose(mesh.corner_uvs, corners_of(mesh)[..., :2], atol=1e-6)
+    assert (mesh.face_normals()[:, 2] > 0.99).all()
+
+
+def test_a_cut_surface_has_no_cracks(tmp_path):
+    """Each inner edge belongs to two faces, so the rim of the hole is one closed line."""
+    mesh = masked(hole(64, 20)).load(tmp_path)
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    pairs, counts = np.unique(edges, axis=0, return_counts=True)
+    assert counts.max() == 2
+    lengths = np.linalg.norm(np.diff(mesh.vertices[pairs[counts == 1]], axis=1), axis=-1)
+    assert lengths.sum() == pytest.approx(4 + 2 * math.pi * 20 / 64, rel=0.01)
+
+
+@pytest.mark.parametrize(("cutoff", "radius"), [(0.25, 8), (0.75, 12), (None, 10)])
+def test_alpha_is_cut_at_the_cutoff_of_the_file(tmp_path, cutoff, radius):
+    """Alpha rises from 0 to 1 within eight texels at the border."""
+    entries = {} if cutoff is None else {"alphaCutoff": cutoff}
+    mesh = masked(hole(32, 10, width=8), **entries).load(tmp_path)
+    circle = math.pi * (radius / 32) ** 2
+    assert 1 - mesh.face_areas().sum() == pytest.approx(circle, rel=0.01)
+
+
+def test_alpha_of_single_texels_is_cut_out(tmp_path):
+    """A transparent texel among opaque ones leaves a hole whose border is at alpha .5.
+
+    With bilinear interpolation, alpha is 1 - (1 - |x|) (1 - |y|) around it, so the
+    hole has the area 4 ∫ (1 - .5 / (1 - x)) dx from 0 to .5 = 2 - 2 ln 2 = .614.
+    """
+    texels = np.full((16, 16, 4), 255, np.uint8)
+    for row, column in ((3, 5), (10, 2), (0, 15)):
+        texels[row, column, 3] = 0
+    mesh = masked(texels).load(tmp_path)
+    area = 3 * (2 - 2 * math.log(2))
+    # The border is straight within each texel, so each hole is off by a part of a texel.
+    assert 256 * (1 - mesh.face_areas().sum()) == pytest.approx(area, abs=0.6)
+
+
+def test_the_alpha_of_vertices_and_of_the_material_is_cut_exactly(tmp_path):
+    """Alpha is .8 x on the square, and at least .5 from x = .625 on."""
+    gltf = Gltf().square(pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.8]}, alphaMode="MASK")
+    colors = np.float32(np.column_stack([SQUARE, SQUARE[:, 0]]))
+    gltf.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = gltf.array(colors)
+    mesh = gltf.load(tmp_path)
+    assert mesh.face_areas().sum() == pytest.approx(0.375, rel=1e-6)
+    assert mesh.vertices[:, 0].min() == pytest.approx(0.625, rel=1e-6)
+    # Colors are interpolated linearly before they are encoded.
+    expected = np.float64(corners_of(mesh))
+    assert_allclose(linear(mesh.corner_colors)[..., :2], expected[..., :2], atol=1e-6)
+
+
+def test_alpha_is_ignored_in_the_mode_opaque(tmp_path):
+    mesh = masked(hole(16, 5), "OPAQUE").load(tmp_path)
+    assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
+    assert (mesh.textures[0] == 200).all()
+
+
+def test_blended_surfaces_are_read_if_they_are_opaque(tmp_path):
+    opaque = hole(16, -1)
+    assert len(masked(opaque, "BLEND").load(tmp_path).faces) == 2
+    # The transparent half of the texture is not on the square.
+    opaque[:, 9:, 3] = 0
+    gltf = masked(opaque, "BLEND")
+    gltf.tree["accessors"][1]["bufferView"] = gltf.view((SQUARE_UVS * 0.4 + 0.1).tobytes())
+    assert len(gltf.load(tmp_path).faces) == 2
+
+
+def one_transparent_texel() -> np.ndarray:
+    texels = np.full((16, 16, 4), 255, np.uint8)
+    texels[4, 9, 3] = 254
+    return texels
+
+
+@pytest.mark.parametrize(
+    "gltf",
+    [
+        masked(hole(16, 5), "BLEND"),
+        masked(one_transparent_texel(), "BLEND"),
+        Gltf().square(pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.9]}, alphaMode="BLEND"),
+        Gltf().square(extensions={"KHR_materials_transmission": {"transmissionFactor": 0.5}}),
+    ],
+    ids=["texture", "one texel", "factor", "transmission"],
+)
+def test_transparent_surfaces_are_refused(tmp_path, gltf):
+    with pytest.raises(InputError, match=r"mesh\.gltf.*(transparent|lets light pass)"):
+        gltf.load(tmp_path)
+
+
+# Specular and glossiness
+
+SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
+
+
+def specular_glossiness(gltf: Gltf, **model: Any) -> Gltf:
+    """Return the file with a square of this model."""
+    return gltf.square(extensions={SPECULAR_GLOSSINESS: model})
+
+
+def test_the_albedo_below_a_specular_color_is_the_diffuse_color_without_what_it_reflects(tmp_path):
+    """c_diff = diffuse · (1 - max(specular)), by the text of the extension."""
+    model = {"diffuseFactor": [0.5, 0.25, 0.1, 1], "specularFactor": [0.1, 0.2, 0.05]}
+    mesh = specular_glossiness(Gltf(), **model).load(tmp_path)
+    assert_allclose(linear(mesh.corner_colors)[0], [[0.4, 0.2, 0.08]] * 3, atol=1e-6)
+    assert mesh.gloss is None
+
+
+@pytest.mark.parametrize("has_diffuse_texture", [False, True])
+def test_the_albedo_below_a_specular_texture_is_that_of_each_texel(tmp_path, has_diffuse_texture):
+    gltf = Gltf()
+    diffuse = color_texels(4, 6)
+    specular = color_texels(4, 6, 4)[::-1] // 2
+    model: dict[str, Any] = {"specularGlossinessTexture": gltf.texture(specular)}
+    model |= {"specularFactor": [0.5, 1, 0.8], "diffuseFactor": [0.6, 1, 1, 1]}
+    if has_diffuse_texture:
+        model["diffuseTexture"] = gltf.texture(diffuse)
+    else:
+        diffuse = np.full((4, 6, 3), 255)
+    mesh = specular_glossiness(gltf, **model).load(tmp_path)
+    reflected = (linear(specular[..., :3] / 255) * [0.5, 1, 0.8]).max(axis=-1, keepdims=True)
+    expected = srgb_of(linear(diffuse / 255) * (1 - reflected))
+    assert_allclose(mesh.textures[0] / 255, expected, atol=0.502 / 255)
+    assert_allclose(mesh.corner_colors[0, 0], srgb_of(np.array([0.6, 1, 1])), atol=1e-6)
+
+
+def test_the_gloss_of_a_specular_color_has_its_reflectance_and_roughness(tmp_path):
+    gltf = Gltf()
+    texels = np.full((2, 2, 4), 255, np.uint8)
+    texels[0, 0, 3] = 51
+    model = {"specularFactor": [0.02] * 3, "glossinessFactor": 0.75}
+    mesh = specular_glossiness(gltf, **model).load(tmp_path, gloss=True)
+    assert_allclose(mesh.gloss[0], [0.25, 0, 0.5], atol=1e-6)
+    gltf = Gltf()
+    model["specularGlossinessTexture"] = gltf.texture(texels)
+    mesh = specular_glossiness(gltf, **model).load(tmp_path, gloss=True)
+    assert_allclose(mesh.gloss[0], [1, 0, 0.5], atol=1e-6)
+    roughness = mesh.gloss_textures[0][..., 0] / 255
+    assert_allclose(roughness, [[0.85, 0.25], [0.25, 0.25]], atol=0.5 / 255)
+    assert (mesh.gloss_textures[0][..., 1] == 255).all()
+
+
+def test_a_specular_color_that_gloss_cannot_hold_is_named(tmp_path):
+    gltf = specular_glossiness(Gltf(), specularFactor=[0.5, 0.3, 0.1])
+    with pytest.warns(UserWarning, match="specular color"):
+        mesh = gltf.load(tmp_path, gloss=True)
+    assert mesh.gloss[0].tolist() == [0, 0, 1]
+
+
+# Morph targets
+
+
+@pytest.mark.parametrize(
+    ("mesh_weights", "node_weights", "height"),
+    [([1.0], None, 3), ([0.5], None, 2), ([1.0], [0.25], 1.5), (None, None, 1), (None, [1.0], 3)],
+)
+def test_morph_targets_move_vertices_by_their_default_weights(
+    tmp_path, mesh_weights, node_weights, height
+):
+    gltf = Gltf()
+    tip = np.float32([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
+    primitive = gltf.mesh({"POSITION": tip})
+    primitive["targets"] = [{"POSITION": gltf.array(np.float32([[0] * 3, [0] * 3, [0, 0, 2]]))}]
+    if mesh_weights:
+        gltf.tree["meshes"][0]["weights"] = mesh_weights
+    if node_weights:
+        gltf.tree["nodes"][0]["weights"] = node_weights
+    assert gltf.load(tmp_path).vertices[:, 2].max() == height
+
+
+def test_morph_targets_are_added_to_each_attribute(tmp_path):
+    """Two targets change positions, colors and normals, the second one by a sparse array."""
+    gltf = Gltf()
+    colors = np.float32([[0.2, 0.4, 0.6]] * 3)
+    attributes = {"POSITION": POINTS[:3], "COLOR_0": colors, "NORMAL": np.float32([[0, 0, 1]] * 3)}
+    primitive = gltf.mesh(attributes)
+    sparse = gltf.array(np.float32([[0, 0, 0]] * 3))
+    accessor = gltf.tree["accessors"][sparse]
+    del accessor["bufferView"]
+    accessor["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": gltf.view(np.uint8([1]).tobytes()), "componentType": 5121},
+        "values": {"bufferView": gltf.view(np.float32([4, 0, 0]).tobytes())},
+    }
+    primitive["targets"] = [
+        {
+            "POSITION": gltf.array(np.float32([[0, 0, 1]] * 3)),
+            "COLOR_0": gltf.array(np.float32([[0.4, 0, 2]] * 3)),
+            "NORMAL": gltf.array(np.float32([[2, 0, 0]] * 3)),
+        },
+        {"POSITION": sparse},
+    ]
+    gltf.tree["meshes"][0]["weights"] = [0.5, 0.25]
+    mesh = gltf.load(tmp_path)
+    expected = POINTS[:3] + [0, 0, 0.5] + 0.25 * np.float32([[0] * 3, [4, 0, 0], [0] * 3])
+    assert_allclose(corners_of(mesh)[0], expected, atol=1e-6)
+    assert_allclose(linear(mesh.corner_colors)[0], [[0.4, 0.4, 1]] * 3, atol=1e-6)
+    [part] = read_parts(tmp_path / "mesh.gltf")
+    _, normals = part.placed()
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    assert_allclose(normals, [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
+
+
+# Nodes
+
+
+def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
+    """Point · scale, rotated by 90° about z, then moved; the parent mirrors x."""
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS[:3], "NORMAL": np.float32([[0, 0.6, 0.8]] * 3)})
+    turn = [0, 0, math.sqrt(0.5), math.sqrt(0.5)]
+    gltf.tree["nodes"] = [
+        {"children": [1], "scale": [-1, 1, 1]},
+        {"mesh": 0, "translation": [5, 6, 7], "rotation": turn, "scale": [2, 3, 4]},
+        {"mesh": 0},
+    ]
+    x, y, z = (POINTS[:3] * [2, 3, 4]).T
+    expected = np.stack([-(-y + 5), x + 6, z + 7], axis=1)
+    # A mirrored face has its corners in the opposite order.
+    assert_allclose(triangle_corners(tmp_path, gltf)[0], expected[[0, 2, 1]], atol=1e-6)
+    [part] = read_parts(tmp_path / "mesh.gltf")
+    _, normals = part.placed()
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normal = np.array([0.2, 0, 0.2]) / math.sqrt(0.08)
+    assert_allclose(normals, np.broadcast_to(normal, (1, 3, 3)), atol=1e-6)
+
+
+def test_instances_place_copies_of_a_mesh(tmp_path):
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS[:3]})
+    shifts = np.float32([[0, 0, 1], [0, 0, 5]])
+    scales = np.float32([[1, 1, 1], [2, 2, 2]])
+    attributes = {"TRANSLATION": gltf.array(shifts), "SCALE": gltf.array(scales)}
+    gltf.tree["nodes"][0] |= {
+        "translation": [10, 0, 0],
+        "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}},
+    }
+    gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    expected = POINTS[None, :3] * scales[:, None] + shifts[:, None] + [10, 0, 0]
+    assert_allclose(triangle_corners(tmp_path, gltf), expected)
+
+
+def test_meshes_outside_of_the_default_scene_are_not_read(tmp_path):
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS[:3]})
+    gltf.tree["nodes"].append({"mesh": 0, "translation": [9, 9, 9]})
+    assert len(gltf.load(tmp_path).faces) == 1
+
+
+# Files
+
+
+def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
+    gltf = masked(hole(8, -1), "OPAQUE")
+    folder = tmp_path / "mesh"
+    (folder / "parts of it").mkdir(parents=True)
+    (folder / "parts of it" / "data.bin").write_bytes(gltf.buffer)
+    Image.fromarray(color_texels(2, 2)).save(folder / "peel.webp", lossless=True)
+    gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer), "uri": "parts%20of%20it/data.bin"}]
+    gltf.tree["images"][0] = {"uri": "peel.webp"}
+    gltf.tree["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}
+    (folder / "mesh.gltf").write_text(json.dumps(gltf.tree))
+    mesh = load_mesh(folder / "mesh.gltf")
+    assert_array_equal(mesh.textures[0], color_texels(2, 2))
+
+
+@pytest.mark.parametrize("kind", ["buffers", "images"])
+@pytest.mark.parametrize("uri", ["../data.bin", "{folder}/data.bin", "file:///etc/passwd", "link"])
+def test_files_outside_of_the_folder_are_not_read(tmp_path, kind, uri):
+    gltf = masked(hole(8, -1), "OPAQUE")
+    content = io.BytesIO()
+    Image.fromarray(hole(8, -1)).save(content, "PNG")
+    (tmp_path / "data.bin").write_bytes(gltf.buffer if kind == "buffers" else content.getvalue())
+    folder = tmp_path / "mesh"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path / "data.bin")
+    (folder / "own.bin").write_bytes(gltf.buffer)
+    gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer), "uri": "own.bin"}]
+    gltf.tree[kind][0]["uri"] = uri.format(folder=tmp_path)
+    (folder / "mesh.gltf").write_text(json.dumps(gltf.tree))
+    with pytest.raises(InputError, match="not below its folder"):
+        load_mesh(folder / "mesh.gltf")
+
+
+def glb(gltf: Gltf) -> bytes:
+    """Encode a file as .glb."""
+    tree = gltf.tree | {"buffers": [{"byteLength": len(gltf.buffer)}]}
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(gltf.buffer), b"BIN\0") + gltf.buffer
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def small_file_of_many_copies() -> Gltf:
+    gltf = Gltf()
+    gltf.mesh({"POSITION": SQUARE}, np.tile(np.uint16([0, 1, 2]), 10_000))
+    gltf.tree["nodes"] = [{"mesh": 0}] * 3000
+    gltf.tree["scenes"][0]["nodes"] = list(range(3000))
+    return gltf
+
+
+def small_file_of_zeros() -> Gltf:
+    gltf = Gltf()
+    accessor = {"componentType": 5126, "count": 2 * 10**9, "type": "VEC3"}
+    gltf.tree["accessors"].append(accessor)
+    gltf.mesh({"POSITION": 0})
+    return gltf
+
+
+def small_file_of_a_large_image() -> Gltf:
+    gltf = Gltf()
+    content = io.BytesIO()
+    Image.new("L", (9000, 9000)).save(content, "PNG")
+    texture = gltf.texture(np.zeros((1, 1), np.uint8))
+    gltf.tree["images"][0]["bufferView"] = gltf.view(content.getvalue())
+    return gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
+
+
+def small_file_of_many_joints() -> Gltf:
+    gltf = Gltf()
+    count = 2000
+    positions = np.tile(np.float32(SQUARE[:3]), (1000, 1))
+    gltf.mesh(
+        {
+            "POSITION": positions,
+            "JOINTS_0": np.zeros((3000, 4), np.uint8),
+            "WEIGHTS_0": np.float32([[1, 0, 0, 0]] * 3000),
+        }
+    )
+    gltf.tree["nodes"] = [{"mesh": 0, "skin": 0}, *({} for _ in range(count))]
+    gltf.tree["skins"] = [{"joints": list(range(1, count + 1))}]
+    return gltf
+
+
+@pytest.mark.parametrize(
+    "create",
+    [
+        small_file_of_many_copies,
+        small_file_of_zeros,
+        small_file_of_a_large_image,
+        small_file_of_many_joints,
+    ],
+)
+def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):
+    (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
+    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    (tmp_path / "mesh.glb").write_bytes(glb(create()))
+    assert (tmp_path / "mesh.glb").stat().st_size < 400_000
+    with pytest.raises(InputError, match=r"need .* GB of memory, but only 0\.4 GB are free"):
+        load_mesh(tmp_path / "mesh.glb")
+
+
+# Classes of features
+
+
+def plain(**entries: Any) -> Gltf:
+    """Return a file with a square whose material has more entries."""
+    return Gltf().square(**entries)
+
+
+def with_entries(gltf: Gltf, **entries: Any) -> Gltf:
+    """Add entries to the tree of a file."""
+    gltf.tree |= entries
+    return gltf
+
+
+IGNORED = {
+    "normalTexture": plain(normalTexture={"index": 0}),
+    "occlusionTexture": plain(occlusionTexture={"index": 0}),
+    "emitted light": plain(emissiveFactor=[0, 1, 0]),
+    "KHR_materials_clearcoat": plain(extensions={"KHR_materials_clearcoat": {}}),
+    "KHR_materials_unlit": with_entries(
+        plain(extensions={"KHR_materials_unlit": {}}), extensionsRequired=["KHR_materials_unlit"]
+    ),
+    "KHR_materials_variants": with_entries(plain(), extensionsUsed=["KHR_materials_variants"]),
+    "KHR_lights_punctual": with_entries(plain(), extensionsUsed=["KHR_lights_punctual"]),
+    "animations": with_entries(plain(), animations=[{}]),
+    "other scenes": with_entries(plain(), scenes=[{"nodes": [0]}, {}]),
+}
+
+
+@pytest.mark.parametrize("feature", IGNORED)
+def test_what_changes_neither_shape_nor_color_is_named_once(tmp_path, feature):
+    with pytest.warns(UserWarning, match=rf"mesh\.gltf: ignored, .*: {feature}$") as record:
+        mesh = IGNORED[feature].load(tmp_path)
+    assert len(record) == 1
+    assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
+    assert (mesh.corner_colors == 1).all()
+
+
+def two_parents() -> Gltf:
+    nodes = [{"children": [i + 1, i + 1]} for i in range(40)]
+    return with_entries(plain(), nodes=[*nodes, {"mesh": 0}])
+
+
+def compressed() -> Gltf:
+    gltf = plain()
+    gltf.tree["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": {"buffer": 0}}
+    return gltf
+
+
+def basis_texture() -> Gltf:
+    gltf = Gltf()
+    texture = gltf.texture(color_texels(2, 2))
+    gltf.tree["textures"][0] = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    return gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
+
+
+def different_places() -> Gltf:
+    gltf = Gltf()
+    color = gltf.texture(color_texels(2, 2))
+    gloss = gltf.texture(color_texels(2, 2), wrapS=33071)
+    return gltf.square(
+        pbrMetallicRoughness={"baseColorTexture": color, "metallicRoughnessTexture": gloss}
+    )
+
+
+def short_buffer() -> Gltf:
+    gltf = plain()
+    gltf.tree["bufferViews"][0]["byteLength"] = 10**6
+    return gltf
+
+
+REFUSED = {
+    "KHR_draco_mesh_compression": with_entries(
+        plain(), extensionsRequired=["KHR_draco_mesh_compression"]
+    ),
+    "meshopt": compressed(),
+    "KHR_texture_basisu": basis_texture(),
+    "two parents": two_parents(),
+    "child of itself": with_entries(plain(), nodes=[{"mesh": 0}, {"children": [1]}]),
+    "number 7 of 1 nodes": with_entries(plain(), scenes=[{"nodes": [7]}]),
+    "number -1 of 1 meshes": with_entries(plain(), nodes=[{"mesh": -1}]),
+    "glTF 1.0": with_entries(plain(), asset={"version": "1.0"}),
+    "ends behind its buffer": short_buffer(),
+    "differ in texture coordinates": different_places(),
+    "specular color": plain(
+        extensions={"KHR_materials_specular": {"specularColorFactor": [1, 0, 0]}}
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_what_would_change_shape_or_color_is_refused(tmp_path, reason):
+    with pytest.raises(InputError, match=rf"mesh\.gltf .*{reason}"):
+        REFUSED[reason].load(tmp_path, gloss=True)
+
+
+def test_the_reflectance_follows_from_the_refractive_index(tmp_path):
+    """((1.2 - 1) / (1.2 + 1))² = .0083, and .04 is the specular factor 1."""
+    extensions = {
+        "KHR_materials_ior": {"ior": 1.2},
+        "KHR_materials_specular": {"specularFactor": 0.5, "specularColorFactor": [0.8] * 3},
+    }
+    mesh = plain(extensions=extensions).load(tmp_path, gloss=True)
+    assert mesh.gloss[0, 2] == pytest.approx(0.4 * (0.2 / 2.2) ** 2 / 0.04)
+
+
+# Other readers and the writer
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_an_ordinary_file_is_read_as_trimesh_reads_it(tmp_path, suffix):
+    sphere = trimesh.creation.icosphere(2)
+    sphere.apply_translation([1, 2, 3])
+    scene = trimesh.Scene()
+    scene.add_geometry(
+        sphere, transform=trimesh.transformations.rotation_matrix(0.7, [0.1, 0.5, 0.9])
+    )
+    scene.add_geometry(trimesh.creation.box(), transform=np.diag([1, -2, 3, 1]))
+    scene.export(tmp_path / f"scene.{suffix}")
+    expected = scene.to_geometry()
+    mesh = load_mesh(tmp_path / f"scene.{suffix}", up="z")
+    assert_allclose(np.sort(mesh.face_areas()), np.sort(expected.area_faces), rtol=1e-5)
+    distances, _ = KDTree(mesh.vertices).query(expected.vertices)
+    assert distances.max() < 1e-5
+    assert mesh.closed
+
+
+def test_a_mesh_that_was_cut_is_exported_and_read_again(tmp_path):
+    mesh = masked(hole(16, 5)).load(tmp_path)
+    export_mesh(mesh, tmp_path / "again.glb")
+    again = load_mesh(tmp_path / "again.glb")
+    assert_allclose(np.sort(again.face_areas()), np.sort(mesh.face_areas()), atol=1e-6)
+    assert_array_equal(again.textures[0], mesh.textures[0])
