@@ -12,13 +12,14 @@ from PIL import Image
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError
+from renderer.errors import InputError, require_file
 from renderer.fitting import fit_photograph
 from renderer.image import decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.light_files import save_light
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack_meshes import build_attacked
+from train.data.masks import read_mask
 from train.report.results import require_replaceable
 from train.settings import read_object
 from train.system.user_errors import writable_folder
@@ -52,7 +53,10 @@ def fit(settings: FitSettings) -> None:
     image = read_file(settings.photograph)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
-    mask = read_mask(settings.mask, image) if settings.mask else grab_cut(image, settings.box)
+    if settings.mask:
+        mask = read_mask(settings.mask, *image.shape[:2])
+    else:
+        mask = grab_cut(image, settings.box)
     mesh_settings = ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)
     found = fit_photograph(
         image,
@@ -219,46 +223,12 @@ def read_file(path: str) -> np.ndarray:
     Raises:
         InputError: If the file is missing or is not an image.
     """
+    require_file(path, "give an image file")
     try:
         return np.asarray(read_rgb(Path(path), 10**6))
     # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
-
-
-def read_mask(path: str, image: np.ndarray) -> np.ndarray:
-    """Read the mask of the object in a photograph.
-
-    Args:
-        path: Image file that is white where the object is, and black elsewhere.
-        image: Photograph, shape (H, W, 3).
-
-    Returns:
-        Mask, uint8, shape (H, W): 255 where the object is.
-
-    Raises:
-        InputError: If the file is not an image, or if its size differs from the
-            size of the photograph.
-    """
-    mask = read_file(path)[..., 0]
-    if mask.shape != image.shape[:2]:
-        given = _format_size(mask)
-        expected = _format_size(image)
-        raise InputError(
-            f"mask={path} has {given} pixels, but the photograph has {expected}: "
-            "give a mask of the same size",
-        )
-    return mask
-
-
-def _format_size(image: np.ndarray) -> str:
-    """Format the size of an image as "WIDTH × HEIGHT", such as "640 × 480".
-
-    Args:
-        image: Image, shape (H, W, ...).
-    """
-    height, width = image.shape[:2]
-    return f"{width} × {height}"
 
 
 def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:

@@ -1,0 +1,117 @@
+"""Masks of all kinds mark the same object."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from renderer.errors import InputError
+from train.data.masks import read_mask
+
+# The object is not symmetric, and neither is the image.
+IS_OBJECT = np.zeros((12, 16), dtype=bool)
+IS_OBJECT[2:7, 3:12] = True
+WHITE_ON_BLACK = np.where(IS_OBJECT, 255, 0).astype(np.uint8)
+
+
+def rgba(inside: tuple[int, ...], outside: tuple[int, ...]) -> Image.Image:
+    pixels = np.where(IS_OBJECT[..., None], inside, outside).astype(np.uint8)
+    return Image.fromarray(pixels)
+
+
+def palette(*colors: tuple[int, int, int]) -> Image.Image:
+    image = Image.fromarray(IS_OBJECT.astype(np.uint8)).convert("P")
+    image.putpalette([value for color in colors for value in color])
+    return image
+
+
+MASKS = {
+    "white on black": Image.fromarray(WHITE_ON_BLACK),
+    "RGB": Image.fromarray(WHITE_ON_BLACK).convert("RGB"),
+    "one bit": Image.fromarray(WHITE_ON_BLACK).convert("1"),
+    "zero and one": Image.fromarray(IS_OBJECT.astype(np.uint8)),
+    "16 bits": Image.fromarray(WHITE_ON_BLACK.astype(np.uint16) * 257),
+    "16 bits, zero and one": Image.fromarray(IS_OBJECT.astype(np.uint16)),
+    "16 bits, zero and 255": Image.fromarray(WHITE_ON_BLACK.astype(np.uint16)),
+    "palette": palette((0, 0, 0), (128, 0, 0)),
+    "palette, green": palette((0, 0, 0), (0, 128, 0)),
+    "palette, white first": palette((0, 0, 0), (255, 255, 255)),
+    "color": rgba((0, 0, 200), (0, 0, 0)),
+    "cut-out": rgba((210, 180, 80, 255), (50, 40, 30, 0)),
+    "black cut-out": rgba((0, 0, 0, 255), (255, 255, 255, 0)),
+    "white with transparency": rgba((255, 255, 255, 255), (0, 0, 0, 0)),
+    "gray cut-out": rgba((90, 90, 90, 255), (200, 200, 200, 0)).convert("LA"),
+    "opaque with alpha": Image.fromarray(WHITE_ON_BLACK).convert("RGBA"),
+}
+
+
+def save(path: Path, image: Image.Image, **options: object) -> str:
+    image.save(path, **options)
+    return str(path)
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_masks_of_every_kind_mark_the_object(tmp_path, name):
+    mask = read_mask(save(tmp_path / "mask.png", MASKS[name]), 12, 16)
+    assert mask.dtype == np.uint8
+    np.testing.assert_array_equal(mask, WHITE_ON_BLACK)
+
+
+@pytest.mark.parametrize("transparency", [0, b"\0\xff"])
+def test_the_transparent_color_of_a_palette_is_outside_of_the_object(tmp_path, transparency):
+    image = palette((255, 255, 255), (90, 10, 10))
+    path = save(tmp_path / "mask.png", image, transparency=transparency)
+    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
+
+
+def test_float_masks_of_zero_and_one_and_turned_masks_mark_the_object(tmp_path):
+    path = save(tmp_path / "mask.tif", Image.fromarray(IS_OBJECT.astype(np.float32)))
+    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    path = save(tmp_path / "a.png", Image.fromarray(WHITE_ON_BLACK[::-1, ::-1].copy()), exif=exif)
+    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
+
+
+def test_soft_edges_keep_their_coverage(tmp_path):
+    soft = WHITE_ON_BLACK.copy()
+    soft[2] //= 2
+    for image in (
+        Image.fromarray(soft),
+        Image.fromarray(soft.astype(np.uint16) * 257),
+        Image.fromarray(np.dstack([np.full((12, 16, 3), 90, np.uint8), soft])),
+    ):
+        path = save(tmp_path / "mask.png", image)
+        np.testing.assert_array_equal(read_mask(path, 12, 16), soft)
+
+
+def three_colors() -> Image.Image:
+    pixels = np.zeros((12, 16, 3), dtype=np.uint8)
+    pixels[:4] = (128, 0, 0)
+    pixels[8:] = (0, 128, 0)
+    return Image.fromarray(pixels)
+
+
+def black_and_white_with_alpha() -> Image.Image:
+    image = Image.fromarray(WHITE_ON_BLACK).convert("RGBA")
+    image.putpixel((0, 0), (0, 0, 0, 0))
+    return image
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        three_colors(),
+        palette((0, 0, 200), (200, 0, 0)),
+        Image.fromarray(np.arange(192, dtype=np.uint8).reshape(12, 16) // 64),
+        Image.new("L", (16, 12), 255),
+        Image.new("L", (16, 12), 0),
+        black_and_white_with_alpha(),
+        Image.fromarray(WHITE_ON_BLACK).resize((17, 12)),
+    ],
+    ids=["three colors", "no black", "labels 0, 1, 2", "white", "black", "two masks", "size"],
+)
+def test_a_mask_that_does_not_tell_where_the_object_is_is_refused(tmp_path, image):
+    with pytest.raises(InputError, match=r"mask=.*mask\.png"):
+        read_mask(save(tmp_path / "mask.png", image), 12, 16)
