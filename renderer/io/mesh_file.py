@@ -16,9 +16,14 @@ from renderer.geometry.polygons import triangulate
 from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
+from renderer.memory import require_memory
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
 TOLERANCE = 1e-3
+# Bytes for each texel of a texture, while it is read and in the mesh.
+_TEXEL_BYTES = 16
+# Device of the textures.
+CPU = torch.device("cpu")
 # Opacity above which a surface counts as opaque.
 OPAQUE = 1 - TOLERANCE
 
@@ -69,34 +74,37 @@ class MeshFile:
         self._assumptions: dict[str, None] = {}
         self._textures: dict[str, np.ndarray] = {}
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, folder: str = "") -> bytes:
         """Read a file below the folder of the mesh file.
 
-        The file is sought at the given path, and then by its name in the folder
-        itself. The path may contain \\ instead of / and %20 instead of a blank.
+        The file is sought in `folder`, at the given path, and by its name alone. The
+        path may contain \\ instead of / and %20 instead of a blank.
         """
         written = name.strip('" \t').replace("\\", "/")
         errors = []
         for path in (written, unquote(written)):
-            for candidate in (path, path.rpartition("/")[2]):
+            for candidate in (f"{folder}{path}", path, path.rpartition("/")[2]):
                 try:
                     return file_below(self.path.parent, candidate).read_bytes()
                 except ValueError as error:
                     errors.append(error)
         raise errors[0]
 
-    def texture(self, name: str) -> np.ndarray:
+    def texture(self, name: str, folder: str = "") -> np.ndarray:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
-        if name not in self._textures:
-            with identify(io.BytesIO(self.read(name))) as image:
+        key = folder + name
+        if key not in self._textures:
+            with identify(io.BytesIO(self.read(name, folder))) as image:
+                texel_count = image.width * image.height
+                require_memory(f"the texels of {name}", _TEXEL_BYTES * texel_count, CPU)
                 pixels = eight_bits(image)
             if (
                 pixels.has_transparency_data
                 and np.array(pixels.convert("RGBA"))[..., 3].min() < 255
             ):
                 self.assume(f"the alpha of {name} is ignored")
-            self._textures[name] = np.array(pixels.convert("RGB"))
-        return self._textures[name]
+            self._textures[key] = np.array(pixels.convert("RGB"))
+        return self._textures[key]
 
     def ignore(self, feature: str) -> None:
         """Note that a feature is ignored, which changes neither the shape nor the base color."""

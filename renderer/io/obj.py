@@ -40,8 +40,9 @@ _NEUTRAL_VALUES = {"-o": [0, 0, 0], "-s": [1, 1, 1], "-t": [0, 0, 0], "-mm": [0,
 # End of the text of a corner that leaves out an index.
 _LEFT_OUT = -(10**18)
 
-# Keywords of the properties of a material, with their values.
-_Properties = list[tuple[str, str]]
+# Folder of a material library with a final /, and the keywords
+# and values of the properties of a material in this library.
+_Definition = tuple[str, list[tuple[str, str]]]
 
 
 class _Lines(NamedTuple):
@@ -86,12 +87,13 @@ class _Material(NamedTuple):
 
     Attributes:
         color: sRGB-encoded color.
-        texture: Name of the image file. An empty string without a texture.
+        texture: Name of the image file, and the folder in which it is sought first,
+            with a final /. None without a texture.
         is_clamped: True if the texture does not repeat.
     """
 
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
-    texture: str = ""
+    texture: tuple[str, str] | None = None
     is_clamped: bool = False
 
 
@@ -117,9 +119,9 @@ def read_obj(file: MeshFile) -> list[Part]:
     colors = np.array([material.color for material in materials])[material_of_face, None]
     if vertex_colors is not None:
         colors = product(colors, vertex_colors[faces])
-    # Textures by their names, because several materials may have the same.
-    names = list(dict.fromkeys(material.texture for material in materials if material.texture))
-    ids = [names.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
+    # Several materials may have the same texture.
+    textures = list(dict.fromkeys(item.texture for item in materials if item.texture))
+    ids = [textures.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
     # The row at the end is for corners without texture coordinates, whose index is -1.
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
     is_clamped = np.array([material.is_clamped for material in materials])[material_of_face]
@@ -131,7 +133,7 @@ def read_obj(file: MeshFile) -> list[Part]:
         colors,
         corner_uvs,
         np.array(ids)[material_of_face],
-        [file.texture(name) for name in names],
+        [file.texture(*texture) for texture in textures],
     )
     if not len(normals):
         return [Part(mesh)]
@@ -279,28 +281,29 @@ def _materials(
     return materials, np.array(indices)[choice_of_face]
 
 
-def _library(names: list[str], file: MeshFile) -> dict[str, _Properties] | None:
+def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
     """Read the properties of all materials by name. None if the file names no library."""
-    library: dict[str, _Properties] = {}
+    library: dict[str, _Definition] = {}
     for name in names:
         try:
-            contents = [file.read(name)]
+            contents = {name: file.read(name)}
         except ValueError:
             # The line may name several files, or end with a comment.
             parts = re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or name.split()
             if parts in ([name], []):
                 raise
-            contents = [file.read(part) for part in parts]
-        for content in contents:
+            contents = {part: file.read(part) for part in parts}
+        for path, content in contents.items():
+            folder = "".join(path.replace("\\", "/").rpartition("/")[:2])
             # The first file that defines a material counts.
-            library = _definitions(content) | library
+            library = _definitions(content, folder) | library
     return library if names else None
 
 
-def _definitions(content: bytes) -> dict[str, _Properties]:
-    """Read the properties of the materials of one .mtl file by name."""
-    definitions: dict[str, _Properties] = {}
-    properties: _Properties = []
+def _definitions(content: bytes, folder: str) -> dict[str, _Definition]:
+    """Read the properties of the materials of the .mtl file in a folder by name."""
+    definitions: dict[str, _Definition] = {}
+    properties: list[tuple[str, str]] = []
     for keyword, rest in re.findall(r"[ \t]*(\S+)(.*)\n", _cleaned(content).decode()):
         text = rest.strip()
         if keyword.lower() != "newmtl":
@@ -309,19 +312,20 @@ def _definitions(content: bytes) -> dict[str, _Properties]:
         properties = []
         if text in definitions:
             raise ValueError(f"an .mtl file defines the material {text} twice")
-        definitions[text] = properties
+        definitions[text] = (folder, properties)
     return definitions
 
 
-def _material(name: str, library: dict[str, _Properties] | None, file: MeshFile) -> _Material:
+def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile) -> _Material:
     """Interpret the properties of a material."""
     if library is None:
         file.assume("materials are white, because the file names no material library")
         return _Material()
     # The name may be followed by a comment.
-    properties = library.get(name, library.get(re.split(r"\s+#", name)[0]))
-    if properties is None:
+    definition = library.get(name, library.get(re.split(r"\s+#", name)[0]))
+    if definition is None:
         raise ValueError(f"no .mtl file defines the material {name}")
+    folder, properties = definition
     material = _Material()
     opacities = {}
     for keyword, text in properties:
@@ -330,10 +334,10 @@ def _material(name: str, library: dict[str, _Properties] | None, file: MeshFile)
                 material = material._replace(color=_color(text))
             case "map_kd":
                 texture, is_clamped = _texture(text)
-                material = material._replace(texture=texture, is_clamped=is_clamped)
+                material = material._replace(texture=(texture, folder), is_clamped=is_clamped)
             case "d" | "tr" as key:
                 # A number may follow the option "-halo".
-                opacities[key] = float(text.partition("#")[0].split()[-1])
+                opacities[key] = float("".join(text.partition("#")[0].split()[-1:]))
             case key if key in _REFUSED_PROPERTIES:
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:

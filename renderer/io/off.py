@@ -35,27 +35,32 @@ def read_off(file: MeshFile) -> list[Part]:
     if header is None:
         raise ValueError("the file does not begin with OFF")
     has_uvs, has_colors, has_normals, has_weights, has_dimension = map(bool, header.groups())
-    lines = [line for line in text[header.end() :].split(b"\n") if line.strip()]
-    counts = lines[0].split() if lines else []
+    # A text without empty lines, and the end of each line.
+    text = re.sub(rb"\n\s*", b"\n", text[header.end() :].strip() + b"\n")
+    ends = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord("\n")) + 1
+    counts = text[: ends[0]].split()
     is_plain = all(count.isdigit() for count in counts) and len(counts) >= 2
     if has_weights or has_dimension or not is_plain:
         raise ValueError("only .off files in ASCII form with three coordinates are supported")
     vertex_count, face_count = map(int, counts[:2])
-    if len(lines) < 1 + vertex_count + face_count:
+    if len(ends) < 1 + vertex_count + face_count:
         raise ValueError("the file is truncated: export it again")
+    vertex_text = text[ends[0] : ends[vertex_count]]
+    face_text = text[ends[vertex_count] : ends[vertex_count + face_count]]
 
-    numbers, lengths = _numbers(lines[1 : 1 + vertex_count])
+    lengths = words_per_line(vertex_text)
     width = lengths.max(initial=3)
     color_start = 3 + 3 * has_normals
     color_width = width - color_start - 2 * has_uvs
     if (lengths != width).any() or color_width not in ((3, 4) if has_colors else (0,)):
         raise ValueError(f"the vertices have other numbers than {header[0].decode()} announces")
-    table = numbers.reshape(-1, width)
+    table = parse_numbers(vertex_text, np.float64).reshape(-1, width)
     vertices = table[:, :3]
     color_numbers = table[:, color_start : color_start + color_width].ravel()
     vertex_colors = _colors(color_numbers, np.full(vertex_count, color_width), file)
 
-    numbers, lengths = _numbers(lines[1 + vertex_count : 1 + vertex_count + face_count])
+    numbers = parse_numbers(face_text, np.float64)
+    lengths = words_per_line(face_text)
     whole_numbers = numbers.astype(np.int64)
     # Place of each number in its line, in which the number of corners is first.
     places = np.arange(len(numbers)) - (np.cumsum(lengths) - lengths).repeat(lengths)
@@ -75,16 +80,12 @@ def read_off(file: MeshFile) -> list[Part]:
     return [Part(colored_mesh(vertices, faces, colors), normals)]
 
 
-def _numbers(lines: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Parse the numbers in lines, and count the numbers of each line."""
-    text = b"".join(line + b"\n" for line in lines)
-    return parse_numbers(text, np.float64), words_per_line(text)
-
-
 def _colors(numbers: np.ndarray, widths: np.ndarray, file: MeshFile) -> np.ndarray:
     """Convert rows of 3 or 4 numbers to sRGB-encoded colors, which are white for empty rows."""
-    if 1 < numbers.max(initial=0) <= 255 and (numbers == np.round(numbers)).all():
-        numbers = numbers.clip(0).astype(np.uint8)
+    # Bytes are written as whole numbers, and other colors with a point.
+    values = numbers.astype(np.uint8)
+    if numbers.max(initial=0) > 1 and (values == numbers).all():
+        numbers = values
     colors = np.ones((len(widths), 4))
     colors[np.arange(4) < widths[:, None]] = unit_colors(numbers, file)
     if colors[:, 3].min(initial=1) < OPAQUE:

@@ -188,6 +188,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     texture_names = []
     counts: dict[str, int] = {}
     properties: dict[str, list[_Property]] = {}
+    items: list[_Property] = []
     for line in as_utf8(header[2]).decode().split(header[1].decode()):
         match line.split():
             case ["format", form, *_]:
@@ -196,12 +197,14 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
                 texture_names.append(line.split(None, 2)[2].strip())
             case ["element", name, count]:
                 counts[name] = int(count)
-                properties[name] = []
-            case ["property", "list", length_type, number_type, name]:
-                item = _Property(name, _TYPES[number_type], _TYPES[length_type])
-                properties[list(properties)[-1]].append(item)
-            case ["property", number_type, name]:
-                properties[list(properties)[-1]].append(_Property(name, _TYPES[number_type]))
+                items = properties[name] = []
+            case ["property", "list", length_type, type_, name] if {
+                length_type,
+                type_,
+            } <= _TYPES.keys():
+                items.append(_Property(name, _TYPES[type_], _TYPES[length_type]))
+            case ["property", type_, name] if type_ in _TYPES:
+                items.append(_Property(name, _TYPES[type_]))
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:

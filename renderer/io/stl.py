@@ -32,13 +32,11 @@ def read_stl(file: MeshFile) -> list[Part]:
     content = file.content
     header = content[:_HEADER_SIZE]
     face_count = int.from_bytes(header[-4:], "little")
-    size = _HEADER_SIZE + face_count * _FACE.itemsize
-    # A binary file may begin with "solid", too.
-    is_text = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:5].lower() == b"solid"
-    if is_text and len(content) != size:
+    # A binary file may begin with "solid", too, but has NUL bytes.
+    if re.match(rb"\W*solid", content, re.IGNORECASE) and b"\0" not in content:
         corners = _text_corners(content)
         colors = np.ones((1, 3))
-    elif len(content) < size or len(header) < _HEADER_SIZE:
+    elif len(content) < _HEADER_SIZE + face_count * _FACE.itemsize or len(header) < _HEADER_SIZE:
         raise ValueError("the file is truncated: export it again")
     else:
         faces = np.frombuffer(content, _FACE, face_count, _HEADER_SIZE)

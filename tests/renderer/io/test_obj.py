@@ -195,6 +195,30 @@ def test_materials_with_different_textures_keep_them_apart(tmp_path):
     assert len(mesh.textures) == 2
 
 
+@pytest.mark.parametrize("library", ["sub/m.mtl", "sub\\m.mtl", "./sub/m.mtl"])
+def test_images_are_sought_in_the_folder_of_the_library_and_then_in_that_of_the_mesh(
+    tmp_path, library
+):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "a.png").write_bytes(png_of(255, 0, 0))
+    (tmp_path / "a.png").write_bytes(png_of(0, 0, 255))
+    (tmp_path / "b.png").write_bytes(png_of(0, 255, 0))
+    text = f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nmtllib {library}\nmtllib m.mtl\n"
+    text += "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in ("a", "b", "c"))
+    (tmp_path / "sub" / "m.mtl").write_text("newmtl a\nmap_Kd a.png\nnewmtl b\nmap_Kd b.png\n")
+    mesh = load(tmp_path, text, m="newmtl c\nmap_Kd a.png\n")
+    found = [mesh.textures[index][0, 0].tolist() for index in mesh.texture_ids]
+    assert found == [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
+
+
+def test_a_texture_that_does_not_fit_into_memory_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nmtllib m.mtl\nusemtl m\nf 1/1 2/1 3/1\n"
+    monkeypatch.setattr("renderer.memory.free_memory", lambda device: 10)
+    with pytest.raises(InputError, match="memory"):
+        load(tmp_path, text, m="newmtl m\nmap_Kd red.png\n")
+
+
 @pytest.mark.parametrize("option", ["-clamp on", ""])
 def test_a_clamped_texture_is_refused_where_it_would_not_repeat(tmp_path, option):
     (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
