@@ -58,15 +58,15 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
     alpha_squared = roughness**4
     # The next lines compute π D G / (4 (n·l) (n·v)) with the distribution D and the masking
     # term G. The denominator cancels with a factor of G.
-    without_fresnel = _distribution((half * normals).sum(-1), alpha_squared)
+    without_fresnel = distribution((half * normals).sum(-1), alpha_squared)
     for direction in (toward, directions):
         cosine = (direction * normals).sum(-1)
-        without_fresnel = without_fresnel / _masking_denominator(cosine, alpha_squared)
+        without_fresnel = without_fresnel / masking_denominator(cosine, alpha_squared)
     fresnel_terms = fresnel((half * toward).sum(-1).clamp(0, 1))
     return torch.stack([without_fresnel * term for term in fresnel_terms])
 
 
-def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+def distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
     """Compute π times the GGX distribution D of the normals of microfacets.
 
     D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33.
@@ -81,7 +81,7 @@ def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
     return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
 
 
-def _masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+def masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
     """Compute the denominator of Smith's masking term G₁(c).
 
     G₁(c) is 2 c / (c + √(α² + (1 - α²) c²)). The BRDF contains

@@ -5,10 +5,11 @@ diffuse layer ("Revisiting Physically Based Shading at Imageworks", 2017). A
 reflectance is always π f, the reflected radiance per irradiance.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -217,6 +218,110 @@ def test_lobes_are_the_projected_reflectance_of_gltf(roughness, tolerance, view_
         for cosine, row in zip(cosines, torch.cat(found), strict=True):
             scale = project(whole_lobe, cosine).norm()
             assert (row - project(lobe, cosine)).norm() <= tolerance * scale
+
+
+COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
+
+
+def quadrature_of_narrow_lobes(degree: int) -> Iterator[tuple[np.ndarray, Tensor]]:
+    """Yield blocks of directions (N, 3) with y > 0, and twice their weighted harmonics.
+
+    The nodes are closest together near the horizon and towards +x. There are
+    about eight in the width of the narrowest lobe. The harmonics (N, K) of order
+    m < 0 are odd in y and count as 0.
+    """
+    node, weight = legendre.leggauss(240)
+    around, step = legendre.leggauss(120)
+    fraction = (around + 1) / 2
+    azimuth = math.pi * fraction**2
+    order = torch.arange((degree + 1) ** 2) - bands(degree) * (bands(degree) + 1)
+    for root, ring in zip(np.split((node + 1) / 2, 24), np.split(weight, 24), strict=True):
+        directions = directions_of(root[:, None] ** 2, azimuth)
+        solid_angles = (ring * root)[:, None] * 2 * math.pi * fraction * step
+        values = basis(torch.from_numpy(directions), degree)
+        yield directions, values * torch.from_numpy(solid_angles).reshape(-1, 1) * (order >= 0)
+
+
+def projected(lobes: list[tuple[Lobe, float]], degree: int) -> Tensor:
+    """Project lobes, each with its cosine n·v, times the cosine of the light: (lobes, K)."""
+    total = torch.zeros(len(lobes), (degree + 1) ** 2, dtype=DOUBLE)
+    for directions, harmonics in quadrature_of_narrow_lobes(degree):
+        values = [lobe.reflectance(cosine, directions) for lobe, cosine in lobes]
+        total += torch.from_numpy(np.stack(values) * directions[:, 2]) @ harmonics
+    return total
+
+
+# Metallic and Fresnel terms of the two parts of a metal's lobe, and of a varnish.
+PARTS = {"colored": (1.0, (1, 0)), "white": (1.0, (0, 1)), "varnish": (0.0, (None, 1))}
+
+
+@pytest.mark.parametrize(
+    ("degree", "roughnesses"),
+    [
+        (39, [0.2, 0.27]),
+        pytest.param(5, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),
+        pytest.param(20, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),
+        pytest.param(40, [0.23, 0.3, 0.37, 0.5, 0.7, 0.95, 1.0], marks=pytest.mark.slow),
+    ],
+)
+def test_lobes_and_roughness_gradients_are_those_of_quadrature_in_float32(degree, roughnesses):
+    """The errors are L2 norms over all harmonics, relative to those of the whole lobe.
+
+    A metal's whole lobe has the sum of its two Fresnel terms. The derivative by
+    the roughness is a central difference of the quadrature, and its error is
+    relative to the derivative of the whole lobe.
+    """
+    step = 1e-4
+    shape = (3, len(PARTS), len(roughnesses) * len(COSINES), -1)
+    lobes = [
+        (Lobe(roughness + move, *fresnel), cosine)
+        for move in (0, step, -step)
+        for _, fresnel in PARTS.values()
+        for roughness in roughnesses
+        for cosine in COSINES
+    ]
+    expected, above, below = projected(lobes, degree).view(shape)
+    slope = (above - below) / (2 * step)
+
+    def coefficients(part: str, roughness: Tensor, cosine: float) -> Tensor:
+        """Evaluate the library's lobe (K,) in axes whose z-axis is the normal."""
+        metallic, _ = PARTS[part]
+        gloss = SampleGloss(roughness, double(metallic).float(), double(1.0).float())
+        seen = toward(cosine).float()
+        colored, white, frame = gloss.specular_transfer(UP.float(), seen, degree)
+        return frame.to_world(colored if part == "colored" else white)[:, 0]
+
+    def require_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
+        """Compare the three parts (3, K) of lobes, or of derivatives."""
+        whole = torch.stack([expected[0] + expected[1]] * 2 + [expected[2]])
+        assert ((found - expected).norm(dim=1) <= tolerance * whole.norm(dim=1)).all()
+
+    for row, (roughness, cosine) in enumerate(itertools.product(roughnesses, COSINES)):
+        pairs = [
+            torch.autograd.functional.jvp(
+                partial(coefficients, part, cosine=cosine),
+                torch.tensor([roughness], dtype=torch.float32),
+                torch.ones(1),
+            )
+            for part in PARTS
+        ]
+        values, tangents = (torch.stack(parts).double() for parts in zip(*pairs, strict=True))
+        require_close(values, expected[:, row], 0.001)
+        require_close(tangents, slope[:, row], 0.02)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.3, 0.55])
+def test_an_image_does_not_depend_on_whether_the_roughness_is_differentiable(roughness):
+    """A number and a tensor give equal images. One roughness per face differs by rounding."""
+    mesh = normalize(solid("pear"))
+    light = positive_light(20)
+    plain = render(mesh, CAMERA, light, 12, gloss=Gloss(roughness, 1.0))
+    tensor = torch.tensor(roughness, dtype=DOUBLE, requires_grad=True)
+    attacked = render(mesh, CAMERA, light, 12, gloss=Gloss(tensor, 1.0))
+    torch.testing.assert_close(attacked.detach(), plain, rtol=0, atol=1e-14)
+    by_face = torch.full((len(mesh.faces),), roughness, dtype=DOUBLE)
+    faces = render(mesh, CAMERA, light, 12, gloss=Gloss(by_face, 1.0))
+    torch.testing.assert_close(faces, plain, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("cosine", "roughness"), [(0.9, 0.2), (0.3, 0.7), (1.0, 1.0)])
