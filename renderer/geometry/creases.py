@@ -16,8 +16,8 @@ from renderer.geometry.normals import CANCELLATION, doubled_area_vectors
 CREASE = 40.0
 # Rounding errors of at most this angle in degrees do not make an edge sharp.
 ROUNDING_ANGLE = 0.01
-# The normals of a file are rounded to this fraction before they are compared.
-FILE_NORMAL_STEP = 1e-3
+# Normals of a file that differ by at most this angle in degrees are rounded values of one normal.
+FILE_ANGLE = 1.0
 # Only so many of the faces around one edge are compared with each other.
 # Without the limit, a file whose faces all share one edge would take forever.
 MAX_FACES_AT_EDGE = 8
@@ -56,11 +56,13 @@ def normal_groups(
         lengths = np.linalg.norm(area_vectors, axis=1)
         has_area = lengths > 0
         unit_normals = area_vectors / np.where(has_area, lengths, 1)[:, None]
-        sharpest = np.cos(np.radians(min(crease + ROUNDING_ANGLE, 180)))
-        by_crease = _fans(faces, unit_normals, sharpest)
+        first, second = _neighbors(faces)
+        cosines = np.einsum("ni,ni->n", unit_normals[first // 3], unit_normals[second // 3])
+        is_smooth = cosines >= np.cos(np.radians(min(crease + ROUNDING_ANGLE, 180)))
+        by_crease = _joined(faces, first[is_smooth], second[is_smooth])
     groups = by_crease
     if file_normals is not None:
-        by_file, is_given = _groups_of_file(faces, file_normals)
+        by_file, is_given = _groups_of_file(faces, file_normals, first, second)
         groups = np.where(is_given, by_file, by_crease + by_file.max() + 1)
     separate = np.arange(faces.size).reshape(-1, 3)
     for finer in (by_crease, separate):
@@ -73,53 +75,68 @@ def normal_groups(
     return np.unique(groups, return_inverse=True)[1].reshape(-1, 3)
 
 
-def _groups_of_file(faces: np.ndarray, file_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the vertex and normal of each corner, and whether a normal is given."""
+def _groups_of_file(
+    faces: np.ndarray, file_normals: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Group corners by their normals in a file, and tell which corners have one, shape (F, 3) each.
+
+    `first` and `second` are the corners of neighboring faces (see `_neighbors`).
+    Corners of faces that only touch at a vertex are compared, too, in the order of
+    their normals.
+    """
     lengths = np.linalg.norm(file_normals.astype(np.float64), axis=-1)
     is_given = (lengths > 0) & np.isfinite(lengths)
-    safe_normals = np.where(is_given[..., None], file_normals, 1)
-    unit_normals = safe_normals / np.where(is_given, lengths, 1)[..., None]
-    steps = round(1 / FILE_NORMAL_STEP)
-    # Each component becomes a digit from 0 to 2 · steps of one integer.
-    digits = np.rint(steps * unit_normals.clip(-1, 1)).astype(np.int64) + steps
-    base = 2 * steps + 1
-    keys = faces * base**3 + digits @ [base**2, base, 1]
-    return np.unique(keys, return_inverse=True)[1].reshape(-1, 3), is_given
+    unit_normals = np.where(is_given[..., None], file_normals, 0)
+    unit_normals = (unit_normals / np.where(is_given, lengths, 1)[..., None]).reshape(-1, 3)
+    vertex = faces.ravel()
+    # One integer is sorted much faster than four numbers.
+    order = np.argsort(
+        vertex * 2**33 + np.rint(1000 * unit_normals).astype(int) @ [2**22, 2**11, 1]
+    )
+    is_same_vertex = vertex[order[1:]] == vertex[order[:-1]]
+    first = np.concatenate([first, order[:-1][is_same_vertex]])
+    second = np.concatenate([second, order[1:][is_same_vertex]])
+    cosines = np.einsum("ni,ni->n", unit_normals[first], unit_normals[second])
+    agree = cosines >= np.cos(np.radians(FILE_ANGLE))
+    return _joined(faces, first[agree], second[agree]), is_given
 
 
-def _fans(faces: np.ndarray, unit_normals: np.ndarray, min_cosine: float) -> np.ndarray:
-    """Number the fans of faces around each vertex that end at sharp edges, shape (F, 3).
+def _neighbors(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of corners at one vertex whose faces share an edge that ends there.
 
-    An edge is sharp if the cosine of the angle between the normals of its faces is
-    below `min_cosine`.
+    Corner c of face f has the number 3 f + c.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    # Side 3 f + s leads from corner s of face f to the next corner,
-    # so that a side has the number of the corner at which it starts.
+    # Side 3 f + s leads from corner s of face f to the next corner.
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()
     next_corner = np.arange(faces.size).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     edge = np.minimum(start, end) * (start.max() + 1) + np.maximum(start, end)
     sides = np.argsort(edge, kind="stable")
     sorted_edges = edge[sides]
-    links = []
+    firsts, seconds = [], []
     for distance in range(1, MAX_FACES_AT_EDGE):
         is_shared = sorted_edges[distance:] == sorted_edges[:-distance]
         if not is_shared.any():
             break
         first = sides[:-distance][is_shared]
         second = sides[distance:][is_shared]
-        cosines = np.einsum("ni,ni->n", unit_normals[first // 3], unit_normals[second // 3])
-        first, second = first[cosines >= min_cosine], second[cosines >= min_cosine]
         # The corners of both faces at the start and at the end of the first side.
         is_parallel = start[first] == start[second]
-        at_start = np.where(is_parallel, second, next_corner[second])
-        at_end = np.where(is_parallel, next_corner[second], second)
-        links += [(first, at_start), (next_corner[first], at_end)]
-    rows, columns = np.concatenate(links, axis=1) if links else np.zeros((2, 0), np.int64)
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
+        firsts += [first, next_corner[first]]
+        seconds += [
+            np.where(is_parallel, second, next_corner[second]),
+            np.where(is_parallel, next_corner[second], second),
+        ]
+    nothing = np.zeros(0, np.int64)
+    return np.concatenate([nothing, *firsts]), np.concatenate([nothing, *seconds])
+
+
+def _joined(faces: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Number the groups of corners that pairs of corners connect, shape (F, 3)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(first), np.int8), (first, second)), (faces.size, faces.size))
     return connected_components(graph, directed=False)[1].astype(np.int64).reshape(-1, 3)
 
 
