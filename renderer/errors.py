@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+import unicodedata
 from collections.abc import Collection, Set
 from numbers import Integral, Real
 from pathlib import Path
@@ -101,6 +102,21 @@ def single_line(error: Exception) -> str:
         class.
     """
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def composed(name: str) -> str:
+    """Return a name in Unicode's form NFC, so that equal names compare equal.
+
+    macOS writes the names of files in the form NFD, in which an accent is a
+    character of its own.
+
+    Args:
+        name: Name of a class, folder or file.
+
+    Returns:
+        Name in the form NFC.
+    """
+    return unicodedata.normalize("NFC", name)
 
 
 def is_out_of_memory(error: Exception) -> bool:

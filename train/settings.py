@@ -17,7 +17,7 @@ from augment.settings import (
     count_views,
     read_normalized_light,
 )
-from renderer.errors import MAX_SCALE, InputError, describe, is_whole, require_range
+from renderer.errors import MAX_SCALE, InputError, composed, describe, is_whole, require_range
 from renderer.settings import (
     MAX_SIZE,
     MAX_VIEWS,
@@ -738,12 +738,12 @@ def simplified(name: str) -> str:
         name: Name of a class, of a solid or of a file.
 
     Returns:
-        Name in lower case, in which "_" and "-" are replaced by spaces.
+        Name in lower case and in Unicode's form NFC, in which "_" and "-" are replaced by spaces.
 
     >>> simplified("Sweet_pepper")
     'sweet pepper'
     """
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+    return " ".join(composed(name).lower().replace("_", " ").replace("-", " ").split())
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:
@@ -776,7 +776,7 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
                 f"label has {describe(name)} in its list: give only names of classes",
                 "label",
             )
-    names = [str(name) for name in listed]
+    names = [composed(str(name)) for name in listed]
     if not names or len(set(names)) < len(names):
         raise InputError(
             f"label=[{', '.join(names)}] must name a class, or several, each once",

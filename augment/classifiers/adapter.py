@@ -22,7 +22,14 @@ from torch import Tensor, nn
 from augment.classifiers.normalized_light import normalize_light
 from augment.losses import log_odds
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
-from renderer.errors import InputError, describe, is_out_of_memory, require_range, single_line
+from renderer.errors import (
+    InputError,
+    composed,
+    describe,
+    is_out_of_memory,
+    require_range,
+    single_line,
+)
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole
 
@@ -450,11 +457,10 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
         InputError: If `classes` is not a list of strings. A single string is
             refused, too.
     """
-    return tuple(
-        as_list(
-            name, classes, str, "a list of the names of the classes, in the order of the logits"
-        )
+    names = as_list(
+        name, classes, str, "a list of the names of the classes, in the order of the logits"
     )
+    return tuple(map(composed, names))
 
 
 class Wrapper(nn.Module):
@@ -670,9 +676,10 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
             names.
     """
     require_kind("label", name, str | int, "the name of a class, or its index")
-    if name in classes:
-        return classes.index(str(name))
-    text = str(name)
+    text = composed(str(name))
+    names = [*map(composed, classes)]
+    if isinstance(name, str) and text in names:
+        return names.index(text)
     is_index = text.isascii() and text.isdecimal()
     if isinstance(name, str) and not is_index and _are_indices(classes):
         raise InputError(

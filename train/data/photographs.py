@@ -17,7 +17,7 @@ from torch import Tensor
 
 from augment.classifiers.adapter import Label, class_index, nearest
 from augment.progress import progress
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, composed, single_line
 from renderer.io.images import read_square
 from renderer.memory import require_memory
 from train import console
@@ -147,6 +147,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
             only missing files or a source without images.
     """
     labels = label_names(label)
+    classes = [*map(composed, classes)]
     for name in labels:
         class_index(classes, name, "label")
     paths, files = _image_files(folder)
@@ -161,8 +162,8 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
 
     photographs = []
     for path in paths:
-        row = rows.get(path, _Row())
-        name = path.parts[0] if has_class_folders else labels[0]
+        row = rows.get(_composed_path(path), _Row())
+        name = composed(path.parts[0]) if has_class_folders else labels[0]
         photographs.append(Photograph(path, name, row.source, row.hard_negatives, row.mesh))
     sources = {item.source for item in photographs}
     hard_negatives = {name for item in photographs for name in item.hard_negatives}
@@ -194,7 +195,7 @@ def _require_files_of_rows(
     Raises:
         InputError: If all rows name missing files.
     """
-    missing = sorted(rows.keys() - set(files))
+    missing = sorted(rows.keys() - set(map(_composed_path, files)))
     if not missing:
         return
     if len(missing) == len(rows):
@@ -221,12 +222,13 @@ def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
-    return [name for name in folder_names(folder) if name in classes]
+    names = {*folder_names(folder)}
+    return sorted(name for name in classes if composed(name) in names)
 
 
 def folder_names(folder: Path) -> list[str]:
-    """Return the sorted names of the subfolders of a folder, without hidden ones."""
-    folders = [entry.name for entry in folder.iterdir() if entry.is_dir()]
+    """Return the sorted names of the subfolders, in the form of `composed`, without hidden ones."""
+    folders = {composed(entry.name) for entry in folder.iterdir() if entry.is_dir()}
     return sorted(name for name in folders if not is_hidden(name))
 
 
@@ -285,6 +287,11 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
     own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
     other_files = [path for path in visible_files(folder) if path not in own_files]
     return sorted(path for path in other_files if not _is_image(folder, path))
+
+
+def _composed_path(path: PurePosixPath) -> PurePosixPath:
+    """Return a path whose names compare equal to those of the same path in photos.csv."""
+    return PurePosixPath(composed(str(path)))
 
 
 def _is_image(folder: Path, path: PurePosixPath) -> bool:
@@ -414,7 +421,8 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
         if not table.is_file():
             raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
-            for line in csv.DictReader(file, restval="", strict=True):
+            composed_lines = (composed(line) for line in file)
+            for line in csv.DictReader(composed_lines, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
                 row = _Row(
                     line["source_tag"] or None,

@@ -2,14 +2,23 @@ import logging
 import os
 import socket
 from pathlib import Path, PurePosixPath
+from unicodedata import normalize
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from augment.classifiers.adapter import class_index
 from renderer.errors import InputError
-from train.data.photographs import Photograph, find_photographs, load_photographs, unsupported_files
+from train.class_names import classes_of_meshes
+from train.data.photographs import (
+    Photograph,
+    class_folders,
+    find_photographs,
+    load_photographs,
+    unsupported_files,
+)
 
 CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
@@ -110,6 +119,30 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
         "orange/b.HEIC",
         "orange/c.avif",
     ]
+
+
+@pytest.mark.parametrize("of_classes", ["NFC", "NFD"])
+@pytest.mark.parametrize("of_files", ["NFC", "NFD"])
+def test_names_with_accents_are_equal_in_both_forms_of_unicode(tmp_path, of_classes, of_files):
+    """macOS writes the names of files in the form NFD. Equal letters then differ in bytes."""
+    classes = [normalize(of_classes, name) for name in ("orange", "açaí", "crème brûlée")]
+    of_others = "NFC" if of_files == "NFD" else "NFD"
+    folder = normalize(of_files, "crème brûlée")
+    touch(tmp_path, f"{folder}/{normalize(of_files, 'é.png')}", "orange/b.png")
+    table = "path,source_tag,hard_negatives\ncrème brûlée/é.png,Zürich,\norange/b.png,a,Zürich\n"
+    lines = table.splitlines()
+    lines[1] = normalize(of_others, lines[1])
+    lines[2] = normalize(of_files, lines[2])
+    (tmp_path / "photos.csv").write_text("\n".join(lines), encoding="utf-8")
+    found = find_photographs(tmp_path, classes, normalize(of_others, "crème brûlée"))
+    first = next(photograph for photograph in found if photograph.label != "orange")
+    assert first.label == normalize("NFC", "crème brûlée")
+    assert first.source == normalize("NFC", "Zürich")
+    assert (tmp_path / first.path).exists()
+    assert class_folders(tmp_path, classes) == sorted([classes[0], classes[2]])
+    assert class_index(classes, normalize(of_others, "açaí"), "label") == 1
+    mesh = normalize(of_others, "crème_brûlée.glb")
+    assert classes_of_meshes([mesh], classes, "scene.meshes") == [classes[2]]
 
 
 def test_pipes_and_sockets_are_no_photographs(tmp_path):
