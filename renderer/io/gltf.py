@@ -32,7 +32,7 @@ FAN = 6
 ALMOST_ONE = 1 - 0.5 / 255
 # Bytes that a face, and a joint of a vertex, take while the parts are read and joined.
 FACE_BYTES = 2000
-JOINT_BYTES = 100
+JOINT_BYTES = 200
 
 
 @dataclass(frozen=True)
@@ -203,8 +203,10 @@ def _place(file: GltfFile, node: int, part: _Primitive, skeleton: Skeleton | Non
         corner_colors=encode(torch.from_numpy(corners[..., 3:6]), "srgb").float().numpy(),
         corner_uvs=corners[..., :2].astype(np.float32),
         texture_ids=np.full(len(faces), texture_id, dtype=np.int32),
+        # `load_mesh` finds the sharp edges of all parts together.
+        normal_ids=faces,
         textures=() if part.material.texture is None else (part.material.texture,),
-        gloss=None if gloss is None else np.float32(gloss)[None].repeat(len(faces), axis=0),
+        gloss=None if gloss is None else np.tile(gloss.astype(np.float32), (len(faces), 1)),
         gloss_textures=(
             () if part.material.gloss_texture is None else (part.material.gloss_texture,)
         ),

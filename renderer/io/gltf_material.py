@@ -114,7 +114,7 @@ class Material:
         size = list(self.texture.shape[:2])
         size[axis] += before + after
         require_memory("textures", TEXEL_BYTES * math.prod(size), torch.device("cpu"))
-        textures = {}
+        textures: dict[str, Any] = {}
         for name in ("texture", "alpha", "gloss_texture"):
             texels = getattr(self, name)
             if texels is not None:
@@ -237,8 +237,8 @@ def _specular_glossiness(file: GltfFile, model: dict[str, Any], gloss: bool) -> 
     roughness = np.clip(1 - glossiness, 0, 1)
     if placement is None:
         return replace(material, gloss=np.array([roughness, 0, factor]))
-    texels = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
-    return _with_gloss_texture(material, texels.astype(np.uint8), placement)
+    factors = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
+    return _with_gloss_texture(material, factors.astype(np.uint8), placement)
 
 
 def _dimmed(material: Material, factors: np.ndarray, placement: Placement) -> Material:
@@ -246,7 +246,9 @@ def _dimmed(material: Material, factors: np.ndarray, placement: Placement) -> Ma
     material = _with_common_placement(material, placement, factors.shape)
     assert material.texture is not None
     height, width = material.texture.shape[:2]
-    image = Image.fromarray(factors.astype(np.float32)).resize((width, height), Image.BILINEAR)
+    image = Image.fromarray(factors.astype(np.float32)).resize(
+        (width, height), Image.Resampling.BILINEAR
+    )
     linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
     dimmed = encode(linear * torch.from_numpy(np.array(image))[..., None], "srgb")
     return replace(material, texture=(255 * dimmed).round().to(torch.uint8).numpy())
@@ -260,7 +262,7 @@ def _with_gloss_texture(material: Material, texels: np.ndarray, placement: Place
         # Textures that will be extended need the same size.
         height, width = material.texture.shape[:2]
         channels = [Image.fromarray(channel) for channel in np.moveaxis(texels, 2, 0)]
-        resized = [np.array(c.resize((width, height), Image.BILINEAR)) for c in channels]
+        resized = [np.array(c.resize((width, height), Image.Resampling.BILINEAR)) for c in channels]
         texels = np.stack(resized, axis=-1)
     return replace(material, gloss_texture=texels)
 

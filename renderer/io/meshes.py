@@ -24,7 +24,7 @@ from trimesh.visual.material import Material, empty_material
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_file, single_line
 from renderer.geometry.creases import normal_groups
-from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
+from renderer.geometry.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits
 from renderer.io.mesh_file import MeshFile, Part
@@ -101,7 +101,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     if not parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     placed_meshes, normals = zip(*(part.placed() for part in parts), strict=True)
-    mesh = _merge_vertices(concatenate(placed_meshes), np.concatenate(normals))
+    mesh = _share_textures(concatenate(placed_meshes))
+    mesh = _merge_vertices(mesh, np.concatenate(normals))
     # The matrices of a scene may have huge numbers or NaN. A
     # comparison with NaN is False, so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
@@ -116,6 +117,23 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     is_gltf = path.suffix.lower().lstrip(".") in GLTF
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
+
+
+def _share_textures(mesh: Mesh) -> Mesh:
+    """Return a copy of a mesh in which the copies of a part have one texture."""
+    pairs = list(zip(mesh.textures, mesh.gloss_textures or mesh.textures, strict=True))
+    keys = [(id(texture), id(gloss_texture)) for texture, gloss_texture in pairs]
+    pair_of_key = dict(zip(keys, pairs, strict=True))
+    index_of_key = {key: index for index, key in enumerate(pair_of_key)}
+    # The last entry belongs to the index -1, which is NO_TEXTURE.
+    new_ids = np.array([*(index_of_key[key] for key in keys), NO_TEXTURE], dtype=np.int32)
+    gloss_textures = tuple(pair[1] for pair in pair_of_key.values())
+    return replace(
+        mesh,
+        texture_ids=new_ids[mesh.texture_ids],
+        textures=tuple(pair[0] for pair in pair_of_key.values()),
+        gloss_textures=gloss_textures if mesh.gloss_textures else (),
+    )
 
 
 def _merge_vertices(mesh: Mesh, normals: np.ndarray) -> Mesh:

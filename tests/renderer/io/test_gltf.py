@@ -576,6 +576,35 @@ def test_instances_place_copies_of_a_mesh(tmp_path):
     assert_allclose(triangle_corners(tmp_path, gltf), expected)
 
 
+def test_copies_of_a_mesh_share_its_texture(tmp_path):
+    gltf = Gltf()
+    texture = gltf.texture(color_texels(2, 2))
+    gltf.square(pbrMetallicRoughness={"baseColorTexture": texture}).mesh({"POSITION": POINTS[:3]})
+    gltf.tree["nodes"] = [{"mesh": 0}, {"mesh": 1}, {"mesh": 0, "translation": [5, 0, 0]}]
+    gltf.tree["scenes"][0]["nodes"] = [0, 1, 2]
+    mesh = gltf.load(tmp_path)
+    assert len(mesh.textures) == 1
+    assert mesh.texture_ids.tolist() == [0, 0, -1, 0, 0]
+
+
+def test_the_mask_of_a_posed_and_mirrored_mesh_is_cut_out(tmp_path):
+    """One joint scales by 2 and mirrors, so the visible half has the area 2."""
+    gltf = Gltf().square(pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 1]}, alphaMode="MASK")
+    colors = np.float32(np.column_stack([SQUARE, SQUARE[:, 0]]))
+    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = gltf.array(colors)
+    attributes["JOINTS_0"] = gltf.array(np.zeros((4, 4), np.uint8))
+    attributes["WEIGHTS_0"] = gltf.array(np.float32([[1, 0, 0, 0]] * 4))
+    gltf.tree["nodes"] = [{"mesh": 0, "skin": 0}, {"scale": [-2, 2, 2]}]
+    gltf.tree["scenes"][0]["nodes"] = [0, 1]
+    gltf.tree["skins"] = [{"joints": [1]}]
+    mesh = gltf.load(tmp_path)
+    assert mesh.face_areas().sum() == pytest.approx(2, rel=1e-6)
+    assert mesh.vertices[:, 0].max() == pytest.approx(-1, rel=1e-6)
+    assert (mesh.face_normals()[:, 2] > 0.99).all()
+    assert_allclose(mesh.skin.carried.sum(axis=1)[:, :3], mesh.vertices, atol=1e-6)
+
+
 def test_meshes_outside_of_the_default_scene_are_not_read(tmp_path):
     gltf = Gltf()
     gltf.mesh({"POSITION": POINTS[:3]})

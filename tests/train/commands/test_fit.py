@@ -181,6 +181,7 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*normalTexture:UserWarning")
 @pytest.mark.realdata
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
 @pytest.mark.parametrize(

@@ -284,6 +284,7 @@ def test_a_scene_with_outlines_has_the_samples_of_their_documented_accuracy(opti
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*normalTexture:UserWarning")
 @pytest.mark.realdata
 @pytest.mark.skipif(not MESHES.is_dir(), reason="needs ../shared/data")
 @pytest.mark.parametrize(
