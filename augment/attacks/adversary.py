@@ -38,6 +38,7 @@ from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.shading.gloss import Gloss
+from renderer.short_repr import ShortRepr
 from renderer.surface.texture_bake import with_added_albedo
 from renderer.validation import as_folder
 from renderer.visibility.rasterizers import Rasterizer, choose
@@ -60,8 +61,8 @@ MAP_HEIGHT = 256
 RGBE_TOLERANCE = 2.0**-8
 
 
-@dataclass(frozen=True)
-class Adversary:
+@dataclass(frozen=True, repr=False)
+class Adversary(ShortRepr):
     """All that is needed to render one example after an attack, and its images before and after.
 
     An example is one object in front of a background, seen from V cameras.

@@ -43,6 +43,7 @@ from renderer.errors import InputError, is_whole, require_choice, require_range
 from renderer.io.images import write_image
 from renderer.light.harmonics import irradiance_error
 from renderer.rendering import light_sphere
+from renderer.short_repr import ShortRepr
 from renderer.validation import (
     as_list,
     as_path,
@@ -66,8 +67,8 @@ ANIMATION_SUFFIXES = (".gif", ".webp")
 MAX_FRAME_COUNT = 1000
 
 
-@dataclass(frozen=True)
-class AttackResult:
+@dataclass(frozen=True, repr=False)
+class AttackResult(ShortRepr):
     """Result of an attack on E examples of V views, with a classifier of C classes.
 
     `nb.check`, `nb.success_by_radius`, `nb.transfer` and `nb.save` take it as
@@ -699,10 +700,11 @@ def require_clean_correct(
         f"{classifier.classes[index]} {confidence:.1%}"
         for confidence, index in zip(confidences.tolist(), classes.tolist(), strict=True)
     ]
-    images = f"{len(misclassified)} of {source.numel()} images of {item.name}"
+    wrong = f"{len(misclassified)} of {source.numel()} images"
     raise InputError(
-        f"force=False, and {images} are not classified as {item.label!r} before any attack "
-        f"(the first: {', '.join(most_probable)}): change the scene, or set force=True",
+        f"force=False, and {wrong} are not classified as their class before any attack "
+        f"(the first, of {item.name}, class {item.label!r}: {', '.join(most_probable)}): "
+        "change the scene, or set force=True",
         "force",
     )
 

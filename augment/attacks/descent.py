@@ -42,6 +42,7 @@ from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, add
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.model_passes import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
+from renderer.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -121,8 +122,8 @@ class Criterion:
         return torch.where(is_untargeted, is_misclassified, predicted == self.target)
 
 
-@dataclass(frozen=True)
-class DescentResult:
+@dataclass(frozen=True, repr=False)
+class DescentResult(ShortRepr):
     """Values that a descent found for E examples, with their images and costs.
 
     A candidate is a vector of D values that the descent evaluated. For each

@@ -35,6 +35,7 @@ from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, require_choice
 from renderer.image import decode, to_bytes, to_unit
+from renderer.short_repr import ShortRepr
 from renderer.validation import require_kind, require_seed
 
 # A photograph is lit by a projector that shows a picture, the slide. These are the names of three
@@ -48,8 +49,8 @@ LIGHTS = (SLIDE, RANDOM, ADVERSARIAL)
 UNCHANGED = "unchanged"
 
 
-@dataclass(frozen=True)
-class PhotographAttackResult:
+@dataclass(frozen=True, repr=False)
+class PhotographAttackResult(ShortRepr):
     """Predictions of a network for N photographs in the light of a projector.
 
     The projector shows S random pictures (slides) on each photograph, each in

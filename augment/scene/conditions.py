@@ -9,6 +9,7 @@ from torch import Tensor
 
 from renderer.camera import Camera
 from renderer.geometry.mesh import Mesh
+from renderer.short_repr import ShortRepr
 from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
@@ -38,8 +39,8 @@ class Example:
     exposure: float = 1.0
 
 
-@dataclass(frozen=True)
-class Conditions:
+@dataclass(frozen=True, repr=False)
+class Conditions(ShortRepr):
     """Light, shape and colors with which A examples are rendered.
 
     N and F are the numbers of vertices and faces of the largest mesh of the scene. A smaller mesh

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from renderer.io.files import atomic_write
+from renderer.short_repr import ShortRepr
 from renderer.validation import as_path
 from train.auditing.audit_page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.lights import KINDS
@@ -39,8 +40,8 @@ class AttackCounts:
     random: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class NetworkReport:
+@dataclass(frozen=True, repr=False)
+class NetworkReport(ShortRepr):
     """Results of an audit for one network.
 
     Attributes:
@@ -69,8 +70,8 @@ class NetworkReport:
     transfers: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class AuditReport:
+@dataclass(frozen=True, repr=False)
+class AuditReport(ShortRepr):
     """Report of an audit.
 
     Attributes:

@@ -27,6 +27,7 @@ from augment.photographs.photograph_attack import (
 )
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
+from renderer.short_repr import ShortRepr
 from train.data.photographs import Photograph, find_unlabeled, load_photographs
 from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
@@ -73,8 +74,8 @@ class RelitPhotograph:
     becomes: Mapping[str, Sequence[str]]
 
 
-@dataclass(frozen=True)
-class RelitScores:
+@dataclass(frozen=True, repr=False)
+class RelitScores(ShortRepr):
     """Predictions of a network for photographs in the light of a projector.
 
     Attributes:

@@ -301,7 +301,7 @@ class Trainer:
         largest = math.ceil(in_round / shares) * shares
         if settings.batch_size > largest:
             console.warning(
-                "train.batch_size=%d is more than the %d images that a round shows: it is %d",
+                "batch_size=%d is more than the %d images that a round shows: it is %d",
                 settings.batch_size,
                 in_round,
                 largest,

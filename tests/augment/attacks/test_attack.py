@@ -215,7 +215,7 @@ def orange_labeled(label: str) -> augment.Scene:
 
 def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color):
     scene = orange_labeled("lime")
-    with pytest.raises(InputError, match=r"1 of 1 images of solid:orange"):
+    with pytest.raises(InputError, match=r"1 of 1 images .*solid:orange"):
         augment.attack(by_color, scene)
     assert augment.attack(by_color, scene, force=True).descent.success_before.all()
 

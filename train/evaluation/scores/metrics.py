@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from renderer.short_repr import ShortRepr
 from train.evaluation.scores.predictions import Prediction
 from train.evaluation.tables import Estimate, Proportion, fraction
 
@@ -225,8 +226,8 @@ def within_rank(predictions: Sequence[Prediction], max_rank: int) -> Outcome:
     return Outcome(predictions, hits)
 
 
-@dataclass(frozen=True)
-class Pool:
+@dataclass(frozen=True, repr=False)
+class Pool(ShortRepr):
     """Set of predictions that are scored together.
 
     With several labels, a photograph has one prediction for each label. All of
@@ -486,8 +487,8 @@ def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None
     )
 
 
-@dataclass(frozen=True)
-class Pooled:
+@dataclass(frozen=True, repr=False)
+class Pooled(ShortRepr):
     """Predictions of one evaluation, grouped by label, source, mesh and class.
 
     Each group is a `Pool`, whose predictions are scored together.

@@ -22,6 +22,7 @@ from renderer.errors import InputError, require_range, single_line
 from renderer.image import to_unit
 from renderer.io.files import atomic_write
 from renderer.settings import MAX_SIZE
+from renderer.short_repr import ShortRepr
 from renderer.validation import as_folder, require_kind, require_whole
 from train.data.photographs import (
     SEPARATOR,
@@ -82,8 +83,8 @@ class Prediction:
         return self.photograph.label == self.label
 
 
-@dataclass(frozen=True)
-class FolderPredictions:
+@dataclass(frozen=True, repr=False)
+class FolderPredictions(ShortRepr):
     """Predictions of a model for all photographs of a folder.
 
     Attributes:

@@ -23,6 +23,7 @@ from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
+from renderer.short_repr import ShortRepr
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
 from train.evaluation.scores.metrics import (
@@ -82,8 +83,8 @@ class ClassScores:
     most_common_wrong: Mapping[str, int]
 
 
-@dataclass(frozen=True)
-class Scores:
+@dataclass(frozen=True, repr=False)
+class Scores(ShortRepr):
     """Scores of a model on a folder of photographs.
 
     Attributes:
@@ -111,6 +112,10 @@ class Scores:
     by_mesh: Mapping[str, Metrics] | None
     by_class: Mapping[str, ClassScores]
     class_metrics: Mapping[str, Metrics] | None = None
+
+    def __str__(self) -> str:
+        """Return the lines that pnb-evaluate prints."""
+        return format_overall(self)
 
     @property
     def label(self) -> str:
