@@ -218,11 +218,11 @@ def colored_mesh(
         textures: Textures, uint8, shape (H, W, 3) each.
     """
     corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
-    if not textures or uvs is None or texture_ids is None:
+    if not textures or texture_ids is None:
         texture_ids = np.full(len(faces), NO_TEXTURE)
     else:
         is_textured = texture_ids != NO_TEXTURE
-        if np.isnan(uvs[is_textured]).any():
+        if uvs is None or np.isnan(uvs[is_textured]).any():
             raise ValueError("faces with a texture have no texture coordinates")
         require_bounded(texture_coordinates=uvs[is_textured])
         corner_uvs[is_textured] = uvs[is_textured]
@@ -233,6 +233,8 @@ def colored_mesh(
         corner_uvs=corner_uvs,
         texture_ids=texture_ids.astype(np.int32),
         textures=tuple(textures),
+        # Sharp edges are found later, when equal positions have become one vertex.
+        normal_ids=faces,
     )
 
 
