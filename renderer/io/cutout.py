@@ -6,16 +6,13 @@ texel. The border is straight within such a face.
 """
 
 import numpy as np
-import torch
-
-from renderer.memory import require_memory
 
 # Columns of the values at the corners of faces.
 U, V, ALPHA = 0, 1, 2
 # Largest alpha of a texel.
 FULL = 255
-# Bytes that a face takes while it is divided.
-FACE_BYTES = 2000
+# Largest number of faces before the last division.
+MAX_FACES = 10**6
 
 
 class _AlphaTexture:
@@ -104,7 +101,7 @@ def cut_out(
         New vertices, faces and corners. The given ones if nothing is cut out.
 
     Raises:
-        InputError: If the faces do not fit into the memory.
+        ValueError: If the result has too many faces.
     """
     given = vertices, faces, corners
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)
@@ -122,7 +119,11 @@ def cut_out(
         is_large = is_crossed & (lengths.max(axis=1) > 1)
         if not is_large.any():
             break
-        require_memory("faces at holes", FACE_BYTES * 4 * len(faces), torch.device("cpu"))
+        if len(faces) > MAX_FACES:
+            raise ValueError(
+                f"the border of its alpha needs more than {MAX_FACES} faces: use fewer texels "
+                "or fewer repetitions of the texture"
+            )
         keep = np.flatnonzero(is_shown)
         vertices, faces, corners = _divide(
             vertices, faces[keep], corners[keep], lengths[keep].argmax(axis=1), is_large[keep]

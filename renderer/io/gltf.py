@@ -78,6 +78,10 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
             if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
                 read = part(node["mesh"], number, weights)
                 placed_parts += _place(file, index, read, skeleton)
+    if not placed_parts and any(
+        m.get("alphaMode") == "MASK" for m in file.tree.get("materials", ())
+    ):
+        raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
     return placed_parts
 
 

@@ -100,15 +100,16 @@ class GltfFile:
         self, location: dict[str, Any], count: int, dtype: np.dtype[Any], width: int
     ) -> np.ndarray:
         """Return the elements that an accessor or its sparse part stores, without a copy."""
-        view = self.entry("bufferViews", location["bufferView"])
+        index = location["bufferView"]
+        view = self._view(index)
         size = dtype.itemsize
-        return np.ndarray(
-            (count, width),
-            dtype,
-            self._view(location["bufferView"]),
-            location.get("byteOffset", 0),
-            (view.get("byteStride", width * size), size),
-        )
+        stride = self.entry("bufferViews", index).get("byteStride", width * size)
+        offset = location.get("byteOffset", 0)
+        end = offset + stride * (count - 1) + width * size
+        # NumPy would read bytes before the buffer at a negative offset.
+        if min(offset, stride, count) < 0 or end > len(view):
+            raise ValueError(f"an array ends behind its buffer view {index}: the file is damaged")
+        return np.ndarray((count, width), dtype, view, offset, (stride, size))
 
     def _view(self, index: int) -> memoryview:
         """Return the bytes of a buffer view."""

@@ -22,6 +22,7 @@ from renderer import memory
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.image import decode
+from renderer.io import cutout
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh, read_parts
 
@@ -372,6 +373,14 @@ def test_alpha_of_single_texels_is_cut_out(tmp_path):
     area = 3 * (2 - 2 * math.log(2))
     # The border is straight within each texel, so each hole is off by a part of a texel.
     assert 256 * (1 - mesh.face_areas().sum()) == pytest.approx(area, abs=0.6)
+
+
+def test_a_mask_with_too_long_a_border_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(cutout, "MAX_FACES", 1000)
+    gltf = masked(hole(16, 5))
+    gltf.tree["accessors"][1]["bufferView"] = gltf.view((1e5 * SQUARE_UVS).tobytes())
+    with pytest.raises(InputError, match="needs more than 1000 faces"):
+        gltf.load(tmp_path)
 
 
 def test_the_alpha_of_vertices_and_of_the_material_is_cut_exactly(tmp_path):
@@ -788,7 +797,14 @@ def short_buffer() -> Gltf:
     return gltf
 
 
+def negative_offset() -> Gltf:
+    gltf = plain()
+    gltf.tree["accessors"][0]["byteOffset"] = -4
+    return gltf
+
+
 REFUSED = {
+    "an array ends behind its buffer view": negative_offset(),
     "KHR_draco_mesh_compression": with_entries(
         plain(), extensionsRequired=["KHR_draco_mesh_compression"]
     ),
@@ -801,6 +817,9 @@ REFUSED = {
     "glTF 1.0": with_entries(plain(), asset={"version": "1.0"}),
     "ends behind its buffer": short_buffer(),
     "differ in texture coordinates": different_places(),
+    "cuts out all faces": plain(
+        pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.4]}, alphaMode="MASK"
+    ),
     "specular color": plain(
         extensions={"KHR_materials_specular": {"specularColorFactor": [1, 0, 0]}}
     ),
