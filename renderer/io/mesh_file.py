@@ -148,15 +148,15 @@ def require_bounded(**values: np.ndarray) -> None:
 
 def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
     """Parse numbers between blanks or line breaks."""
-    is_blank = np.frombuffer(b" " + text, dtype=np.uint8) <= ord(" ")
-    count = np.count_nonzero(is_blank[:-1] & ~is_blank[1:])
+    if not text.strip():
+        return np.zeros(0, dtype)
     with warnings.catch_warnings():
-        # NumPy stops with a warning at a word that is no number.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        numbers: np.ndarray = np.fromstring(text, dtype, sep=" ")
-    if len(numbers) != count:
-        raise ValueError(f"number {len(numbers) + 1} of {count} is damaged: export the file again")
-    return numbers
+        # NumPy stops at a word that is no number, with a warning or, in new versions, an error.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, dtype, sep=" ")
+        except (ValueError, DeprecationWarning) as error:
+            raise ValueError("a word is not a number: export the file again") from error
 
 
 def words_per_line(text: bytes) -> np.ndarray:
