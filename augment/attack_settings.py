@@ -137,7 +137,7 @@ class AttackSettings(ParameterSettings):
         2.0,
         "Stop an example when, in every view, the logit gap is at least this large: the target "
         "logit minus the largest other logit or, without a target, the largest other logit minus "
-        "the logit of the true class.",
+        "the logit of the true class. Its unit is that of the classifier's logits.",
         minimum=0,
         maximum=MAX_SCALE,
     )
@@ -154,7 +154,8 @@ class AttackSettings(ParameterSettings):
         None,
         "Continue with an example until sensor noise changes its logit gap little: the smallest "
         "gap, with noise and without, must be this many times the range of the gaps. null is 2 if "
-        "the pose or the material is attacked, and otherwise 0.",
+        "the pose or the material is attacked, or if log-odds exceed 50 and `margin` is not 0. "
+        "Otherwise it is 0.",
         minimum=0,
         maximum=MAX_SCALE,
     )
@@ -237,6 +238,16 @@ class AttackSettings(ParameterSettings):
             return self.noise_margin
         needed = any(settings.needs_noise_margin for settings in self.parameters.values())
         return NOISE_MARGIN if needed else 0.0
+
+    @property
+    def overconfident_noise_margin(self) -> float:
+        """Return the number that `noise_margin` stands for where a classifier is overconfident.
+
+        A margin of 2 is less there than the change of the logits by the noise.
+        """
+        if self.noise_margin is None and self.sensor_noise and self.margin:
+            return NOISE_MARGIN
+        return self.applied_noise_margin
 
     def require_parameters(self) -> None:
         """Check that the attack changes something.

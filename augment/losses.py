@@ -16,12 +16,17 @@ from renderer.errors import require_range
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
 # all labels.
 NO_CLASS = -(10**9)
+# A network is overconfident where its log-odds exceed this number. Networks rarely do so, unless
+# their logits are multiplied by a factor.
+OVERCONFIDENT = 50.0
 
 
 def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
     """Compute the cost that an attack decreases.
 
-    It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy.
+    It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy. Without a target,
+    the cost and its gradient round to 0 if the log-odds o of the source are large. Where they
+    exceed 50, o − 50 is therefore added.
 
     Args:
         logits: Logits of N images, shape (N, classes).
@@ -38,31 +43,39 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
     """
     # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
     require_known(source.clamp(min=0), logits)
-    cost = _log_probability(logits, source)
+    odds = _log_odds(logits, source)
+    is_added = odds > OVERCONFIDENT
+    if target is not None:
+        is_added = is_added & (target == NO_CLASS)
+    cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
+    cost = torch.where(source == NO_CLASS, 0, cost)
     if target is not None:
         cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
     return cost
 
 
-def _log_probability(logits: Tensor, classes: Tensor) -> Tensor:
-    """Compute the logarithm of the probability of a class, which is minus the cross entropy.
+def _log_odds(logits: Tensor, classes: Tensor) -> Tensor:
+    """Compute the log-odds of a class of each image, where NO_CLASS stands for any class.
 
-    It is log σ(o), where σ is the logistic function and o are the log-odds of the class. Its
-    gradient is accurate even if the probability rounds to 1. The gradient of `cross_entropy` then
-    loses the term of the class.
+    Their log σ is the logarithm of the probability. Its gradient is accurate even if the
+    probability rounds to 1. The gradient of `cross_entropy` then loses the term of the class.
+    """
+    columns = torch.where(classes == NO_CLASS, 0, classes)[:, None]
+    other_logits = logits.scatter(1, columns, -torch.inf)
+    return logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
+
+
+def is_overconfident(logits: Tensor) -> Tensor:
+    """Return a mask of the images with a class of log-odds above 50 or below −50.
 
     Args:
-        logits: Logits of N images, shape (N, classes).
-        classes: Class of each image, int64, shape (N,). The result for NO_CLASS is 0.
+        logits: Logits of images in any number of dimensions, shape (..., classes).
 
     Returns:
-        Logarithms, shape (N,).
+        Mask, shape (...).
     """
-    is_class = classes != NO_CLASS
-    columns = torch.where(is_class, classes, 0)[:, None]
-    other_logits = logits.scatter(1, columns, -torch.inf)
-    odds = logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
-    return torch.where(is_class, F.logsigmoid(odds), 0)
+    lowest, highest = logits.aminmax(dim=-1)
+    return highest - lowest > OVERCONFIDENT
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:

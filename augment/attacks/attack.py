@@ -65,6 +65,10 @@ BALL_SIZE = 96
 ANIMATION_SUFFIXES = (".gif", ".webp")
 # Largest number of frames that `AttackResult.save_animation` writes.
 MAX_FRAME_COUNT = 1000
+# What `attack` and its checks say if gradient descent finds no direction.
+ZERO_GRADIENT = (
+    "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,16 +211,19 @@ class AttackResult(ShortRepr):
         """Light, shape, colors and pose of the E examples after the attack."""
         return self.problem.conditions(self.descent.values, self.problem.all_examples)
 
-    def plot(self, example: int = 0, view: int = 0) -> Figure:
+    def plot(self, example: int | None = None, view: int | None = None) -> Figure:
         """Draw a view of an example as a figure with four parts.
 
         The parts are the image before the attack, a white ball in the attacked
-        light, the image after the attack, and the most probable classes before
-        and after.
+        light, the image after the attack, and the probabilities of the true
+        class and of the most probable classes before and after.
 
         Args:
-            example: Index of the example.
-            view: Index of the view.
+            example: Index of the example. None for the first one with a view
+                that was correct before the attack and that the attack fooled.
+                If there is none, it is the first that was correct before, or
+                else 0.
+            view: Index of the view. None chooses it in the same way.
 
         Returns:
             Figure of matplotlib. `figure.savefig(path)` writes it.
@@ -227,7 +234,7 @@ class AttackResult(ShortRepr):
         # Importing matplotlib takes half a second.
         from augment.attacks.plots import draw_attack
 
-        self._require_view(example, view)
+        example, view = self._shown_view(example, view)
         conditions = self.conditions
         basis = self.problem.scene.basis_under(conditions, example)
         before = self.logits_in_views_before[example, view].softmax(0)
@@ -239,7 +246,25 @@ class AttackResult(ShortRepr):
             before.cpu(),
             after.cpu(),
             self.classifier.classes,
+            int(self.criterion.source[example, view]),
         )
+
+    def _shown_view(self, example: int | None, view: int | None) -> tuple[int, int]:
+        """Return an example and a view, where None is replaced by what shows the attack best."""
+        example_count, view_count = self.images_in_views.shape[:2]
+        if example is not None:
+            _require_index("example", example, example_count)
+        if view is not None:
+            _require_index("view", view, view_count)
+        was_correct = self.logits_in_views_before.argmax(2) == self.criterion.source
+        # 2 for views that the attack turned from correct to wrong, 1 for others that were correct.
+        scores = was_correct * (1 + self.success_in_views.to(was_correct.device).int())
+        rows = slice(None) if example is None else example
+        columns = slice(None) if view is None else view
+        # Views that are not chosen from have a score of -1.
+        chosen = torch.full_like(scores, -1)
+        chosen[rows, columns] = scores[rows, columns]
+        return divmod(int(chosen.argmax()), view_count)
 
     def save_animation(
         self, path: str | Path, example: int = 0, view: int = 0, frame_count: int = 20
@@ -279,7 +304,7 @@ class AttackResult(ShortRepr):
         """
         path = as_path("path", path)
         require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
-        self._require_view(example, view)
+        example, view = self._shown_view(example, view)
         require_whole("frame_count", frame_count)
         require_range("frame_count", frame_count, 2, MAX_FRAME_COUNT)
         fractions = [index / (frame_count - 1) for index in range(frame_count)]
@@ -342,14 +367,8 @@ class AttackResult(ShortRepr):
         basis = self.problem.scene.basis_under(conditions, 0)
         return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
 
-    def _require_view(self, example: int, view: int) -> None:
-        """Raise InputError unless `example` and `view` are indices of the result."""
-        example_count, view_count = self.images_in_views.shape[:2]
-        _require_index("example", example, example_count)
-        _require_index("view", view, view_count)
-
     def _repr_png_(self) -> bytes:
-        """Return a PNG file of the first view of the first example. Notebooks display it."""
+        """Return `plot()` as a PNG file. Notebooks display it."""
         content = BytesIO()
         self.plot().savefig(content, format="png")
         return content.getvalue()
@@ -520,6 +539,9 @@ def _attack(
         restarts = random_starts(problem, settings.restarts, seed)
         descent = descend(model, problem, criterion, settings, phases, restarts=restarts, seed=seed)
         images = final_images(problem, descent.values, problem.all_examples, descent.images)
+
+    if descent.zero_gradient.any():
+        warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
     logits = logits_of(model, images, settings.batch_size)
     success_in_views = fooled_in_views(

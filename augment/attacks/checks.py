@@ -14,6 +14,7 @@ from torch import Tensor
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.attack import (
+    ZERO_GRADIENT,
     AttackResult,
     final_images,
     fooled_in_views,
@@ -148,7 +149,7 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
     if checks["cost_fell"] < 1:
         reasons.append("the attack did not lower the cost of some examples")
     if checks["zero_gradient"] > 0:
-        reasons.append("the first gradient of some examples is exactly zero")
+        reasons.append(ZERO_GRADIENT)
     return reasons
 
 

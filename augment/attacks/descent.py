@@ -21,9 +21,11 @@ undone and tried again at half its length.
 One forward and backward pass of the classifier gives the cost, its gradient and
 the predictions. An example succeeds when the predictions reach its criterion in
 every view. It is finished when the logit gap (`augment.losses.logit_gap`) is
-also at least `AttackSettings.margin` in every view and, if the settings ask for
-it, larger than its changes by the noise of a sensor. Until then it stays active:
-it takes further steps, and its successful values of lowest cost are kept.
+also at least `AttackSettings.margin` in every view. If the settings ask for it,
+or if the classifier is overconfident (`augment.losses.is_overconfident`), the gap
+must also be larger than its changes by the noise of a sensor. Until then the
+example stays active: it takes further steps, and its successful values of lowest
+cost are kept.
 Whether a success counts is decided after the descent
 (`augment.attacks.attack.fooled_in_views`).
 """
@@ -39,10 +41,13 @@ import torch
 from torch import Tensor, nn
 
 from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, add_sensor_noise
-from augment.losses import NO_CLASS, adversarial_cost, logit_gap
+from augment.losses import NO_CLASS, adversarial_cost, is_overconfident, logit_gap
 from augment.model_passes import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
 from renderer.short_repr import ShortRepr
+
+# Gradients below this number are not scaled before they enter the network.
+MIN_GRADIENT = 1e-30
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -454,15 +459,16 @@ class Descent:
         logits = self.model(batch).to(batch.dtype)
         expected_logits = self.expectation(self.model, batch, logits)
         cost = adversarial_cost(expected_logits, classes.source, classes.target)
-        (batch_gradient,) = torch.autograd.grad(cost.sum(), batch)
+        (logit_gradient,) = torch.autograd.grad(cost.sum(), expected_logits)
+        # The gradient of a confident prediction is so small that it would round to zero in a
+        # network of half precision. A factor that is a power of two changes no other digits.
+        largest = logit_gradient.abs().amax(1, keepdim=True).clamp(min=MIN_GRADIENT)
+        power = largest / torch.frexp(largest).mantissa
+        (batch_gradient,) = torch.autograd.grad(expected_logits, batch, logit_gradient / power)
         # The network may return its gradient in another memory layout. The copy has the
         # layout of the images.
-        all_gradients[batch_rows] = batch_gradient
-        return Score(
-            cost=cost.detach(),
-            gap=logit_gap(expected_logits.detach(), classes.source, classes.target),
-            predicted=logits.detach().argmax(1),
-        )
+        all_gradients[batch_rows] = batch_gradient * power[:, :, None, None]
+        return Score.of_logits(cost.detach(), logits.detach(), expected_logits.detach(), classes)
 
     def _decide(self, state: State, evaluation: Evaluation) -> Decision:
         """Decide what happens to the candidates of the active examples.
@@ -479,7 +485,7 @@ class Descent:
         is_success = evaluation.is_criterion_met
         cost = evaluation.score.cost
         is_finished = is_success & (evaluation.score.gap >= self.settings.margin)
-        if self.settings.applied_noise_margin:
+        if self.settings.overconfident_noise_margin:
             is_finished = self._finished_despite_noise(is_finished, state, evaluation)
         is_accepted = is_finished | self._is_accepted(state, evaluation)
         # An example without a success takes each accepted candidate as its result. An
@@ -517,28 +523,38 @@ class Descent:
     ) -> Tensor:
         """Return a mask of the finished examples that remain successes with sensor noise.
 
-        The images that the classifier sees for this are counted as queries.
+        Only examples with a noise margin are checked. The images that the classifier sees for this
+        are counted as queries.
 
         Args:
             is_finished: Mask of the active examples that are finished if noise is
                 ignored, shape (N,).
             state: State of the descent, with N active examples.
-            evaluation: Images of the N candidates.
+            evaluation: Images and scores of the N candidates.
 
         Returns:
             Mask of the active examples, shape (N,).
         """
-        # Indices of the finished examples among the N active examples.
-        finished = is_finished.nonzero()[:, 0]
-        rows = state.active_rows[finished]
+        has_margin = self._noise_margin(evaluation.score.is_overconfident) > 0
+        # Indices of the checked examples among the N active examples.
+        checked = (is_finished & has_margin).nonzero()[:, 0]
+        rows = state.active_rows[checked]
         state.result.queries[rows] += NOISE_DRAWS * evaluation.images.shape[1]
         with self.phases("attack_classifier"):
             is_robust = self._is_robust_to_noise(
-                evaluation.images[finished],
+                evaluation.images[checked],
                 state.examples[rows],
                 state.criterion.select(rows),
             )
-        return is_finished.index_copy(0, finished, is_robust)
+        return is_finished.index_copy(0, checked, is_robust)
+
+    def _noise_margin(self, is_overconfident: Tensor) -> Tensor:
+        """Return how many times the range of the gaps with noise the smallest gap must be."""
+        return torch.where(
+            is_overconfident,
+            self.settings.overconfident_noise_margin,
+            self.settings.applied_noise_margin,
+        )
 
     @torch.no_grad()
     def _is_robust_to_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
@@ -546,10 +562,9 @@ class Descent:
 
         The logit gap tells by how much a view reaches the criterion. It is
         computed without noise and with several draws of noise. In every view,
-        the smallest of these gaps must be at least
-        `AttackSettings.applied_noise_margin` times the difference between the
-        largest and the smallest. This noise differs from the noise that later
-        decides whether a success counts.
+        the smallest of these gaps must be at least `_noise_margin` times the
+        difference between the largest and the smallest. This noise differs from
+        the noise that later decides whether a success counts.
 
         Args:
             images: Images of V views of the A examples, shape (A, V, 3, H, W).
@@ -569,15 +584,17 @@ class Descent:
             "noise margin",
         )
         gaps = []
+        overconfident = []
         for version in (images, *noisy_versions):
             batches = version.flatten(0, 1).split(self.settings.batch_size)
             logits = torch.cat([self.model(batch) for batch in batches])
             logits_of_views = logits.unflatten(0, version.shape[:2])
             gaps.append(logit_gap(logits_of_views, criterion.source, criterion.target))
+            overconfident.append(is_overconfident(logits_of_views))
         # Smallest and largest logit gap of each view, each of shape (A, V).
         smallest, largest = torch.stack(gaps).aminmax(dim=0)
-        needed_gap = self.settings.applied_noise_margin * (largest - smallest)
-        return (smallest >= needed_gap).all(1)
+        noise_margin = self._noise_margin(torch.stack(overconfident).any(0))
+        return (smallest >= noise_margin * (largest - smallest)).all(1)
 
     def _step(self, state: State) -> None:
         """Compute the next candidate of each active example by a step along its gradient.
@@ -612,11 +629,33 @@ class Score:
         predicted: Predicted classes of the images before any random
             transformation. Shape (N, V) for examples with V views, (N,) for
             single images.
+        is_overconfident: Mask, shape (N,), see `augment.losses.is_overconfident`. For an
+            example, it is whether any of its views is.
     """
 
     cost: Tensor
     gap: Tensor
     predicted: Tensor
+    is_overconfident: Tensor
+
+    @classmethod
+    def of_logits(
+        cls, cost: Tensor, logits: Tensor, expected_logits: Tensor, classes: Criterion
+    ) -> Score:
+        """Return the scores of N images.
+
+        Args:
+            cost: Cost of each image.
+            logits: Logits of the images, shape (N, C).
+            expected_logits: Logits averaged over random transformations of the images.
+            classes: Source and target class of each image.
+        """
+        return cls(
+            cost=cost,
+            gap=logit_gap(expected_logits, classes.source, classes.target),
+            predicted=logits.argmax(1),
+            is_overconfident=is_overconfident(expected_logits),
+        )
 
     @classmethod
     def of_examples(cls, batches: Sequence[Score], view_count: int) -> Score:
@@ -634,7 +673,17 @@ class Score:
         cost = torch.cat([score.cost for score in batches]).unflatten(0, (-1, view_count))
         gap = torch.cat([score.gap for score in batches]).unflatten(0, (-1, view_count))
         predicted = torch.cat([score.predicted for score in batches]).unflatten(0, (-1, view_count))
-        return cls(cost=cost.sum(1), gap=gap.amin(1), predicted=predicted)
+        is_extreme = torch.cat([score.is_overconfident for score in batches])
+        return cls(
+            cost=cost.sum(1),
+            gap=gap.amin(1),
+            predicted=predicted,
+            is_overconfident=is_extreme.unflatten(0, (-1, view_count)).any(1),
+        )
+
+    def select(self, rows: Tensor) -> Score:
+        """Return the scores of some of the examples or images."""
+        return Score(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.descent import Criterion, Descent, DescentResult, Evaluation, Score, State
-from augment.losses import adversarial_cost, logit_gap
+from augment.losses import adversarial_cost
 from augment.model_passes import BatchSize
 from augment.random_streams import generator
 
@@ -88,7 +88,7 @@ class GradientFree(Descent):
         return Evaluation(
             values=all_candidates[best],
             images=images[best],
-            score=Score(score.cost[best], score.gap[best], score.predicted[best]),
+            score=score.select(best),
             is_criterion_met=is_met[best],
             candidate_count=count,
         )
@@ -171,11 +171,8 @@ class GradientFree(Descent):
         # The network may compute in half precision.
         logits = self.model(batch).to(batch.dtype)
         expected_logits = self.expectation(self.model, batch, logits)
-        return Score(
-            cost=adversarial_cost(expected_logits, classes.source, classes.target),
-            gap=logit_gap(expected_logits, classes.source, classes.target),
-            predicted=logits.argmax(1),
-        )
+        cost = adversarial_cost(expected_logits, classes.source, classes.target)
+        return Score.of_logits(cost, logits, expected_logits, classes)
 
     def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
         """Return a mask of the candidates that lower the cost of their examples, shape (N,).

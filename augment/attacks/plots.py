@@ -25,6 +25,7 @@ def draw_attack(
     probabilities_before: Tensor,
     probabilities_after: Tensor,
     classes: Sequence[str],
+    true_class: int,
 ) -> Figure:
     """Draw one view before and after an attack, with the light and the most probable classes.
 
@@ -35,6 +36,7 @@ def draw_attack(
         probabilities_before: Probability of each class before the attack, shape (C,).
         probabilities_after: Probability of each class after the attack, shape (C,).
         classes: Names of the C classes.
+        true_class: Index of the class that the images show.
 
     Returns:
         The figure. `figure.savefig(path)` writes it.
@@ -46,7 +48,7 @@ def draw_attack(
     _show(axes_before, before, f"before: {_most_probable(probabilities_before, classes)}")
     _show(axes_light, ball, "light after the attack")
     _show(axes_after, after, f"after: {_most_probable(probabilities_after, classes)}")
-    _draw_probabilities(axes_bars, probabilities_before, probabilities_after, classes)
+    _draw_probabilities(axes_bars, probabilities_before, probabilities_after, classes, true_class)
     return figure
 
 
@@ -76,18 +78,23 @@ def _most_probable(probabilities: Tensor, classes: Sequence[str]) -> str:
     return f"{classes[int(index)]} {float(probability):.0%}"
 
 
-def _draw_probabilities(axes: Axes, before: Tensor, after: Tensor, classes: Sequence[str]) -> None:
-    """Draw the probabilities of the most probable classes as pairs of bars.
+def _draw_probabilities(
+    axes: Axes, before: Tensor, after: Tensor, classes: Sequence[str], true_class: int
+) -> None:
+    """Draw the probabilities of the true class and the most probable classes as pairs of bars.
 
     Args:
         axes: Part of the figure to draw in.
         before: Probability of each class before the attack, shape (C,).
         after: Probability of each class after the attack, shape (C,).
         classes: Names of the C classes.
+        true_class: Index of the true class, which is always shown.
     """
     shown_count = min(SHOWN_CLASSES, len(classes))
     # Order the classes by the larger of their two probabilities.
     by_probability = before.maximum(after).topk(shown_count).indices
+    if true_class not in by_probability:
+        by_probability[-1] = true_class
     # matplotlib draws bars from the bottom to the top, so the most probable class comes last.
     ranked = by_probability.flip(0)
     names = [classes[index] for index in ranked.tolist()]

@@ -33,18 +33,35 @@ def test_a_complementary_label_costs_the_negative_log_probability_of_all_other_c
     torch.testing.assert_close(loss, expected, rtol=0, atol=32 * EPS)
 
 
-@pytest.mark.parametrize("gap", [0, 5, 17, 30, 80])
+@pytest.mark.parametrize("gap", [0, 5, 17, 30, 48])
 def test_the_gradient_in_float32_is_exact_if_the_network_is_certain(gap):
     logits = torch.tensor([[0.5, 2.0 + gap, 2.0, 0.0]], requires_grad=True)
     probabilities = torch.from_numpy(softmax(logits.detach().double().numpy(), axis=1))
-    # The gradient of log p is onehot − softmax. Float64 rounds 1 − p to 0 at a gap of 80, but not
+    # The gradient of log p is onehot − softmax. Float64 rounds 1 − p to 0 at a gap of 48, but not
     # the equal sum of the other probabilities.
     expected = -probabilities
     expected[0, 1] = probabilities[0, [0, 2, 3]].sum()
     adversarial_cost(logits, torch.tensor([1]), torch.tensor([NO_CLASS])).sum().backward()
-    # The difference of two logits has an error of up to 82 / 2 · ε, which the exponential keeps.
-    rtol = 82 * torch.finfo(torch.float32).eps
+    # The difference of two logits has an error of up to 50 / 2 · ε, which the exponential keeps.
+    rtol = 50 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(logits.grad.double(), expected, rtol=rtol, atol=0)
+
+
+@pytest.mark.parametrize("factor", [100, 1e4])
+def test_the_gradient_of_an_overconfident_network_is_that_of_its_log_odds(factor):
+    """The other class of the largest logit has all probability that the source does not have."""
+    logits = factor * torch.tensor([[0.5, 4.0, 2.0, 0.0]])
+    logits.requires_grad_(True)
+    adversarial_cost(logits, torch.tensor([1])).sum().backward()
+    assert logits.grad.tolist() == [[0.0, 1.0, -1.0, 0.0]]
+
+
+def test_the_cost_grows_with_the_log_odds_on_both_sides_of_50():
+    odds = torch.tensor([40.0, 49.9, 50.0, 50.1, 104.0, 1e5])
+    logits = torch.stack([odds, torch.zeros_like(odds)], dim=1)
+    cost = adversarial_cost(logits, torch.zeros(len(odds), dtype=torch.int64))
+    assert (cost.diff() > 0).all()
+    torch.testing.assert_close(cost[:3], torch.nn.functional.logsigmoid(odds[:3]), rtol=0, atol=0)
 
 
 def test_label_smoothing_leaves_complementary_labels_as_they_are():
