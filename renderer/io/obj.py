@@ -29,6 +29,9 @@ _IGNORED = {"l", "p", "s", "vp", "lod", "mg", "bevel", "c_interp", "d_interp", "
 _REFUSED_PROPERTIES = {"map_d", "map_tr", "disp", "decal"}
 # Successive lines with the same keyword.
 _BLOCK = re.compile(rb"[ \t]*(\S+)[^\n]*\n(?:[ \t]*\1(?=\s)[^\n]*\n)*")
+# Comment of ZBrush with the colors of vertices. Each is a
+# mask, red, green and blue in two hexadecimal digits each.
+_POLYPAINT = re.compile(rb"^#MRGB[ \t]+((?:[0-9a-fA-F]{8})+)", re.MULTILINE)
 # Option of a texture, with its values.
 _OPTION = re.compile(
     r"(-[a-z]+)\s+((?:on|off|[rgbmlz])\s+|(?:[-+]?[\d.]+(?:e[-+]?\d+)?\s+){1,3})(.*)", re.IGNORECASE
@@ -196,6 +199,11 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
     if (table[counts == 4, 3] != 1).any():
         raise ValueError("vertices with a weight other than 1 are not supported")
     is_colored = counts == 6
+    painted = bytes.fromhex(b"".join(_POLYPAINT.findall(file.content)).decode())
+    if painted and not is_colored.any():
+        if len(painted) != 4 * len(table):
+            raise ValueError("the colors in comments #MRGB are not one for each vertex")
+        return table[:, :3], np.frombuffer(painted, np.uint8).reshape(-1, 4)[:, 1:] / 255
     if not is_colored.any():
         return table[:, :3], None
     colors = np.ones((len(table), 3))

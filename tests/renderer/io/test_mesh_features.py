@@ -137,6 +137,8 @@ ROWS = [
     Row("obj", "vt for some corners", obj(face="f 1/1 2 3//1"), WHITE),
     Row("obj", "vertex colors", obj(vertex="1 0 0"), RED),
     Row("obj", "vertex colors and vt", obj(vertex="1 0 0", face=TEXTURED), RED),
+    Row("obj", "polypaint", obj("#MRGB ffff0000ffff0000\n#MRGB 00ff0000"), RED),
+    Row("obj", "polypaint of two vertices", obj("#MRGB ffff0000ffff0000"), REFUSED),
     Row("obj", "weight 1", obj(vertex="1"), WHITE),
     Row("obj", "weight", obj(vertex="2"), REFUSED),
     Row("obj", "color and weight", obj(vertex="1 1 0 0"), REFUSED),
