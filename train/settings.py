@@ -58,10 +58,12 @@ NEEDS_INITIAL_NETWORK = (
 # Value of train.freeze with which only the last layer is trained, as by Kirichenko
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
+# Value of data.name for photographs without classes.
+UNLABELLED = "unlabelled"
 # Choices of data.name.
-DATA_SETS = ("cifar100", "npz", "folder", "unlabelled", "shapes")
+DATA_SETS = ("cifar100", "npz", "folder", UNLABELLED, "shapes")
 # Values of data.name that need data.path.
-DATA_SETS_WITH_PATH = ("npz", "folder", "unlabelled")
+DATA_SETS_WITH_PATH = ("npz", "folder", UNLABELLED)
 # Choices of train.schedule.
 SCHEDULES = ("step", "cosine", "one_cycle")
 # Choices of train.flips.

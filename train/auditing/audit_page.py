@@ -27,6 +27,7 @@ from train.auditing.relit_audit import relit_sections
 from train.auditing.remedies import (
     CLASSIFIER,
     HARDENING,
+    NEXT_HARDENING,
     NORMALIZED,
     Recommendation,
     recommend,
@@ -54,6 +55,7 @@ from train.runs.run_config import CONFIG, read_config, read_json
 # Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {
     "No": "It is not safe under unusual lighting.",
+    "Perhaps not": "It may not be safe under unusual lighting; so few views show little.",
     "Unknown": "It is unknown whether it is safe.",
 }
 # Names of the two folders of test images, and of the subfolders with their scores.
@@ -69,6 +71,8 @@ PLAIN = "plain_light.json"
 TRANSFER = "transfer.json"
 # JavaScript of the slider that moves a light from natural to attacked.
 SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
+# With fewer views that an attack could lose, attacks and renders alone decide nothing.
+MIN_VIEWS = 6
 # Number of images in a gallery of the worst predictions.
 WORST = 10
 # A network is called safe only if it classifies at least this fraction of the images
@@ -145,6 +149,8 @@ def write_audit_page(
             # The top of the report shows the gain by hardening already.
             sentence = recommendation.advice
         screen = replace(screen, sentences=[*screen.sentences, sentence])
+    elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
+        screen = replace(screen, sentences=[*screen.sentences, NEXT_HARDENING])
     last_folder = list(results.values())[-1]
     path = write_page(
         out,
@@ -419,10 +425,15 @@ def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -
     if not any(any(views) for views in read_json(folder / RECOGNIZED).values()):
         question = f"Is {name} safe under unusual lighting?"
         return f"{question} Unknown: it does not recognize {label} in plain light, either."
-    findings = _find_rates(label, folder, images)
+    of_renders, of_images = _find_rates(label, folder, images)
+    findings = [*of_renders, *of_images]
     faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
     faults += _attack_faults(folder)
-    if faults:
+    view_count = max(read_json(folder / f"{kind}.json")["correct"] for kind in KINDS)
+    rests_on_images = any(finding.right < PASS_THRESHOLD for finding in of_images)
+    if faults and not rests_on_images and view_count < MIN_VIEWS:
+        answer = f"Perhaps not: {'; '.join(faults)}. Only {view_count} views were attacked."
+    elif faults:
         answer = f"No: {'; '.join(faults)}."
     elif images and all(finding.least >= PASS_THRESHOLD for finding in findings):
         answer = "Yes, as far as this audit looks."
@@ -431,7 +442,9 @@ def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -
     return f"Is {name} safe under unusual lighting? {answer}"
 
 
-def _find_rates(label: str, folder: Path, images: Collection[str]) -> list[Finding]:
+def _find_rates(
+    label: str, folder: Path, images: Collection[str]
+) -> tuple[list[Finding], list[Finding]]:
     """Find what fraction of the renders and test images a network classifies correctly.
 
     Args:
@@ -441,12 +454,13 @@ def _find_rates(label: str, folder: Path, images: Collection[str]) -> list[Findi
             "photographs", both or none.
 
     Returns:
-        Findings about renders in environment lighting, about renders in random
-        lighting, and about recall and false positives on each folder of test
+        Two lists: findings about renders in environment lighting and in random
+        lighting; and about recall and false positives on each folder of test
         images. Unknown fractions are left out.
     """
     rates = _rates(read_json(folder / RECOGNIZED))
-    findings = [_recognized(subject, rate) for subject, rate in rates.items()]
+    of_renders = [_recognized(subject, rate) for subject, rate in rates.items()]
+    findings = []
     for name in images:
         scores = read_json(folder / name / SUMMARY)
         recall = read_metric(scores, "recall")
@@ -454,6 +468,11 @@ def _find_rates(label: str, folder: Path, images: Collection[str]) -> list[Findi
         false_positive_rate = read_metric(scores, "false_positive_rate")
         subject = f"other objects for {label} in the {IN_WORDS[name]}"
         findings.append(_not_mistaken(subject, false_positive_rate))
+    return _known(of_renders), _known(findings)
+
+
+def _known(findings: Sequence[Finding | None]) -> list[Finding]:
+    """Return the findings that are known."""
     return [finding for finding in findings if finding is not None]
 
 

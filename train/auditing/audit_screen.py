@@ -124,8 +124,9 @@ def screen_of_one(
         remaining = fraction(remaining_count, correct_count)
         numbers.append(ShownMetric(title, "higher is better", before=None, after=remaining))
         sentences.append(
-            f"If an attacker controls {KINDS[kind].title}, it still recognizes {remaining_count} "
-            f"of the {correct_count} views that it recognizes before the attack."
+            f"If an attacker controls {KINDS[kind].title} (radius {KINDS[kind].radii[-1]:g}), it "
+            f"still recognizes {remaining_count} of the {correct_count} views that it recognizes "
+            "before the attack."
         )
     false_positive_rate = pool.metrics.false_positive_rate if pool else None
     if false_positive_rate is not None and false_positive_rate.value is not None:
@@ -188,7 +189,8 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
         alt_text = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
         for picture in plots.from_file(path, alt_text, PAIR_WIDTH):
             lost = f"{counts[kind]['adversarial'][-1]} of {counts[kind]['correct']} views lost"
-            compared.append(ComparedImage(picture, f"{light.title}: {lost}", *answers))
+            caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
+            compared.append(ComparedImage(picture, caption, *answers))
     return compared
 
 

@@ -28,11 +28,19 @@ BOTH = "hardening and normalized light"
 # What a user does for each remedy.
 CHECK = "Choose its threshold and check it on your own photographs first."
 ADVICE = {
-    ORIGINAL: "Recommended: the original network, unchanged.",
+    ORIGINAL: "Keep the original network: no remedy that was tested is proven to help.",
     LIGHT_ALONE: "Recommended: the network as it is, with normalize_light=true.",
     HARDENING: f"Recommended: the hardened network. {CHECK}",
     BOTH: f"Recommended: the hardened network, with normalize_light=true. {CHECK}",
 }
+# What a user does next if no remedy helps: without and with a hardened network.
+NEXT_HARDENING = (
+    "Next: harden it (pnb-train experiment=classifier), and audit both with hardened=run:FOLDER."
+)
+NEXT_DATA = (
+    "Next: harden with more meshes of the class and photographs of the place of use, and audit "
+    "again."
+)
 # Remedies are compared by top-1 accuracy if there are several positive classes.
 TOP1 = "class_top1"
 
@@ -131,7 +139,8 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     title = metric_title(metric)
     gain = gains.get(chosen)
     if gain is None:
-        reason = f"No gain in {title} is proven for: {', '.join(remedies)}."
+        reason = f"No gain in {title} is proven for: {', '.join(remedies)}. "
+        reason += NEXT_DATA if {HARDENING, BOTH} & {*remedies} else NEXT_HARDENING
     else:
         reason = gain_sentence(f"With {chosen}, {title}", gain)
     rows = []

@@ -35,6 +35,7 @@ from train.report.summary import (
     RunSummary,
     Scored,
     ScoredRun,
+    accuracy_title,
     group_by_images,
     group_by_method,
     label_title,
@@ -581,7 +582,8 @@ def format_short_comparison(
         values = [_format_value(metric) for metric in (_mean_accuracy(runs_of_method), *metrics)]
         gain = _format_gain(evaluations, method)
         rows.append([method, len(runs_of_method), *values, gain])
-    header = ["network", "runs", "test accuracy", *map(metric_title, SHORT_METRICS)]
+    every_run = [run for runs_of_method in methods.values() for run in runs_of_method]
+    header = ["network", "runs", accuracy_title(every_run), *map(metric_title, SHORT_METRICS)]
     return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
 
 

@@ -620,7 +620,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     try:
         evaluations = compare.read_evaluations(group)
         if evaluations:
-            rocs = _plot_rocs(evaluations)
+            rocs = _plot_rocs(evaluations, title)
             tables += _evaluation_tables(evaluations)
             tables.append(compare.class_table(group))
     except InputError as error:
@@ -634,11 +634,12 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     }
 
 
-def _plot_rocs(methods: compare.Evaluations) -> list[Picture | None]:
+def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None]:
     """Plot the ROC curves of all methods.
 
     Args:
         methods: Evaluations of each method on the same images.
+        images: Title of these images.
 
     Returns:
         A plot for all images and, if there are several positive classes, a plot
@@ -646,6 +647,7 @@ def _plot_rocs(methods: compare.Evaluations) -> list[Picture | None]:
         negative images.
     """
     first_evaluation = next(iter(methods.values()))[0]
+    name = images.partition(":")[0]
     pictures = []
     for subset, pool in first_evaluation.pools.items():
         if not subset.is_overall:
@@ -653,7 +655,7 @@ def _plot_rocs(methods: compare.Evaluations) -> list[Picture | None]:
         scores = {}
         for method, evaluations in methods.items():
             scores[method] = [evaluation.pools[subset].scores for evaluation in evaluations]
-        pictures.append(plots.roc(scores, pool.label))
+        pictures.append(plots.roc(scores, f"{pool.label}, {name}"))
     return pictures
 
 

@@ -28,7 +28,7 @@ from train.runs import checkpoint, run_config, run_lock, run_log
 from train.runs.run_config import CONFIG, read_config, read_json
 from train.runs.run_log import BEFORE, PHASES, read_metrics
 from train.runs.saved_networks import PUBLISHED, load_selected
-from train.settings import label_names, published
+from train.settings import UNLABELLED, label_names, published
 
 # Methods are named by numbers instead of by their settings if there are more than this.
 MAX_NAMED = 30
@@ -583,7 +583,17 @@ def _accuracy_table(methods: Methods) -> Table:
     # A dictionary has each name once, in the order of the runs.
     names = dict.fromkeys(name for name in test_images if name)
     title = " or ".join(f"accuracy on {name}" for name in names)
-    return _run_table(title, ["test accuracy", "of the last epoch"], lines)
+    every_run = [run for runs in methods.values() for run in runs]
+    return _run_table(title, [accuracy_title(every_run), "of the last epoch"], lines)
+
+
+def accuracy_title(runs: Sequence[RunSummary]) -> str:
+    """Return the title of the column with the accuracy of runs on their test images.
+
+    Images without labels are labeled with the predictions of the network before the training.
+    """
+    names = {run.config.get("data", {}).get("name") for run in runs if run.config}
+    return "agreement with the original" if names == {UNLABELLED} else "test accuracy"
 
 
 def score_table(title: str, group: Scored) -> Table:

@@ -192,7 +192,7 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(audit, "SETUPS", 1)
     monkeypatch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
-    monkeypatch.setattr(audit, "load_network", CLASSIFIERS.__getitem__)
+    monkeypatch.setattr(audit, "load_network", lambda name, **_: CLASSIFIERS[name])
     monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.classifier])
     return {
         "classifier": "dark",
@@ -388,6 +388,16 @@ def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
     answer,
 ):
     write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
+    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
+    assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
+
+
+@pytest.mark.parametrize(
+    ("hits", "n", "answer"), [(9, 9, "Perhaps not: an attack"), (200, 400, "No: it recognizes")]
+)
+def test_a_few_attacked_views_alone_do_not_make_a_headline(tmp_path, hits, n, answer):
+    """Four views are attacked, and all of them are lost. The images of the second case decide."""
+    write_parts(tmp_path, hits, n, adversarial=[0, 0, 4, 4])
     text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
 
