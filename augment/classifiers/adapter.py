@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_forward_pre_hook
 
 from augment.classifiers.normalized_light import normalize_light
 from augment.losses import log_odds
@@ -548,6 +549,31 @@ class AnyFunction(Wrapper):
         # The first call has found out what the function takes.
         if self.call is not None:
             return self.call(images)
+        in_training: list[str] = []
+
+        def note(module: nn.Module, _: object) -> None:
+            # Transformations of images are modules in training mode, too, but have no weights.
+            has_weights = any(True for _ in module.parameters(recurse=False))
+            if module.training and (
+                has_weights or isinstance(module, nn.modules.dropout._DropoutNd)
+            ):
+                in_training.append(type(module).__name__)
+
+        hook = register_module_forward_pre_hook(note)
+        try:
+            scores = self._first_call(images)
+        finally:
+            hook.remove()
+        if in_training:
+            self.call = None
+            raise InputError(
+                f"the function calls a network in training mode ({in_training[0]}): "
+                "call the method eval() of the network first"
+            )
+        return scores
+
+    def _first_call(self, images: Tensor) -> Tensor:
+        """Compute the scores (N, C) of images, and find out what the function takes."""
         failure = None
         try:
             scores = self.network(images)

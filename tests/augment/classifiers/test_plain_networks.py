@@ -1,5 +1,7 @@
 """A plain network is attacked as it is, after a check on gray images."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -191,3 +193,24 @@ def test_adversaries_are_shown_to_a_plain_network_as_to_its_classifier(network):
     [row] = augment.transfer(result, [network])
     assert row | {"network": ""} == expected | {"network": ""}
     assert all(parameter.requires_grad for parameter in network.parameters())
+
+
+class Calling:
+    """Object that calls a network."""
+
+    def __init__(self, network: nn.Module):
+        self.network = network
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        return self.network(images)
+
+
+@pytest.mark.parametrize("layer", [nn.BatchNorm2d(3), nn.Dropout(0.5)])
+@pytest.mark.parametrize(
+    "wrap", [Calling, lambda network: partial(network.forward), nn.Module.__call__.__get__]
+)
+def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
+    network = nn.Sequential(layer, nn.AdaptiveAvgPool2d(1), nn.Flatten()).train()
+    with pytest.raises(InputError, match=r"eval\(\)"):
+        as_classifier(wrap(network), size=8)
+    as_classifier(wrap(network.eval()), size=8)
