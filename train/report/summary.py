@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -272,7 +272,7 @@ def trained_labels(folder: Path) -> list[str]:
     except InputError:
         return []
     if "label" in run.settings:
-        return label_names(run.settings["label"])
+        return label_names(cast(Any, run.settings["label"]))
     scored = [[*scores.labels] for scores in run.photographs.values()]
     return scored[0] if scored else []
 
