@@ -25,6 +25,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,14 @@ from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.scores.metrics import (
+    Jackknife,
+    Units,
+    average,
+    change,
+    leave_out,
+    weighted_means,
+)
 from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
 
 TEST = "test"
@@ -121,7 +130,6 @@ SLIDES = 12
 SLIDE_SIZE = 512
 CELLS = 16
 BATCH = 64
-RESAMPLES = 2000
 
 
 # ---------------------------------------------------------------------------- make
@@ -395,11 +403,7 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
 
 
 def mean_with_interval(parts: Sequence[ScoredGroup], name: str, other: str | None) -> Estimate:
-    """Return a mean over groups with its 95% bootstrap interval over objects, setups and seeds.
-
-    Objects, setups and seeds are drawn independently, and an image counts as
-    often as its object, its setup and its seed together (Owen 2007, "The
-    pigeonhole bootstrap").
+    """Return a mean over groups with its 95% interval over objects, setups and seeds.
 
     Args:
         parts: Groups of images with objects and setups of their own. They have
@@ -408,37 +412,28 @@ def mean_with_interval(parts: Sequence[ScoredGroup], name: str, other: str | Non
         other: Network whose hits are subtracted. None subtracts nothing. It has
             one seed, or as many seeds as the first network.
     """
-    means = []
-    resampled = []
-    for number, part in enumerate(parts):
-        values = part.hits[name] - (0 if other is None else part.hits[other])
-        seeds = np.arange(len(values))
-        # All groups have the same draws of the seeds.
-        seed_weights = draw_weights(seeds, np.random.default_rng(0))
-        rng = np.random.default_rng([1, number])
-        image_weights = draw_weights(part.objects, rng) * draw_weights(part.setups, rng)
-        sums = np.einsum("rs,rn,sn->r", seed_weights, image_weights, values)
-        # Each draw has as many seeds as there are. A draw may have no image.
-        with np.errstate(invalid="ignore"):
-            resampled.append(sums / (image_weights.sum(1) * len(seeds)))
-        means.append(values.mean())
-    low, high = np.nanquantile(np.mean(resampled, axis=0), [0.025, 0.975])
-    return Estimate(float(np.mean(means)), float(low), float(high))
+    runs = [leave_out_units(parts, name, seed) for seed in range(len(parts[0].hits[name]))]
+    if other is None:
+        return average(runs).estimate
+    others = [leave_out_units(parts, other, seed) for seed in range(len(parts[0].hits[other]))]
+    return change(runs, others * (len(runs) // len(others)))
 
 
-def draw_weights(units: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw as many units as there are with replacement, and count how often each was drawn.
-
-    Args:
-        units: Unit of each of N images, such as its object, shape (N,).
-        rng: Random number generator.
-
-    Returns:
-        How often the unit of each image was drawn, shape (RESAMPLES, N).
-    """
-    names, unit_of_image = np.unique(units, return_inverse=True)
-    chances = np.full(len(names), 1 / len(names))
-    return rng.multinomial(len(names), chances, size=RESAMPLES)[:, unit_of_image]
+def leave_out_units(parts: Sequence[ScoredGroup], name: str, seed: int) -> Jackknife:
+    """Return the mean accuracy over groups without each object, and without each setup."""
+    hits = [part.hits[name][[seed]] for part in parts]
+    value = float(np.mean([values.mean() for values in hits]))
+    without = []
+    counts = []
+    for part, values in zip(parts, hits, strict=True):
+        for names in (part.objects, part.setups):
+            unit_of_image = np.unique(names, return_inverse=True)[1]
+            units = Units([unit_of_image], "objects and setups")
+            (mean,) = leave_out(partial(weighted_means, values), units)
+            if mean.unit_count > 1:
+                without.append(value + (mean.without[0] - mean.value) / len(parts))
+                counts.append(mean.unit_count)
+    return Jackknife(value, without, min(counts), "objects and setups")
 
 
 def compare(parts: Sequence[ScoredGroup], control: str | None) -> list[str]:

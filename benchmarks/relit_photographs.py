@@ -7,7 +7,7 @@ The name of each photograph begins with the index of its class, such as
 
 A row of the table is a network, or the mean over the seeds of a training, whose
 networks are separated by commas. Differences are from the first row, and from the
-row `--control`, with 95% intervals of a bootstrap over photographs and seeds.
+row `--control`, with 95% intervals over photographs and seeds.
 """
 
 import argparse
@@ -185,22 +185,24 @@ def cell(columns: Tensor, first: Tensor, control: Tensor | None) -> str:
     """
     text = f"{columns.mean():.3f}"
     if (columns - first).any():
-        text += f", {format_interval(interval(columns - first), '+')}"
+        text += f", {format_interval(interval(columns, first), '+')}"
     if control is not None and (columns - control).any():
-        text += f" ({format_interval(interval(columns - control), '+')} over the control)"
+        text += f" ({format_interval(interval(columns, control), '+')} over the control)"
     return text
 
 
-def interval(values: Tensor) -> Estimate:
-    """Return a mean with its 95% interval, by a bootstrap over photographs and seeds.
+def interval(columns: Tensor, other: Tensor) -> Estimate:
+    """Return a difference of means with its 95% interval over photographs and seeds.
 
     Args:
-        values: Numbers of the photographs for each seed, shape (S, N).
+        columns: Numbers of the photographs for each seed, shape (S, N).
+        other: Numbers that are subtracted, shape (S, N) or (1, N).
     """
-    count = values.shape[1]
+    count = columns.shape[1]
+    hits = {"": columns.numpy(), "other": other.numpy()}
     # Each photograph is an object of its own.
-    part = ScoredGroup({"": values.numpy()}, setups=np.zeros(count), objects=np.arange(count))
-    return mean_with_interval([part], "", None)
+    part = ScoredGroup(hits, setups=np.zeros(count), objects=np.arange(count))
+    return mean_with_interval([part], "", "other")
 
 
 if __name__ == "__main__":

@@ -3,24 +3,25 @@
 python -m benchmarks.paper.table docs/paper/norm_balls.jsonl --figure norm_balls.png
 
 Brackets hold 95% intervals. Those of counts are Wilson's. Those of views are from
-a bootstrap over the lights of each mesh, because the views share lights. A
+a jackknife over the lights of each mesh, because the views share lights. A
 figure is drawn of norm_balls alone.
 """
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import bootstrap
 
 from benchmarks.common import Row
 from benchmarks.paper.common import last_run
 from train.evaluation import tables
+from train.evaluation.scores.metrics import Units, leave_out, weighted_means
 
 # Titles of the columns of norm_balls, by the counts in its records.
 COUNTS = {
@@ -202,10 +203,9 @@ def views(records: Sequence[Row]) -> Cells:
 
 
 def format_failures(group: Sequence[Row], state: str) -> str:
-    """Write the fraction of views that are misclassified, with its bootstrap interval.
+    """Write the fraction of views that are misclassified, with its 95% interval.
 
-    The bootstrap resamples the sets of views of each mesh, because the views of
-    a set share a light.
+    The interval is over the sets of views, because the views of a set share a light.
 
     Args:
         group: Records of one kind of attack and one number of attacked views.
@@ -220,26 +220,13 @@ def format_failures(group: Sequence[Row], state: str) -> str:
             np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets
         ]
         failures_of_meshes.append(failures)
-    interval = bootstrap(
-        failures_of_meshes,
-        mean_of_means,
-        method="percentile",
-        rng=0,
-    ).confidence_interval
-    value = mean_of_means(*failures_of_meshes)
-    percentages = format_percentages(value, interval.low, interval.high)
+    # The order of the values is that of the meshes, which have equally many sets.
+    values = np.array([np.concatenate(failures_of_meshes)])
+    (mean,) = leave_out(partial(weighted_means, values), Units([np.arange(values.size)], "lights"))
+    interval = mean.estimate
+    assert interval.low is not None and interval.high is not None
+    percentages = format_percentages(mean.value, interval.low, interval.high)
     return f"{percentages} of {len(failures_of_meshes)} × {len(failures_of_meshes[0])}"
-
-
-def mean_of_means(*samples: Sequence[float], axis: int = -1) -> np.ndarray:
-    """Return the mean of the means of samples.
-
-    Args:
-        *samples: Samples. A bootstrap gives them a first axis of replicates.
-        axis: Axis of the values in each sample.
-    """
-    means = [np.mean(sample, axis=axis) for sample in samples]
-    return np.mean(means, axis=0)
 
 
 def run_time(records: Sequence[Row]) -> Cells:

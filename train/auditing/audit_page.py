@@ -33,7 +33,7 @@ from train.auditing.remedies import (
     recommend,
 )
 from train.class_names import in_words
-from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
+from train.evaluation.scores.metrics import Units, leave_out, read_metric, weighted_means
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
 from train.evaluation.tables import Estimate, Proportion, fraction
@@ -535,7 +535,7 @@ def _attack_faults(folder: Path) -> list[str]:
 def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     """Compute what fraction of renders in environment lights and random lights is recognized.
 
-    The bootstrap of the interval draws views, and then lights for each view.
+    The intervals are over views.
 
     Args:
         correct: For the name of each light, whether each view is recognized.
@@ -554,16 +554,11 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     for title, names in names_of_title.items():
         # `hits` has one row for each view and one column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
-        if hits.min() == hits.max():
-            # If all renders have the same result, the bootstrap interval has no width.
-            # Wilson's interval for the fraction of views is used instead. The results in all
-            # lights are equal, so those in the first light are counted.
-            rates[title] = fraction(int(hits[:, 0].sum()), len(hits))
-            continue
         # Index of the view in each entry of `hits.ravel()`.
         view_of_render = np.arange(len(hits)).repeat(hits.shape[1])
-        replicates = bootstrap(partial(weighted_mean, hits.ravel()), view_of_render)
-        rates[title] = estimate(float(hits.mean()), replicates)
+        units = Units([view_of_render], "views")
+        (rate,) = leave_out(partial(weighted_means, hits.reshape(1, -1)), units)
+        rates[title] = rate.estimate
     return rates
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from augment.classifiers import Classifier
 from train.evaluation.scores.metrics import metric_title
-from train.evaluation.tables import Table, format_interval
+from train.evaluation.tables import Table, describe_intervals, format_interval
 from train.report.comparison import ALL, Evaluation, Evaluations, difference, mean_metric
 from train.report.first_screen import EQUAL_RATE, gain_sentence
 
@@ -147,7 +147,8 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     for name, evaluations_of_network in evaluations.items():
         value = format_interval(mean_metric(evaluations_of_network, ALL, metric))
         rows.append([name, value, format_interval(gains.get(name), "+")])
-    table = Table("", ["network", title, "gain over the original network"], rows)
+    intervals = describe_intervals(gains.values())
+    table = Table(intervals, ["network", title, "gain over the original network"], rows)
     advice = ADVICE[chosen]
     return Recommendation(
         remedy=None if gain is None else chosen,

@@ -2,8 +2,13 @@
 
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+# What a 95% interval is over. Images of few objects say nothing about other objects.
+OBJECTS = "objects"
+IMAGES = "images"
+THESE_OBJECTS = "images, for these objects"
 
 
 @dataclass(frozen=True)
@@ -14,11 +19,13 @@ class Estimate:
         value: Value of the metric. None if it is unknown.
         low: Low end of the interval. None if the interval is unknown.
         high: High end of the interval. None if the interval is unknown.
+        over: What the interval is over, such as OBJECTS. Empty if it is unknown.
     """
 
     value: float | None = None
     low: float | None = None
     high: float | None = None
+    over: str = ""
 
 
 @dataclass(frozen=True)
@@ -201,3 +208,16 @@ def format_interval(estimate: Estimate | None, sign: str = "") -> str:
     if estimate.low is None or estimate.high is None:
         return value
     return f"{value} [{estimate.low:{sign}.3f}, {estimate.high:{sign}.3f}]"
+
+
+def describe_intervals(estimates: Iterable[Estimate | None]) -> str:
+    """Say what the intervals of metrics are over.
+
+    Returns:
+        Text such as "95% intervals over objects, or over images, for these objects". Empty if
+        no metric has an interval.
+    """
+    over = {item.over for item in estimates if item is not None and item.low is not None}
+    # A set has no order, and the more general statement comes first.
+    units = sorted(over - {""}, key=lambda words: (THESE_OBJECTS in words, words))
+    return "95% intervals " + ", or ".join(f"over {words}" for words in units) if units else ""

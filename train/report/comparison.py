@@ -7,11 +7,9 @@ interval.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
-
-import numpy as np
 
 from augment.progress import progress
 from augment.settings import MODES
@@ -20,16 +18,14 @@ from train.class_names import in_words
 from train.evaluation.scores.metrics import (
     METRICS,
     TOP_RANKS,
-    Metrics,
     Pool,
     Pooled,
-    estimate,
+    change,
     metric_title,
-    replicate_difference,
 )
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import CONTACT_SHEET
-from train.evaluation.tables import Estimate, Table, format_interval, fraction
+from train.evaluation.tables import Estimate, Table, describe_intervals, format_interval
 from train.report.summary import (
     INITIAL,
     RunSummary,
@@ -216,8 +212,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
         name: Name of the metric in `METRICS`.
 
     Returns:
-        With one seed, the metric and its 95% interval, which is over objects and
-        images if some object is shown in several images. With several seeds, the
+        With one seed, the metric and its 95% interval. With several seeds, the
         mean, with the lowest and the highest value as the ends of the interval.
         None if the metric is unknown for every seed.
     """
@@ -233,7 +228,8 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
         return None
     if len(known) == 1:
         return known[0]
-    return Estimate(value=fmean(values), low=min(values), high=max(values))
+    over = f"lowest and highest of {len(values)} seeds"
+    return Estimate(value=fmean(values), low=min(values), high=max(values), over=over)
 
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
@@ -254,11 +250,13 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
         for evaluation in evaluations:
             subsets.update(dict.fromkeys(evaluation.pools))
     rows: list[list[str]] = []
+    shown: list[Estimate | None] = []
     for subset in progress(subsets, "intervals"):
         for method, evaluations in methods.items():
             metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
+            shown += metrics
             rows.append([subset.title(overall), method, *map(format_interval, metrics)])
-    return Table(f"by {by}", [by, "network", *TITLES], rows)
+    return Table(f"by {by}, {describe_intervals(shown)}", [by, "network", *TITLES], rows)
 
 
 def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
@@ -339,11 +337,9 @@ def difference(
 ) -> Difference | None:
     """Compare a metric of a method with that of a reference: mean minus mean over the seeds.
 
-    The 95% interval comes from a bootstrap over objects, images and seeds. Each
-    replicate draws the same objects and images for all runs. If both methods
-    have the same seeds, a seed is drawn for both of them at once. The bootstrap
-    over n seeds underestimates the variance between seeds by a factor of
-    1 - 1/n. With one seed, this variance is missing altogether.
+    The 95% interval is paired: both methods are measured without the same
+    objects. With several seeds, it is also over seeds. With one seed, it says
+    nothing about other seeds.
 
     Args:
         evaluations: Evaluations of the method, one for each seed.
@@ -353,47 +349,19 @@ def difference(
         name: Name of the metric in `METRICS`.
 
     Returns:
-        Difference of the means. None if the metric of a run has no bootstrap
-        replicates.
+        Difference of the means. None if the metric of a run is unknown.
     """
     pools = [evaluation.pools[subset] for evaluation in evaluations]
     reference_pools = [evaluation.pools[subset] for evaluation in reference]
-    if any(name not in pool.replicates for pool in (*pools, *reference_pools)):
+    if any(name not in pool.jackknives for pool in (*pools, *reference_pools)):
         return None
-    after = fmean(_known_value(pool.metrics, name) for pool in pools)
-    before = fmean(_known_value(pool.metrics, name) for pool in reference_pools)
-    replicates = replicate_difference(
-        np.stack([pool.replicates[name] for pool in pools]),
-        np.stack([pool.replicates[name] for pool in reference_pools]),
-        _have_equal_seeds(evaluations, reference),
-    )
-    change = estimate(after - before, replicates)
-    assert change.low is not None and change.high is not None
-    margin = 0.0
-    if change.low == change.high:
-        # All bootstrap replicates of the difference are equal, because both methods
-        # agree on every image. The true difference can still be up to the upper end
-        # of the Wilson interval (Wilson 1927) for 0 differences among the objects.
-        margin = fraction(0, pools[0].object_count(name)).high or 0.0
+    after = [pool.jackknives[name] for pool in pools]
+    before = [pool.jackknives[name] for pool in reference_pools]
     return Difference(
-        value=change.value,
-        low=max(-1.0, change.low - margin),
-        high=min(1.0, change.high + margin),
-        before=before,
-        after=after,
+        **asdict(change(after, before, _have_equal_seeds(evaluations, reference))),
+        before=fmean(run.value for run in before),
+        after=fmean(run.value for run in after),
     )
-
-
-def _known_value(metrics: Metrics, name: str) -> float:
-    """Return the value of a metric that is known to exist.
-
-    Args:
-        metrics: Metrics of one pool of predictions.
-        name: Name of a metric that has bootstrap replicates.
-    """
-    metric = metrics.find(name)
-    assert metric is not None and metric.value is not None
-    return metric.value
 
 
 def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
@@ -432,15 +400,17 @@ def difference_tables(
         evaluations = methods[method]
         reference = methods[base]
         rows = []
+        shown: list[Difference | None] = []
         for subset in reference[0].pools:
             if overall_only and not subset.is_overall:
                 continue
             differences = [difference(evaluations, reference, subset, name) for name in METRICS]
+            shown += differences
             cells = [format_interval(item, sign="+") for item in differences]
             rows.append([subset.title(overall), *cells])
         paired = ", paired" if _have_equal_seeds(evaluations, reference) else ""
         counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
-        title = f"{method} minus {base} ({counts})"
+        title = f"{method} minus {base} ({counts}), {describe_intervals(shown)}"
         tables.append(Table(title, [by, *TITLES], rows))
     return tables
 

@@ -15,7 +15,7 @@ from renderer.io.images import read_square
 from train.class_names import in_words
 from train.data.photographs import DESCRIPTION
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.tables import Estimate, Table, join_words
+from train.evaluation.tables import Estimate, Table, describe_intervals, join_words
 from train.report import comparison as compare
 from train.report import plots
 from train.report.plots import Picture
@@ -197,7 +197,7 @@ class Compared(NamedTuple):
             return None
         seed_count = max(len(self.before), len(self.after))
         has_one_seed = seed_count == 1
-        interval = "95% interval" if has_one_seed else f"lowest and highest of {seed_count} seeds"
+        interval = describe_intervals([after]) if has_one_seed else after.over
         return ShownMetric(title, note, before, after, name != "auc", interval)
 
 
@@ -312,8 +312,9 @@ def _describe_images(compared: Compared) -> str:
             f"Scored on {positives} and {auc.negatives:,} of other objects "
             f"({auc.negative_objects:,} objects)."
         )
-    if auc.has_repeated_objects and len(compared.after) == 1:
-        sentence += " The intervals are over objects and images."
+    gain = compared.difference("auc")
+    if gain is not None:
+        sentence += f" The gains have {describe_intervals([gain])}."
     if compared.trained_objects:
         trained = join_words(compared.trained_objects, "and")
         sentence += f" The images of {trained} show the objects of the training in new light."
@@ -358,7 +359,10 @@ def _answer(
     """
     assert auc.value is not None and auc.low is not None and auc.high is not None
     subject = change[0].upper() + change[1:]
-    gain = f"AUC {_rounded(auc.value, 2, '+')} [{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}]"
+    gain = (
+        f"AUC {_rounded(auc.value, 2, '+')} [{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}] "
+        f"over {auc.over}"
+    )
     match _direction(auc):
         case 1 if _direction(false_positives) > 0:
             return f"{subject} improved the ranking ({gain}), at a price."
@@ -455,10 +459,9 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
     assert change.low is not None and change.high is not None
     verdicts = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}
     verdict = verdicts[_direction(change)]
-    interval = f"95% interval: {_points(change.low)} to {_points(change.high)} points"
-    return (
-        f"{subject} is {change.after:.0%} instead of {change.before:.0%}; {verdict} ({interval})."
-    )
+    interval = f"95% interval over {change.over}: {_points(change.low)} to {_points(change.high)}"
+    values = f"{change.after:.0%} instead of {change.before:.0%}"
+    return f"{subject} is {values}; {verdict} ({interval} points)."
 
 
 def _points(value: float) -> str:

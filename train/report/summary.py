@@ -23,7 +23,7 @@ from train.evaluation.scores.metrics import (
     read_metric,
 )
 from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
-from train.evaluation.tables import Estimate, Table, format_interval
+from train.evaluation.tables import Estimate, Table, describe_intervals, format_interval
 from train.runs import checkpoint, run_config, run_lock, run_log
 from train.runs.run_config import CONFIG, read_config, read_json
 from train.runs.run_log import BEFORE, PHASES, read_metrics
@@ -513,9 +513,7 @@ def _title_of(group: Scored) -> str:
     )
     if len(labels) > 1:
         title += COUNTED_EACH
-    if auc.has_repeated_objects:
-        title += "; intervals are over objects and images"
-    return title
+    return f"{title}; {describe_intervals([auc])}" if auc.low is not None else title
 
 
 def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:

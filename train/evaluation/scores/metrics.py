@@ -3,8 +3,8 @@
 A `Pool` is a set of predictions that are scored together. It computes their
 `Metrics`. `Pooled` has all pools of one evaluation: the pool of all images, and
 the pools of each label, source, mesh and class. The functions below them compute
-the statistics: the bootstrap, the AUC, the recall at a given false-positive
-rate, and means over classes.
+the statistics: the jackknife and its intervals, the AUC, the recall at a given
+false-positive rate, and means over classes.
 
 A label is the name of a positive class. A prediction scores how well an image
 fits a label. The image is a positive if it shows this class. Otherwise it is a
@@ -22,7 +22,14 @@ import numpy as np
 
 from renderer.short_repr import ShortRepr
 from train.evaluation.scores.predictions import Prediction
-from train.evaluation.tables import Estimate, Proportion, fraction
+from train.evaluation.tables import (
+    IMAGES,
+    OBJECTS,
+    THESE_OBJECTS,
+    Estimate,
+    Proportion,
+    fraction,
+)
 
 # False-positive rates at which the recall is reported. Decimal strings are exact,
 # while a float such as 0.1 is not.
@@ -64,21 +71,21 @@ TITLES = {
 Thresholds = Mapping[str, float]
 
 
-# Number of random resamples (replicates) of the images from which the bootstrap
-# computes an interval.
-REPLICATES = 2000
-# Number of bootstrap replicates that are computed at once. A smaller number needs
-# less memory.
-BLOCK = 250
-# Images and training runs are drawn with different random seeds, so that the draws
-# are independent.
-IMAGE_SEED = 0
-RUN_SEED = 1
+# Smallest number of objects of each kind for intervals over objects. With fewer objects,
+# the interval of an AUC covers more than half of [0, 1] (benchmarks/coverage.py).
+MIN_OBJECTS = 5
+# Largest number of groups into which the objects are divided, each of which is left out
+# once. More groups would hardly change the interval, but the variance of a recall at a
+# false-positive rate, which depends on a quantile, needs groups of several images.
+MAX_GROUPS = 30
+# Smallest ratio of the errors without a group to all errors. It keeps the logit finite if
+# all errors are in one group.
+MIN_RATIO = 0.2
 
 
 @dataclass(frozen=True)
 class AreaUnderCurve(Estimate):
-    """Area under the ROC curve with its bootstrap interval.
+    """Area under the ROC curve with its 95% interval.
 
     The area is unknown if there are no positives or no negatives.
 
@@ -93,16 +100,6 @@ class AreaUnderCurve(Estimate):
     positive_objects: int = 0
     negatives: int = 0
     negative_objects: int = 0
-
-    @property
-    def has_repeated_objects(self) -> bool:
-        """Whether some object is shown in several images.
-
-        The bootstrap of the interval then draws objects as well as images.
-        """
-        is_in_positives = self.positive_objects != self.positives
-        is_in_negatives = self.negative_objects != self.negatives
-        return is_in_positives or is_in_negatives
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,24 +187,21 @@ class Outcome:
 
     @cached_property
     def proportion(self) -> Proportion:
-        """Fraction of hits with its 95% interval.
-
-        Wilson's interval treats each image as a different object. If some object
-        is shown in several images, it is too narrow. The interval is then that of
-        the bootstrap over objects and images.
-        """
+        """Fraction of hits with its 95% interval, which is Wilson's if no unit is repeated."""
         proportion = fraction(sum(self.hits), len(self.hits))
-        object_count = _count_objects(self.predictions)
-        if proportion.value is None or object_count == proportion.n:
+        if proportion.value is None:
             return proportion
-        interval = _estimate_or_wilson(proportion.value, self.replicates, object_count)
-        return replace(proportion, low=interval.low, high=interval.high)
+        if self.jackknife.unit_count == proportion.n:
+            return replace(proportion, over=self.jackknife.over)
+        ends = self.jackknife.estimate
+        return replace(proportion, low=ends.low, high=ends.high, over=ends.over)
 
     @cached_property
-    def replicates(self) -> np.ndarray:
-        """Bootstrap replicates of the fraction of hits, shape (REPLICATES,)."""
-        statistic = partial(weighted_mean, np.array(self.hits))
-        return bootstrap(statistic, _object_indices(self.predictions))
+    def jackknife(self) -> "Jackknife":
+        """Fraction of hits without each unit."""
+        statistic = partial(weighted_means, np.array([self.hits], float))
+        (jackknife,) = leave_out(statistic, choose_units(self.predictions))
+        return jackknife
 
 
 def within_rank(predictions: Sequence[Prediction], max_rank: int) -> Outcome:
@@ -292,12 +286,10 @@ class Pool(ShortRepr):
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
         proportions = {name: outcome.proportion for name, outcome in self.outcomes.items()}
-        auc, *recalls = self._roc_estimates()
-        top_accuracies = self._top_estimates()
+        known = {name: jackknife.estimate for name, jackknife in self._ranked.items()}
+        auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
         auc_with_counts = AreaUnderCurve(
-            value=auc.value,
-            low=auc.low,
-            high=auc.high,
+            **asdict(auc),
             positives=len(self.for_roc.positives),
             positive_objects=_count_objects(self.for_roc.positives),
             negatives=len(self.for_roc.negatives),
@@ -308,8 +300,8 @@ class Pool(ShortRepr):
             auc=auc_with_counts,
             recall_at=dict(zip(RATES, recalls, strict=True)),
             **proportions,
-            class_top1=top_accuracies.get("class_top1"),
-            class_top5=top_accuracies.get("class_top5"),
+            class_top1=known.get("class_top1"),
+            class_top5=known.get("class_top5"),
         )
 
     @cached_property
@@ -325,145 +317,67 @@ class Pool(ShortRepr):
                 prediction_of_path.setdefault(prediction.photograph.path, prediction)
         return list(prediction_of_path.values())
 
-    def _top_estimates(self) -> dict[str, Estimate]:
-        """Compute top-1 and top-5 accuracy with their bootstrap intervals.
-
-        Returns:
-            "class_top1" and "class_top5". Empty if no photograph shows a class
-            of the network.
-        """
-        if not self.classified:
-            return {}
-        values = self._top_statistic(np.ones(len(self.classified)))
-        estimates = {}
-        for name, value, replicates in zip(TOP_RANKS, values, self._top_replicates, strict=True):
-            estimates[name] = _estimate_or_wilson(float(value), replicates, self.object_count(name))
-        return estimates
-
-    @property
-    def _top_statistic(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Function that computes top-1 and top-5 accuracy on resampled photographs.
-
-        Its argument is how often each of the n photographs in `classified` is
-        drawn, shape (..., n). It returns the two accuracies, shape (2, ...).
-        """
-        names = [prediction.photograph.label for prediction in self.classified]
-        ranks = np.array([prediction.true_rank for prediction in self.classified])
-        # The first row says which photographs are correct for top-1, the second row
-        # for top-5, shape (2, n).
-        hits = np.stack([ranks <= max_rank for max_rank in TOP_RANKS.values()])
-        return partial(class_means, hits, names)
-
     @cached_property
-    def _top_replicates(self) -> np.ndarray:
-        """Bootstrap replicates of top-1 and of top-5 accuracy, shape (2, REPLICATES)."""
-        return bootstrap(self._top_statistic, _object_indices(self.classified))
-
-    def _roc_estimates(self) -> list[Estimate]:
-        """Compute the AUC and the recalls with their bootstrap intervals.
-
-        Returns:
-            The AUC, followed by the recall at each false-positive rate in
-            `RATES`. All are unknown without positives or without negatives.
-        """
-        if not self._has_roc_curve:
-            return [Estimate() for _ in ROC_METRICS]
-        values = auc_and_recalls(*self.scores)
-        estimates = []
-        for name, value, replicates in zip(ROC_METRICS, values, self._roc_replicates, strict=True):
-            estimates.append(_estimate_or_wilson(float(value), replicates, self.object_count(name)))
-        return estimates
-
-    def object_count(self, name: str) -> int:
-        """Count the different objects in the photographs on which a metric depends.
-
-        Args:
-            name: Name of a metric that has bootstrap replicates.
-
-        Returns:
-            Number of objects. For a metric of the ROC curve, it is the number of
-            positive or of negative objects, whichever is smaller.
-        """
-        if name in self.outcomes:
-            return _count_objects(self.outcomes[name].predictions)
-        if name in TOP_RANKS:
-            return _count_objects(self.classified)
-        return min(_count_objects(predictions) for predictions in self.for_roc)
-
-    @property
-    def _has_roc_curve(self) -> bool:
-        """Whether there are both positives and negatives, which a ROC curve needs."""
-        return bool(self.for_roc.positives) and bool(self.for_roc.negatives)
-
-    @cached_property
-    def _roc_replicates(self) -> np.ndarray:
-        """Bootstrap replicates of the AUC and of the three recalls, shape (4, REPLICATES)."""
-        statistic = partial(auc_and_recalls, *self.scores)
-        positive_objects = _object_indices(self.for_roc.positives)
-        negative_objects = _object_indices(self.for_roc.negatives)
-        return bootstrap(statistic, positive_objects, negative_objects)
-
-    @cached_property
-    def replicates(self) -> dict[str, np.ndarray]:
-        """For each metric that is known, its bootstrap replicates, shape (REPLICATES,)."""
-        replicates = {}
-        for name, outcome in self.outcomes.items():
-            if outcome.hits:
-                replicates[name] = outcome.replicates
-        if self._has_roc_curve:
-            replicates.update(zip(ROC_METRICS, self._roc_replicates, strict=True))
+    def _ranked(self) -> dict[str, "Jackknife"]:
+        """Values without each unit of the known metrics that depend on a ranking."""
+        jackknives = {}
+        if self.for_roc.positives and self.for_roc.negatives:
+            statistic = partial(auc_and_recalls, *self.scores)
+            of_roc = leave_out(statistic, choose_units(*self.for_roc))
+            jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
         if self.classified:
-            replicates.update(zip(TOP_RANKS, self._top_replicates, strict=True))
-        return replicates
+            names = [prediction.photograph.label for prediction in self.classified]
+            ranks = np.array([prediction.true_rank for prediction in self.classified])
+            # One row for top-1 and one for top-5, shape (2, n).
+            hits = np.stack([ranks <= max_rank for max_rank in TOP_RANKS.values()])
+            of_classes = leave_out(partial(class_means, hits, names), choose_units(self.classified))
+            jackknives.update(zip(TOP_RANKS, of_classes, strict=True))
+        return jackknives
+
+    @cached_property
+    def jackknives(self) -> dict[str, "Jackknife"]:
+        """For each metric that is known, its values without each unit."""
+        outcomes = {name: item.jackknife for name, item in self.outcomes.items() if item.hits}
+        return {**outcomes, **self._ranked}
 
 
-def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:
-    """Add a 95% interval to the value of a metric.
+class Units(NamedTuple):
+    """Units over which an interval is taken: objects, or images.
 
-    This is the percentile interval of the bootstrap, except if all replicates
-    are equal. The percentile interval would then have no width. It is replaced
-    by Wilson's interval, which treats the value as a fraction of the objects.
-
-    Args:
-        value: Value of the metric, in [0, 1].
-        replicates: Bootstrap replicates of the metric, shape (REPLICATES,).
-        object_count: Number of different objects that the images show.
-
-    Returns:
-        The value with its interval.
+    Attributes:
+        groups: For each group of images, the index of the unit that each image
+            belongs to, from 0, shape (n,).
+        over: What the units are: OBJECTS, IMAGES or THESE_OBJECTS.
     """
-    with_percentiles = estimate(value, replicates)
-    if with_percentiles.low != with_percentiles.high:
-        return with_percentiles
-    wilson = fraction(round(value * object_count), object_count)
-    assert wilson.low is not None and wilson.high is not None
-    return Estimate(value=value, low=min(wilson.low, value), high=max(wilson.high, value))
+
+    groups: Sequence[np.ndarray]
+    over: str
 
 
-def _object_indices(predictions: Sequence[Prediction]) -> np.ndarray:
-    """Number the different objects in photographs, in order of first appearance.
+def choose_units(*groups: Sequence[Prediction]) -> Units:
+    """Choose objects as units if each group shows enough of them, and otherwise images.
 
-    Photographs show the same object if they have the same mesh. A photograph
-    with an unknown mesh counts as a different object.
-
-    Args:
-        predictions: One prediction for each of n photographs.
-
-    Returns:
-        Number of the object in each photograph, from 0, shape (n,).
+    Images show the same object if they have the same mesh. An image with an
+    unknown mesh counts as a different object.
     """
-    index_of_object: dict[str | PurePosixPath, int] = {}
-    object_indices = []
-    for prediction in predictions:
-        name = prediction.photograph.mesh or prediction.photograph.path
-        next_index = len(index_of_object)
-        object_indices.append(index_of_object.setdefault(name, next_index))
-    return np.array(object_indices)
+    objects = [[item.photograph.mesh or item.photograph.path for item in group] for group in groups]
+    if all(len({*names}) >= MIN_OBJECTS for names in objects):
+        has_mesh = any(item.photograph.mesh for group in groups for item in group)
+        return Units([_number(names) for names in objects], OBJECTS if has_mesh else IMAGES)
+    images = [[item.photograph.path for item in group] for group in groups]
+    over = IMAGES if images == objects else THESE_OBJECTS
+    return Units([_number(names) for names in images], over)
+
+
+def _number(names: Sequence[object]) -> np.ndarray:
+    """Number names from 0 in order of first appearance, shape (n,)."""
+    number_of_name: dict[object, int] = {}
+    return np.array([number_of_name.setdefault(name, len(number_of_name)) for name in names])
 
 
 def _count_objects(predictions: Sequence[Prediction]) -> int:
     """Count the different objects in the photographs of predictions."""
-    return len(np.unique(_object_indices(predictions)))
+    return len({item.photograph.mesh or item.photograph.path for item in predictions})
 
 
 def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
@@ -636,94 +550,178 @@ def _group(
     return {name: groups[name] for name in sorted(groups)}
 
 
-def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
-    """Evaluate a statistic on random resamples (bootstrap replicates) of images.
+@dataclass(frozen=True)
+class Jackknife:
+    """Value of a statistic in [0, 1], and its values if one unit is left out.
 
-    Images of the same object are not independent. Each replicate therefore
-    draws objects with replacement, as many as there are. For each drawn object,
-    it draws images of the object with replacement, as many as the object has
-    (Davison and Hinkley 1997, section 3.8). With one image per object, this is
-    the ordinary bootstrap over images.
+    Attributes:
+        value: Value on all images.
+        without: For each group of units, such as the positive and the negative
+            objects, the value without each unit, shape (k,).
+        unit_count: Smallest number of units in a group.
+        over: What the units are.
+    """
 
-    The draws depend only on `groups`. Metrics of two networks on the same
-    images are therefore paired: replicate i has the same images for both.
+    value: float
+    without: Sequence[np.ndarray]
+    unit_count: int
+    over: str
 
-    The interval is approximate. The variance of a mean over k objects is too
-    small by a factor of (k - 1) / k. With several objects, the variance over
-    images is counted about twice.
+    @cached_property
+    def estimate(self) -> Estimate:
+        """Value with its 95% interval: logit(value) ± t · standard error.
+
+        The variance of logit(value) is the sum of the jackknife variances of
+        the groups (Efron and Stein 1981). The quantile t has the degrees of
+        freedom of Welch and Satterthwaite. Without variance, as at a value of
+        1, the interval is Wilson's for a fraction of the units.
+        """
+        value = self.value
+        if min(map(len, self.without)) < 2:
+            return Estimate(value, 0.0, 1.0, self.over)
+        spread = _Spread.of([np.zeros(len(values)) for values in self.without])
+        if 0 < value < 1:
+            spread = _Spread.of([_logit(_keep_errors(item, value)) for item in self.without])
+        if spread.variance > 0:
+            half_width = spread.quantile * spread.variance**0.5
+            low, high = 1 / (1 + np.exp([half_width, -half_width] - _logit(value)))
+        else:
+            low, high = _wilson(value, self.unit_count, spread.quantile)
+        return Estimate(value, float(low), float(high), self.over)
+
+
+def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
+    """Evaluate M statistics without each unit, or without each of MAX_GROUPS groups of units.
+
+    Images of the same object are not independent, so an object is left out with
+    all its images. The groups of units depend only on `units`. Metrics of two
+    networks on the same images are therefore paired.
 
     Args:
-        statistic: Function that is evaluated for BLOCK replicates at a time.
-            Its arguments are one array for each group: how often each replicate
-            draws each image, shape (BLOCK, n). It returns an array of shape
-            (..., BLOCK).
-        *groups: Groups of images that are resampled separately, such as the
-            positives and the negatives. For each group of n ≥ 1 images, the
-            index of the object that each image shows, shape (n,). Objects are
-            numbered from 0 in order of first appearance.
-
-    Returns:
-        Value of the statistic for each replicate, shape (..., REPLICATES).
+        statistic: Function of one array for each group of images: how often
+            each image counts, shape (..., n). It returns an array of shape
+            (M, ...).
+        units: Units of each group of images.
     """
-    generator = np.random.default_rng(IMAGE_SEED)
-    blocks = []
-    for _ in range(REPLICATES // BLOCK):
-        draw_counts = [_draw_images(object_of_image, generator) for object_of_image in groups]
-        blocks.append(statistic(*draw_counts))
-    return np.concatenate(blocks, axis=-1)
+    counts = [np.ones(len(unit_of_image), int) for unit_of_image in units.groups]
+    values = statistic(*counts)
+    unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
+    without = []
+    for group, unit_of_image in enumerate(units.groups):
+        unit_count = unit_counts[group]
+        if unit_count == 1:
+            without.append(values[:, None])
+            continue
+        part_count = min(unit_count, MAX_GROUPS)
+        # A random order divides the units into parts of about equal size.
+        order = np.random.default_rng(0).permutation(unit_count)
+        part_of_image = (order * part_count // unit_count)[unit_of_image]
+        is_kept = part_of_image != np.arange(part_count)[:, None]
+        kept = [*counts[:group], is_kept.astype(int), *counts[group + 1 :]]
+        without.append(statistic(*kept))
+    rows = zip(values, *without, strict=True)
+    return [Jackknife(float(row[0]), row[1:], min(unit_counts), units.over) for row in rows]
 
 
-def _draw_images(object_of_image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw the images of BLOCK bootstrap replicates: first objects, then images of each object.
+def average(runs: Sequence[Jackknife]) -> Jackknife:
+    """Average a metric over training runs. Several runs are a further group of units."""
+    values = np.array([run.value for run in runs])
+    groups = zip(*(run.without for run in runs), strict=True)
+    without = [np.mean(group, axis=0) for group in groups]
+    over = runs[0].over
+    if len(runs) > 1:
+        without.append((values.sum() - values) / (len(runs) - 1))
+        over = f"seeds and {over}"
+    return Jackknife(float(values.mean()), without, runs[0].unit_count, over)
+
+
+def change(
+    after: Sequence[Jackknife], before: Sequence[Jackknife], is_paired: bool = True
+) -> Estimate:
+    """Subtract the means of a metric over two groups of runs, with the 95% interval.
+
+    The interval combines those of both means and their correlation (Zou and
+    Donner 2008), so it is as asymmetric as they are. If both groups have the
+    same values without each unit, it is that of 0 changes in Wilson's sense.
 
     Args:
-        object_of_image: Index of the object that each image shows, shape (n,).
-            Objects are numbered from 0 in order of first appearance.
-        generator: Random number generator.
-
-    Returns:
-        How often each replicate draws each image, shape (BLOCK, n).
+        after: Metric of each run of the first group.
+        before: Metric of each run of the second group, on the same images.
+        is_paired: Whether run i of both groups has the same random seed.
     """
-    image_count = len(object_of_image)
-    images_per_object = np.bincount(object_of_image)
-    object_count = len(images_per_object)
-    # Objects that are drawn for each of BLOCK replicates, as one list, shape (BLOCK · objects,).
-    drawn_objects = generator.integers(object_count, size=(BLOCK, object_count)).ravel()
-    replicate_of_draw = np.arange(BLOCK).repeat(object_count)
-    if object_count == image_count:
-        # Each object has a single image, and image i shows object i.
-        drawn_images = drawn_objects
-    else:
-        drawn_sizes = images_per_object[drawn_objects]
-        # `images_by_object` lists the images of object 0, then of object 1, and so on.
-        # `first_position` is the position in this list at which each object starts.
-        images_by_object = object_of_image.argsort(kind="stable")
-        first_position = images_per_object.cumsum() - images_per_object
-        # An object with n images gets n random numbers below n.
-        position_in_object = generator.integers(drawn_sizes.repeat(drawn_sizes))
-        object_start = first_position[drawn_objects].repeat(drawn_sizes)
-        drawn_images = images_by_object[object_start + position_in_object]
-        replicate_of_draw = replicate_of_draw.repeat(drawn_sizes)
-    # Each pair of a replicate and an image has its own number, so that `bincount`
-    # counts how often the pair is drawn.
-    pair_numbers = replicate_of_draw * image_count + drawn_images
-    draw_counts = np.bincount(pair_numbers, minlength=BLOCK * image_count)
-    return draw_counts.reshape(BLOCK, image_count)
+    one, other = average(after), average(before)
+    value = one.value - other.value
+    group_count = len(one.without) if is_paired else len(after[0].without)
+    pairs = list(zip(one.without[:group_count], other.without, strict=False))
+    over = max(one.over, other.over, key=len)
+    if value == 0 and all(np.array_equal(*pair) for pair in pairs):
+        margin = fraction(0, one.unit_count).high
+        assert margin is not None
+        return Estimate(value, -margin, margin, over)
+    variances = _Spread.of(one.without).variance * _Spread.of(other.without).variance
+    covariance = sum(_covariance(*pair) for pair in pairs)
+    correlation = covariance / variances**0.5 if variances > 0 else 0.0
+    high, low = one.estimate, other.estimate
+    return Estimate(
+        value,
+        max(-1.0, value - _hypotenuse(one.value - high.low, low.high - other.value, correlation)),
+        min(1.0, value + _hypotenuse(high.high - one.value, other.value - low.low, correlation)),
+        over,
+    )
 
 
-def weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Compute the mean of values, each counted several times.
+def _hypotenuse(a: float, b: float, correlation: float) -> float:
+    """Half width of a difference whose parts have the half widths a and b."""
+    return max(0.0, a * a + b * b - 2 * correlation * a * b) ** 0.5
 
-    `functools.partial(weighted_mean, values)` is a statistic for `bootstrap`.
 
-    Args:
-        values: Values, shape (n,).
-        counts: How often each value counts, shape (..., n).
+def _covariance(one: np.ndarray, other: np.ndarray) -> float:
+    """Jackknife covariance of two statistics, from their values without each of k units."""
+    return float((len(one) - 1) * np.mean((one - one.mean()) * (other - other.mean())))
 
-    Returns:
-        Weighted mean, shape (...).
-    """
-    return counts @ values / counts.sum(axis=-1)
+
+class _Spread(NamedTuple):
+    """Jackknife variance of a statistic, and the quantile of Student's t for its interval."""
+
+    variance: float
+    quantile: float
+
+    @classmethod
+    def of(cls, without: Sequence[np.ndarray]) -> "_Spread":
+        """Add the variances of the groups of units, from the values without each unit."""
+        # This import is here because it takes a second.
+        from scipy.special import stdtrit
+
+        variances = np.array([_covariance(values, values) for values in without])
+        degrees = np.array([len(values) - 1 for values in without])
+        freedom = degrees.min()
+        if variances.any():
+            # Welch and Satterthwaite.
+            freedom = variances.sum() ** 2 / (variances**2 / degrees).sum()
+        return cls(float(variances.sum()), float(stdtrit(freedom, 0.975)))
+
+
+def _keep_errors(values: np.ndarray, value: float) -> np.ndarray:
+    """Keep at least MIN_RATIO of the distance of a value from 0 and from 1."""
+    return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
+
+
+def _logit(values: np.ndarray) -> np.ndarray:
+    """Log-odds of values in (0, 1)."""
+    return np.log(values) - np.log1p(-values)
+
+
+def _wilson(value: float, n: int, quantile: float) -> tuple[float, float]:
+    """Wilson's interval of a fraction of n units, with a quantile of Student's t."""
+    shift = quantile**2 / n
+    center = (value + shift / 2) / (1 + shift)
+    half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
+    return max(0.0, center - half_width), min(1.0, center + half_width)
+
+
+def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Compute means over images that count several times: (M, n) and (..., n) to (M, ...)."""
+    return np.moveaxis(counts @ values.T / counts.sum(axis=-1, keepdims=True), -1, 0)
 
 
 def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> np.ndarray:
@@ -731,7 +729,7 @@ def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> n
 
     This is the mean over all images if an image of a class with n images has
     the weight 1 / n. `functools.partial(class_means, hits, names)` is a
-    statistic for `bootstrap`.
+    statistic for `leave_out`.
 
     Args:
         hits: Whether each image is a hit, by K definitions of a hit such as
@@ -746,69 +744,6 @@ def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> n
     weights = 1 / class_sizes[class_of_image]
     total_weight = counts @ weights
     return np.stack([counts @ (weights * row) / total_weight for row in hits])
-
-
-def estimate(value: float, replicates: np.ndarray) -> Estimate:
-    """Add the 95% percentile interval of the bootstrap to the value of a metric.
-
-    The interval is described by Efron and Tibshirani (1993), chapter 13. Unlike
-    an interval of standard errors, it stays within the range of the metric.
-    Unlike their BCa interval, it is defined if all replicates are equal, as at
-    a recall of 1.
-
-    Args:
-        value: Value of the metric on all images.
-        replicates: Values of the metric on bootstrap replicates, shape
-            (REPLICATES,).
-
-    Returns:
-        Value with its interval.
-    """
-    low, high = np.quantile(replicates, (0.025, 0.975))
-    return Estimate(value=value, low=float(low), high=float(high))
-
-
-def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np.ndarray:
-    """Compute bootstrap replicates of the difference between two groups of training runs.
-
-    A group has runs with different random seeds. Each replicate also resamples
-    the runs: it draws as many runs as the group has, with replacement, and
-    averages the metric over them.
-
-    Args:
-        one: Bootstrap replicates of the metric of each of the S runs of the
-            first group, shape (S, REPLICATES).
-        other: Bootstrap replicates of the metric of each of the T runs of the
-            second group, shape (T, REPLICATES).
-        paired: Whether run i of the first group and run i of the second group
-            are drawn together. S and T must then be equal.
-
-    Returns:
-        Mean of the first group minus mean of the second group in each
-        replicate, shape (REPLICATES,).
-    """
-    generator = np.random.default_rng(RUN_SEED)
-    if paired:
-        return _mean_of_drawn_runs(one - other, generator)
-    mean_of_one = _mean_of_drawn_runs(one, generator)
-    mean_of_other = _mean_of_drawn_runs(other, generator)
-    return mean_of_one - mean_of_other
-
-
-def _mean_of_drawn_runs(values: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Resample training runs in each bootstrap replicate, and average a metric over them.
-
-    Args:
-        values: Metric of each of S runs in each replicate, shape
-            (S, REPLICATES).
-        generator: Random number generator, which draws S runs with replacement
-            for each replicate.
-
-    Returns:
-        Mean over the drawn runs in each replicate, shape (REPLICATES,).
-    """
-    drawn_runs = generator.integers(len(values), size=values.shape)
-    return np.take_along_axis(values, drawn_runs, axis=0).mean(axis=0)
 
 
 def auc_and_recalls(
@@ -981,9 +916,10 @@ def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
     entry = _find_entry(summary, name)
     if not entry:
         return None
-    numbers: dict[str, float | None] = dict.fromkeys(("value", "low", "high"))
+    numbers: dict[str, Any] = dict.fromkeys(("value", "low", "high"))
     if entry.get("value") is not None:
         numbers = {key: float(entry[key]) for key in numbers}
+    numbers["over"] = entry.get("over", "")
     if "hits" in entry:
         return Proportion(**numbers, hits=entry["hits"], n=entry["n"])
     if "positives" in entry:

@@ -46,7 +46,14 @@ from train.evaluation.scores.predictions import (
     write_predictions,
 )
 from train.evaluation.scores.sheet import contact_sheet, write_roc
-from train.evaluation.tables import Proportion, Table, format_fraction, format_interval
+from train.evaluation.tables import (
+    Estimate,
+    Proportion,
+    Table,
+    describe_intervals,
+    format_fraction,
+    format_interval,
+)
 from train.settings import GROUPS
 
 SUMMARY = "summary.json"
@@ -236,9 +243,10 @@ def score(
 ) -> Scores:
     """Score predictions for photographs.
 
-    All metrics have 95% intervals over images, and also over objects if
-    photos.csv names them. If each image shows another object, the intervals of
-    fractions of images are Wilson's. All other intervals come from a bootstrap.
+    All metrics have 95% intervals. They are over objects if photos.csv names at
+    least MIN_OBJECTS of each kind, and otherwise over images, for these objects.
+    Intervals of fractions of different objects are Wilson's. All others come
+    from a jackknife.
 
     Args:
         predicted: Predictions for the photographs of a folder.
@@ -489,7 +497,9 @@ def format_overall(scores: Scores) -> str:
         for metric, cell in zip(metric_titles, cells, strict=True):
             if metric not in details:
                 rows.append((metric, cell))
-    overall_table = Table(f"{_count_images(scores)}; 95% intervals", ["metric", scores.label], rows)
+    overall = scores.overall
+    intervals = describe_intervals([overall.recall, overall.false_positive_rate, overall.auc])
+    overall_table = Table(f"{_count_images(scores)}; {intervals}", ["metric", scores.label], rows)
     return "\n".join([str(overall_table), *_notes(scores)])
 
 
@@ -509,28 +519,24 @@ def _fraction_table(scores: Scores) -> Table:
     """Make the table of the metrics that are fractions of images, such as recall."""
     names = [name for name in FRACTION_METRICS if scores.overall.find(name) is not None]
     rows = []
+    shown: list[Proportion] = []
     for title, metrics in _metrics_of_rows(scores):
         proportions: list[Proportion] = [getattr(metrics, name) for name in names]
+        shown += proportions
         rows.append([title, *map(format_fraction, proportions)])
-    return Table(_title_of_intervals(scores), ["", *map(metric_title, names)], rows)
+    return Table(describe_intervals(shown), ["", *map(metric_title, names)], rows)
 
 
 def _ranking_table(scores: Scores) -> Table:
     """Make the table of the metrics that depend on a ranking of images or classes."""
     names = (*ROC_METRICS, *TOP_RANKS)
     rows = []
+    shown: list[Estimate | None] = []
     for title, metrics in _metrics_of_rows(scores):
-        rows.append([title, *(format_interval(metrics.find(name)) for name in names)])
-    return Table(_title_of_intervals(scores), ["", *map(metric_title, names)], rows)
-
-
-def _title_of_intervals(scores: Scores) -> str:
-    """Write whether the intervals are only over images, or also over objects."""
-    auc = scores.overall.auc
-    if not auc.has_repeated_objects:
-        return "95% intervals over images"
-    counts = f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} hard negatives"
-    return f"95% intervals over objects and images ({counts})"
+        estimates = [metrics.find(name) for name in names]
+        shown += estimates
+        rows.append([title, *map(format_interval, estimates)])
+    return Table(describe_intervals(shown), ["", *map(metric_title, names)], rows)
 
 
 def _class_table(scores: Scores) -> Table:

@@ -7,23 +7,25 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest, mannwhitneyu
-from scipy.stats import bootstrap as scipy_bootstrap
+from scipy.stats import binomtest, mannwhitneyu, ttest_1samp, ttest_ind
+from scipy.stats import t as student_t
 
+from benchmarks.coverage import METRICS, Setup, measure
 from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import (
     RATES,
-    REPLICATES,
-    ROC_METRICS,
+    Jackknife,
+    Units,
     auc_and_recalls,
-    bootstrap,
+    change,
     class_means,
-    estimate,
+    leave_out,
     pool,
-    replicate_difference,
     thresholds,
+    weighted_means,
 )
 from train.evaluation.scores.predictions import rank_classes
+from train.evaluation.tables import OBJECTS, THESE_OBJECTS
 
 # The scores have few values, so that ties are common.
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)
@@ -57,83 +59,102 @@ def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positi
         assert recall == sum(score > expected for score in positives) / len(positives)
 
 
-@pytest.mark.parametrize("image_count", [1, 3])
-@pytest.mark.parametrize("name", ["auc", "recall_at/0.10"])
-def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_image_repeats(
-    name,
-    image_count,
-):
-    """Compare up to chance.
+def mean_of(values: np.ndarray, units: np.ndarray) -> Jackknife:
+    """Leave out each unit of a mean."""
+    (mean,) = leave_out(partial(weighted_means, values[None]), Units([units], "units"))
+    return mean
 
-    The standard error of an end is below 0.006, and a step of the recall is 1/80.
-    """
+
+@pytest.mark.parametrize("image_count", [1, 7])
+def test_the_interval_of_a_mean_is_students_over_objects(image_count):
+    """Compare with scipy's t interval. Near 1/2, the logit is linear up to the third order."""
+    values = 0.5 + np.random.default_rng(3).normal(0, 0.004, 12)
+    images = np.random.default_rng(4).permutation(12 * image_count)
+    objects = np.arange(12).repeat(image_count)[images]
+    found = mean_of(values[objects], objects).estimate
+    student = ttest_1samp(values, 0).confidence_interval()
+    assert (found.low, found.high) == pytest.approx((student.low, student.high), abs=1e-4)
+
+
+def test_the_interval_of_an_auc_has_the_degrees_of_freedom_of_welch():
+    """Compare with scipy. A linear statistic, the difference of two means, stands for the AUC."""
+    generator = np.random.default_rng(5)
+    positives = generator.normal(0.25, 0.004, 6)
+    negatives = generator.normal(-0.25, 0.001, 9)
+
+    def difference(positive_counts, negative_counts):
+        first = weighted_means(positives[None], positive_counts)
+        return first - weighted_means(negatives[None], negative_counts)
+
+    (found,) = leave_out(difference, Units([np.arange(6), np.arange(9)], "objects"))
+    welch = ttest_ind(positives, negatives, equal_var=False).confidence_interval()
+    ends = (found.estimate.low, found.estimate.high)
+    assert ends == pytest.approx((welch.low, welch.high), abs=1e-4)
+
+
+@pytest.mark.parametrize("repeats", [1, 4])
+def test_intervals_do_not_depend_on_how_often_an_image_repeats(repeats):
     generator = np.random.default_rng(3)
-    positives = generator.normal(1, 1, 80).round(1)
-    negatives = generator.normal(0, 1.5, 120).round(1)
-    column = ROC_METRICS.index(name)
-    reference = scipy_bootstrap(
-        (positives, negatives),
-        lambda positives, negatives: auc_and_recalls(positives, negatives)[column],
-        vectorized=False,
-        method="percentile",
-        n_resamples=2000,
-        rng=np.random.default_rng(8),
-    ).confidence_interval
-
-    statistic = partial(
-        auc_and_recalls,
-        positives.repeat(image_count),
-        negatives.repeat(image_count),
-    )
-    objects = [np.arange(count).repeat(image_count) for count in (80, 120)]
-    replicates = bootstrap(statistic, *objects)[column]
-
-    ends = estimate(0.5, replicates)
-    assert (ends.low, ends.high) == pytest.approx(tuple(reference), rel=0, abs=0.02)
-    np.testing.assert_array_equal(bootstrap(statistic, *objects)[column], replicates)
+    positives = generator.normal(1, 1, 12)
+    negatives = generator.normal(0, 1.5, 40)
+    statistic = partial(auc_and_recalls, positives.repeat(repeats), negatives.repeat(repeats))
+    units = Units([np.arange(12).repeat(repeats), np.arange(40).repeat(repeats)], "objects")
+    once = partial(auc_and_recalls, positives, negatives)
+    expected = leave_out(once, Units([np.arange(12), np.arange(40)], "objects"))[0].estimate
+    found = leave_out(statistic, units)[0].estimate
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
 
 
-def test_the_spread_over_objects_and_their_images_is_that_of_a_two_level_bootstrap():
-    """Compare with the closed form of the variance of the mean.
-
-    For k objects of m images, it is
-    (variance of the objects' means + mean variance within an object / m) / k.
-    """
-    generator = np.random.default_rng(2)
-    object_shift = generator.normal(0, 0.5, 5)
-    values = generator.normal(0, 1, (8, 5)) + object_shift  # (image, object)
-    object_of_image = np.arange(40) % 5
-
-    means = bootstrap(lambda counts: counts @ values.ravel() / 40, object_of_image)
-
-    variance = (values.mean(axis=0).var() + values.var(axis=0).mean() / 8) / 5
-    standard_error = (variance / REPLICATES) ** 0.5
-    assert means.mean() == pytest.approx(values.mean(), abs=4 * standard_error)
-    # 13 % are four standard errors of the variance of 2,000 replicates.
-    assert means.var() == pytest.approx(variance, rel=0.13)
+def runs_of(values: np.ndarray) -> list[Jackknife]:
+    """Make training runs with the given scores, which do not depend on the images."""
+    return [Jackknife(value, [np.full(9, value)], 9, "objects") for value in values]
 
 
-# The score of a run depends on its seed, 0 to 3, in all replicates alike: (seed, replicate).
-SCORE_OF_SEED = np.arange(4.0)[:, None] + np.zeros(REPLICATES)
+SCORE_OF_SEED = np.array([0.48, 0.49, 0.51, 0.52])
 
 
-def test_pairing_cancels_what_both_runs_share():
-    difference = replicate_difference(SCORE_OF_SEED + 0.5, SCORE_OF_SEED, True)
-    np.testing.assert_array_equal(difference, 0.5)
+def test_pairing_cancels_what_both_groups_of_runs_share():
+    gain = change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED))
+    assert gain.value == pytest.approx(0.02)
+    assert gain.high - gain.low < 0.002
 
 
-def test_without_pairs_the_difference_has_the_variance_of_both_means():
-    """Compare with 2 · 1.25 / 4, as 0 to 3 have the variance 1.25."""
-    difference = replicate_difference(SCORE_OF_SEED + 0.5, SCORE_OF_SEED, False)
-    assert difference.mean() == pytest.approx(0.5, abs=0.1)
-    assert difference.std() == pytest.approx(np.sqrt(0.625), rel=0.1)
+def test_without_pairs_the_interval_over_seeds_adds_the_variances_of_both_means():
+    """Compare with t(3 degrees of freedom) · √(2 · variance / 4)."""
+    gain = change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED), is_paired=False)
+    half_width = student_t(3).ppf(0.975) * np.sqrt(2 * SCORE_OF_SEED.var(ddof=1) / 4)
+    assert gain.high - gain.low == pytest.approx(2 * half_width, rel=0.01)
+    assert gain.over == "seeds and objects"
 
 
-@pytest.mark.parametrize("is_paired", [True, False])
-def test_a_single_seed_adds_no_spread(is_paired):
-    single = SCORE_OF_SEED[:1]
-    difference = replicate_difference(single + 0.5, single, is_paired)
-    np.testing.assert_array_equal(difference, 0.5)
+@pytest.mark.parametrize("objects", [(5, 5), (9, 9)])
+def test_intervals_of_few_objects_cover_the_truth(objects):
+    """The truth is a closed form. 0.05 are 2.5 standard errors of 120 draws at 0.95."""
+    setup = Setup("typical", objects)
+    coverage, _ = measure(setup, 120, methods=("jackknife",))["jackknife"]
+    is_auc_or_fraction = [METRICS.index(name) for name in ("auc", "recall", "FPR", "top-1")]
+    values, gains = coverage.reshape(2, -1)[:, is_auc_or_fraction]
+    assert values.min() >= 0.9
+    assert gains.min() >= 0.9
+    assert coverage.mean() >= 0.94
+
+
+@pytest.mark.parametrize(("object_count", "over"), [(4, THESE_OBJECTS), (5, OBJECTS)])
+def test_few_objects_have_an_interval_over_images(object_count, over):
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), name, None, (), f"{name}{number % count}.glb")
+        for name, count in {"orange": object_count, "pear": 9}.items()
+        for number in range(40 if name == "orange" else 50)
+    ]
+    logits = torch.randn(90, 2, generator=torch.Generator().manual_seed(1))
+    scored = pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
+    metrics = scored.metrics
+    assert (metrics.auc.over, metrics.recall.over) == (over, over)
+    assert metrics.false_positive_rate.over == OBJECTS
+    if over == THESE_OBJECTS:
+        recall = metrics.recall
+        wilson = binomtest(recall.hits, 40).proportion_ci(method="wilson")
+        assert (recall.low, recall.high) == pytest.approx((wilson.low, wilson.high))
 
 
 def draw_ranks(seed: int) -> tuple[list[str], np.ndarray]:
@@ -196,37 +217,21 @@ def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
         assert metric.low < metric.value < metric.high
 
 
-def test_the_interval_of_one_image_per_class_is_that_of_scipys_bootstrap_over_images():
-    """Compare up to chance: a step is 1/40, and the standard error of an end is below 0.01."""
+def test_the_interval_of_one_image_per_class_is_wilsons_up_to_rounding():
+    """The logit and Wilson's interval differ by less than 0.02 for 40 images."""
     names = [f"class {number}" for number in range(40)]
-    ranks = np.random.default_rng(4).integers(1, 4, 40)
-    hits = ranks == 1
-    reference = scipy_bootstrap(
-        (hits.astype(float),), np.mean, method="percentile", n_resamples=5000, rng=5
-    ).confidence_interval
-    replicates = bootstrap(partial(class_means, hits[None], names), np.arange(40))
-    metric = estimate(hits.mean(), replicates[0])
-    assert metric.low == pytest.approx(reference.low, abs=0.03)
-    assert metric.high == pytest.approx(reference.high, abs=0.03)
+    hits = np.random.default_rng(4).integers(1, 4, 40) == 1
+    units = Units([np.arange(40)], "images")
+    (metric,) = leave_out(partial(class_means, hits[None], names), units)
+    wilson = binomtest(int(hits.sum()), 40).proportion_ci(method="wilson")
+    ends = (metric.estimate.low, metric.estimate.high)
+    assert ends == pytest.approx((wilson.low, wilson.high), abs=0.03)
 
 
-@pytest.mark.parametrize(("second_is_found", "low"), [(False, 0.0), (True, 0.342380)])
-def test_the_interval_of_a_recall_is_over_objects(second_is_found, low):
-    """Compare with closed forms for two objects of 20 images.
-
-    If one object is found, a replicate shows the same object twice with the probability 1/2. If
-    both are found, the low end is 2 / (2 + z²), Wilson's for 2 of 2, with z = 1.959964.
-    """
-    classes = ["orange", "pear"]
-    photographs = [
-        Photograph(PurePosixPath(f"{number}.png"), "orange", None, (), f"{number // 20}.glb")
-        for number in range(40)
-    ]
-    logits = torch.tensor([[1.0, 0.0]] * 20 + [[float(second_is_found), 0.5]] * 20)
-    scored = pool(rank_classes(photographs, logits, classes, ["orange"]))
-    metric = scored.metrics.recall
-    assert metric.value == (1.0 if second_is_found else 0.5)
-    assert (metric.low, metric.high) == pytest.approx((low, 1.0), abs=1e-5)
+def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quantile():
+    found = mean_of(np.ones(140), np.arange(140) % 7).estimate
+    quantile = student_t(6).ppf(0.975)
+    assert (found.low, found.high) == pytest.approx((7 / (7 + quantile**2), 1))
 
 
 def test_the_interval_of_a_recall_is_wilsons_if_each_image_shows_another_object():
