@@ -433,7 +433,7 @@ def leave_out_units(parts: Sequence[ScoredGroup], name: str, seed: int) -> Jackk
             if mean.unit_count > 1:
                 without.append(value + (mean.without[0] - mean.value) / len(parts))
                 counts.append(mean.unit_count)
-    return Jackknife(value, without, min(counts), "objects and setups")
+    return Jackknife(value, without, min(counts, default=1), "objects and setups")
 
 
 def compare(parts: Sequence[ScoredGroup], control: str | None) -> list[str]:

@@ -171,6 +171,7 @@ def fraction(hits: int, n: int) -> Proportion:
         value=hits / n,
         low=float(ends.low),
         high=float(ends.high),
+        over=IMAGES,
         hits=hits,
         n=n,
     )

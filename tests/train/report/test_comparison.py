@@ -81,9 +81,10 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
 
 
 def compare(folders: list[Path], exclude=(), **options) -> dict[str, list[list[str]]]:
-    """Read the tables that compare the runs in some folders."""
+    """Read the tables that compare the runs in some folders, by the title before the intervals."""
     summaries = [summarize(folder) for folder in folders]
-    return read_markdown(format_comparison(summaries, exclude, **options))
+    tables = read_markdown(format_comparison(summaries, exclude, **options))
+    return {title.partition(", 95%")[0]: rows for title, rows in tables.items()}
 
 
 @pytest.fixture
@@ -350,7 +351,7 @@ def read_interval(cell: str) -> tuple[float, float, float]:
     return float(difference), float(low), float(high)
 
 
-def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(methods):
+def test_a_difference_has_a_wider_interval_than_a_bootstrap_over_three_seeds(methods):
     tables = compare(methods.folders)
     header, total, web = tables["random minus none (3 and 3 seeds, paired)"]
     assert header[:4] == ["source", "recall", "FPR", "AUC"]
@@ -362,8 +363,10 @@ def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(meth
     for cell, value, interval in zip((web[1], web[3]), values, intervals, strict=True):
         difference, low, high = read_interval(cell)
         assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.
-        # The ends vary by chance by up to 0.02, with 1,000 replicates.
-        assert (low, high) == pytest.approx(tuple(interval), abs=0.02)
+        # The ends vary by chance by up to 0.02, with 1,000 replicates. The bootstrap of three seeds
+        # has 2/3 of the variance between seeds, and t with two degrees of freedom is 2.2 · 1.96.
+        assert low < interval[0] + 0.02 and interval[1] - 0.02 < high
+        assert high - low < 2.8 * (interval[1] - interval[0])
 
 
 def test_networks_that_agree_on_n_oranges_differ_by_at_most_wilsons_limit_for_0_of_n(scored_run):

@@ -73,8 +73,8 @@ def test_the_patterns_are_named_if_they_are_the_only_lighting(tmp_path, environm
     ("low", "high", "expected"), [(-0.004, 0.364, ["−0.4", "+36"]), (0.0, 0.016, ["0", "+2"])]
 )
 def test_an_end_of_an_interval_is_shown_as_0_only_if_it_is_0(low, high, expected):
-    change = Difference(0.1, low, high, before=0.2, after=0.3)
-    interval = gain_sentence("Recall", change).partition("interval: ")[2]
+    change = Difference(0.1, low, high, "objects", before=0.2, after=0.3)
+    interval = gain_sentence("Recall", change).partition("over objects: ")[2]
     assert re.findall(r"[−+]?\d[\d.]*", interval) == expected
 
 

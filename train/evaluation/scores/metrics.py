@@ -577,7 +577,7 @@ class Jackknife:
         1, the interval is Wilson's for a fraction of the units.
         """
         value = self.value
-        if min(map(len, self.without)) < 2:
+        if min(map(len, self.without), default=0) < 2:
             return Estimate(value, 0.0, 1.0, self.over)
         spread = _Spread.of([np.zeros(len(values)) for values in self.without])
         if 0 < value < 1:
@@ -658,6 +658,8 @@ def change(
         margin = fraction(0, one.unit_count).high
         assert margin is not None
         return Estimate(value, -margin, margin, over)
+    if min(map(len, [*one.without, *other.without]), default=0) < 2:
+        return Estimate(value, -1.0, 1.0, over)
     variances = _Spread.of(one.without).variance * _Spread.of(other.without).variance
     covariance = sum(_covariance(*pair) for pair in pairs)
     correlation = covariance / variances**0.5 if variances > 0 else 0.0

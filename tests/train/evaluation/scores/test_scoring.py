@@ -32,7 +32,7 @@ from train.evaluation.scores.scoring import (
     write,
 )
 from train.evaluation.scores.sheet import FRAME_WIDTH, IMAGE_SIZE
-from train.evaluation.tables import fraction
+from train.evaluation.tables import THESE_OBJECTS, fraction
 
 
 class TableModel(torch.nn.Module):
@@ -278,7 +278,8 @@ class TestMeshes:
         auc = scores.to_summary()["auc"]
         assert auc["positive_objects"] == 4  # m, n, d, e
         assert auc["negative_objects"] == 4  # k, g, i, j
-        assert "objects and images" in format_scores(scores)
+        assert auc["over"] == THESE_OBJECTS
+        assert THESE_OBJECTS in format_scores(scores)
 
     @pytest.mark.parametrize(("mesh", "is_orange"), [("k", False), ("m", True), ("n", True)])
     def test_are_ranked_against_all_images_of_the_other_kind(self, scores, mesh, is_orange):
