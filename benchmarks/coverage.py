@@ -86,7 +86,7 @@ SETUPS = (
 
 
 def true_metrics(
-    positives: np.ndarray, negatives: np.ndarray, spreads: Sequence[float]
+    positives: np.ndarray, negatives: np.ndarray, spreads: Sequence[float | np.floating]
 ) -> np.ndarray:
     """Compute METRICS for scores that are mixtures of normal distributions.
 
@@ -104,7 +104,7 @@ def true_metrics(
             is_low = ndtr((negatives - middle) / spreads[1]).mean() > float(rate)
             low, high = (middle, high) if is_low else (low, middle)
         recalls.append(ndtr((positives - low) / spreads[0]).mean())
-    auc = ndtr((positives[:, None] - negatives) / np.hypot(*spreads)).mean()
+    auc = ndtr((positives[:, None] - negatives) / np.hypot(spreads[0], spreads[1])).mean()
     found = ndtr(positives / spreads[0])
     by_class = [found[first::CLASSES].mean() for first in range(min(CLASSES, len(found)))]
     false_positive_rate = ndtr(negatives / spreads[1]).mean()
@@ -146,18 +146,20 @@ def simulate(
         scores.append([run.ravel() for run in runs])
         means.append((before[:, 0], after[:, 0]))
     spread = np.hypot(1, of_image)
-    before, after = zip(*means, strict=True)
+    (positives, positives_after), (negatives, negatives_after) = means
+    spreads = (np.hypot(spread, of_seed), spread)
     truth = [
-        true_metrics(*before, (1, 1)),
-        true_metrics(*after, (np.hypot(spread, of_seed), spread)),
+        true_metrics(positives, negatives, (1, 1)),
+        true_metrics(positives_after, negatives_after, spreads),
     ]
     return [list(run) for run in zip(*scores, strict=True)], np.stack(truth)
 
 
 def statistics(
-    positives: np.ndarray, negatives: np.ndarray, classes: np.ndarray
+    scores: Sequence[np.ndarray], classes: Sequence[str]
 ) -> list[tuple[Callable[..., np.ndarray], list[int]]]:
     """Return the functions of image counts that compute METRICS, with the groups they take."""
+    positives, negatives = scores
     is_found = positives[None] > 0
     return [
         (partial(auc_and_recalls, positives, negatives), [0, 1]),
@@ -168,17 +170,17 @@ def statistics(
 
 
 def jackknives(
-    scores: Sequence[np.ndarray], classes: np.ndarray, units: Sequence[np.ndarray]
+    scores: Sequence[np.ndarray], classes: Sequence[str], units: Sequence[np.ndarray]
 ) -> list[Jackknife]:
     """Leave out each unit of positives and negatives for each of METRICS."""
     results = []
-    for statistic, groups in statistics(*scores, classes):
+    for statistic, groups in statistics(scores, classes):
         results += leave_out(statistic, Units([units[group] for group in groups], ""))
     return results
 
 
 def intervals(
-    runs: Sequence[Sequence[np.ndarray]], classes: np.ndarray, units: Sequence[np.ndarray]
+    runs: Sequence[Sequence[np.ndarray]], classes: Sequence[str], units: Sequence[np.ndarray]
 ) -> list[Estimate]:
     """Return the library's intervals of the first network, and of the gain of the second."""
     first, *second = (jackknives(scores, classes, units) for scores in runs)
@@ -189,7 +191,7 @@ def intervals(
 
 def resampled(
     runs: Sequence[Sequence[np.ndarray]],
-    classes: np.ndarray,
+    classes: Sequence[str],
     objects: Sequence[np.ndarray],
     generator: np.random.Generator,
 ) -> list[Estimate]:
@@ -202,7 +204,7 @@ def resampled(
     draws = []
     for scores in runs:
         rows = []
-        for statistic, groups in statistics(*scores, classes):
+        for statistic, groups in statistics(scores, classes):
             rows += list(statistic(*(counts[group] for group in groups)))
         draws.append(rows)
     first, second = np.array(draws[0]), np.mean(draws[1:], axis=0)
@@ -228,7 +230,7 @@ def measure(
     generator = np.random.default_rng(0)
     objects = [np.arange(count).repeat(setup.images) for count in setup.objects]
     images = [np.arange(len(object_of_image)) for object_of_image in objects]
-    classes = objects[0] % CLASSES
+    classes = [str(number % CLASSES) for number in objects[0]]
     truth = true_values(setup)
     found: dict[str, list[np.ndarray]] = {}
     for _ in range(repetitions):

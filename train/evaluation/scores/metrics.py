@@ -320,7 +320,7 @@ class Pool(ShortRepr):
     @cached_property
     def _ranked(self) -> dict[str, "Jackknife"]:
         """Values without each unit of the known metrics that depend on a ranking."""
-        jackknives = {}
+        jackknives: dict[str, Jackknife] = {}
         if self.for_roc.positives and self.for_roc.negatives:
             statistic = partial(auc_and_recalls, *self.scores)
             of_roc = leave_out(statistic, choose_units(*self.for_roc))
@@ -568,8 +568,8 @@ class Jackknife:
     over: str
 
     @cached_property
-    def estimate(self) -> Estimate:
-        """Value with its 95% interval: logit(value) ± t · standard error.
+    def interval(self) -> tuple[float, float]:
+        """Ends of the 95% interval: logit(value) ± t · standard error.
 
         The variance of logit(value) is the sum of the jackknife variances of
         the groups (Efron and Stein 1981). The quantile t has the degrees of
@@ -578,16 +578,20 @@ class Jackknife:
         """
         value = self.value
         if min(map(len, self.without), default=0) < 2:
-            return Estimate(value, 0.0, 1.0, self.over)
+            return 0.0, 1.0
         spread = _Spread.of([np.zeros(len(values)) for values in self.without])
         if 0 < value < 1:
             spread = _Spread.of([_logit(_keep_errors(item, value)) for item in self.without])
         if spread.variance > 0:
             half_width = spread.quantile * spread.variance**0.5
             low, high = 1 / (1 + np.exp([half_width, -half_width] - _logit(value)))
-        else:
-            low, high = _wilson(value, self.unit_count, spread.quantile)
-        return Estimate(value, float(low), float(high), self.over)
+            return float(low), float(high)
+        return _wilson(value, self.unit_count, spread.quantile)
+
+    @property
+    def estimate(self) -> Estimate:
+        """Value with its 95% interval."""
+        return Estimate(self.value, *self.interval, self.over)
 
 
 def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
@@ -663,13 +667,11 @@ def change(
     variances = _Spread.of(one.without).variance * _Spread.of(other.without).variance
     covariance = sum(_covariance(*pair) for pair in pairs)
     correlation = covariance / variances**0.5 if variances > 0 else 0.0
-    high, low = one.estimate, other.estimate
-    return Estimate(
-        value,
-        max(-1.0, value - _hypotenuse(one.value - high.low, low.high - other.value, correlation)),
-        min(1.0, value + _hypotenuse(high.high - one.value, other.value - low.low, correlation)),
-        over,
-    )
+    low, high = one.interval
+    other_low, other_high = other.interval
+    down = _hypotenuse(one.value - low, other_high - other.value, correlation)
+    up = _hypotenuse(high - one.value, other.value - other_low, correlation)
+    return Estimate(value, max(-1.0, value - down), min(1.0, value + up), over)
 
 
 def _hypotenuse(a: float, b: float, correlation: float) -> float:
@@ -708,9 +710,9 @@ def _keep_errors(values: np.ndarray, value: float) -> np.ndarray:
     return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
 
 
-def _logit(values: np.ndarray) -> np.ndarray:
+def _logit(values: np.ndarray | float) -> np.ndarray:
     """Log-odds of values in (0, 1)."""
-    return np.log(values) - np.log1p(-values)
+    return np.log(values) - np.log1p(np.negative(values))
 
 
 def _wilson(value: float, n: int, quantile: float) -> tuple[float, float]:
