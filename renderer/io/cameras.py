@@ -28,7 +28,7 @@ TRANSFORMS = "transforms.json"
 COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 # Camera models of nerfstudio that are perspective. Parameters of lens distortion, which
 # they also have, are checked separately.
-PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
+PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 # Names of the parameters of lens distortion in transforms.json.
 DISTORTION = (
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4"),
@@ -43,7 +43,9 @@ OTHER_CAMERAS = (
 # Advice at the end of errors about lens distortion.
 UNDISTORT = "undistort the images first, for example with colmap image_undistorter"
 # Exceptions that Python raises if a file lacks an entry or has a wrong one.
-_DAMAGED_FILE_ERRORS = (ValueError, KeyError, TypeError, IndexError, AttributeError)
+_DAMAGED_FILE_ERRORS = (
+    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
+)
 
 
 def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
@@ -146,7 +148,8 @@ def _add(values: dict[str, Any], name: str, value: object) -> None:
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines of a text file that are neither empty nor comments."""
-    for line in path.read_text(encoding="utf-8-sig").splitlines():
+    # `splitlines` would also split at other characters, which may be in names.
+    for line in path.read_text(encoding="utf-8-sig").split("\n"):
         if line.strip() and not line.lstrip().startswith("#"):
             yield line
 
@@ -178,7 +181,8 @@ def _is_points(line: str) -> bool:
     words = line.split()
     try:
         np.array(words, dtype=float)
-        np.array(words[2::3], dtype=int)
+        # The number of no point is -1, or 2^64 - 1.
+        [int(word) for word in words[2::3]]
     except ValueError:
         return False
     return len(words) % 3 == 0
@@ -274,7 +278,9 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
             camera_to_world = np.array(frame["transform_matrix"], dtype=float)
             view_matrix = np.linalg.inv(camera_to_world)
             camera = PinholeCamera.from_matrix(view_matrix, intrinsics, size, "opengl")
-            _add(cameras, str(frame["file_path"]), camera)
+            if not isinstance(frame["file_path"], str):
+                raise TypeError(f"file_path is {frame['file_path']}")
+            _add(cameras, frame["file_path"], camera)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except _DAMAGED_FILE_ERRORS as error:
@@ -300,9 +306,10 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
         InputError: If the camera is not perspective or has distortion, or if
             the image size is missing.
     """
-    model = entries.get("camera_model", "PINHOLE")
-    if model not in PERSPECTIVE:
-        raise InputError(f"camera_model={model} is not supported: {UNDISTORT}")
+    for name in ("camera_model", "camera_type"):
+        model = entries.get(name, "PINHOLE")
+        if str(model).upper() not in PERSPECTIVE:
+            raise InputError(f"{name}={model} is not supported: {UNDISTORT}")
     for name in OTHER_CAMERAS:
         value = entries.get(name)
         # The motion of a rolling shutter is a list of numbers.

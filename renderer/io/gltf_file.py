@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from renderer.io.images import eight_bits
+from renderer.io.images import eight_bits, identify
 from renderer.io.mesh_file import MeshFile
 from renderer.memory import require_memory
 
@@ -29,8 +29,6 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Types of the chunks of a .glb file (4.4.3): "JSON" and "BIN\0".
 JSON_CHUNK = 0x4E4F534A
 BINARY_CHUNK = 0x004E4942
-# Formats of images (3.8.2 and EXT_texture_webp).
-FORMATS = ("PNG", "JPEG", "WEBP")
 WEBP = "EXT_texture_webp"
 INSTANCING = "EXT_mesh_gpu_instancing"
 # Bytes that a number of an accessor takes while it is read.
@@ -153,7 +151,7 @@ class GltfFile:
         content = (
             self._resource(entry["uri"]) if "uri" in entry else self._view(entry["bufferView"])
         )
-        image = Image.open(io.BytesIO(content), formats=FORMATS)
+        image = identify(io.BytesIO(content))
         texel_bytes = TEXEL_BYTES * image.width * image.height
         require_memory("textures", texel_bytes, torch.device("cpu"))
         return eight_bits(image)

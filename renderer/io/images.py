@@ -11,6 +11,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 from PIL import Image, ImageOps, features
+from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
 from torch import Tensor
 
 from renderer.errors import InputError, require_file
@@ -205,6 +206,8 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
     """
     ImageOps.exif_transpose(image, in_place=True)
     image = eight_bits(image)
+    if image.mode == "La":
+        image = image.convert("LA")
     is_gray = image.mode in ("1", "L", "LA", "La")
     if image.has_transparency_data:
         rgba = image.convert("RGBA")
@@ -252,10 +255,15 @@ def eight_bits(image: Image.Image) -> Image.Image:
             f"the pixels are {kind}, so the value of white is unknown: save 8 or 16 bits"
         )
     if image.mode.startswith("I"):
-        # Pixels of the mode "I" have 16 bits. `Image.convert` would
-        # clip their values at 255 instead of dividing them by 256.
+        # Pixels of the mode "I" have 16 bits, or the 12 bits of a TIFF file. `Image.convert`
+        # would clip their values at 255 instead of dividing them.
         pixels = np.asarray(image)
-        scaled = Image.fromarray(np.clip(pixels // 256, 0, 255).astype(np.uint8))
+        tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
+        bits = tags.get(BITSPERSAMPLE, (16,))[0]
+        values = np.clip(pixels >> (bits - 8), 0, 255).astype(np.uint8)
+        # Pillow inverts such a TIFF file only if it has at most 8 bits.
+        is_white_zero = tags.get(PHOTOMETRIC_INTERPRETATION) == 0
+        scaled = Image.fromarray(255 - values if is_white_zero else values)
         key = image.info.get("transparency")
         if key is not None:
             scaled.putalpha(Image.fromarray(np.where(pixels == key, 0, 255).astype(np.uint8)))

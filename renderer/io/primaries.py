@@ -8,6 +8,8 @@ import numpy as np
 REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Chromaticities that differ by at most this are those of Rec. 709, rounded.
 ROUNDING = 1e-3
+# Primaries of cameras are at most 1.5. Larger numbers may be percentages.
+LARGEST = 2
 # Matrix from XYZ to the responses of cones in Bradford's chromatic adaptation
 # (ICC.1:2022, annex E).
 BRADFORD = np.array(
@@ -33,6 +35,8 @@ def to_rec709(chromaticities: Sequence[float], adapt: bool) -> np.ndarray | None
     if given.shape == (8,) and np.abs(given - REC_709).max() <= ROUNDING:
         return None
     error = ValueError(f"the primaries {given.tolist()} span no colors")
+    if np.abs(given).max(initial=0) > LARGEST:
+        raise error
     try:
         theirs = BRADFORD @ _to_xyz(given)
     except (ValueError, np.linalg.LinAlgError):

@@ -49,8 +49,9 @@ LARGEST_MAP = 4096
 _RGBE_BITS = 8
 # Names of the channels of an .npy array for each possible number of channels. Y is gray.
 _CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
-# Possible names of an alpha channel, in lower case.
-_ALPHA_NAMES = ("a", "alpha")
+# Possible names of a channel that is no light, or of its layer, in lower case: alpha, depth
+# (OpenEXR reserves Z and ZBack for it) and numbers of objects.
+_OTHER_NAMES = {"a", "alpha", "z", "zback", "depth", "mist", "id", "indexob", "indexma"}
 # Possible names of the three color channels, in lower case.
 _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
@@ -419,7 +420,11 @@ def _color_channels(names: Sequence[str]) -> list[int]:
             red_green_blue = [(layer, color_name) for color_name in color_names]
             if set(red_green_blue) <= set(layers_and_channels):
                 return [layers_and_channels.index(channel) for channel in red_green_blue]
-    gray_channels = [index for index, channel in enumerate(channels) if channel not in _ALPHA_NAMES]
+    gray_channels = [
+        index
+        for index, name in enumerate(names)
+        if _OTHER_NAMES.isdisjoint(name.casefold().split("."))
+    ]
     if len(gray_channels) == 1:
         return gray_channels * 3
     raise InputError(

@@ -1,6 +1,7 @@
 """Read masks, which tell the pixels of an object in a photograph from the others."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from PIL import ImageOps
 
 from renderer.errors import InputError, require_file, single_line
@@ -57,8 +58,7 @@ def _levels(path: str) -> np.ndarray:
             alpha = rgba[..., 3]
             if alpha.min() < alpha.max():
                 opaque = rgba[..., :3][alpha >= WHITE]
-                is_black_and_white = np.isin(opaque, (0, 255)).all() and np.ptp(opaque) > 0
-                if opaque.size and is_black_and_white:
+                if {*np.unique(opaque).tolist()} == {0, 255}:
                     raise ValueError("it is black and white, and a part is transparent")
                 print(f"mask={path}: the opaque part is the object")
                 return _white_on_black(path, alpha)
@@ -93,6 +93,14 @@ def _white_on_black(path: str, values: np.ndarray) -> np.ndarray:
         if levels[1] not in (1, 255):
             print(f"mask={path}: the value {levels[1]} is the object")
         return np.where(values > 0, 255, 0).astype(np.uint8)
-    if levels[-1] < WHITE or levels[0] > 255 - WHITE:
+    # NaN, which sorts last, is not white.
+    if not levels[-1] >= WHITE or levels[0] > 255 - WHITE:
         raise ValueError(f"its values are from {levels[0]} to {levels[-1]} of 255")
+    # A pixel at the edge of the object has a neighbor of another value.
+    neighbors = sliding_window_view(values, (3, 3))
+    is_flat = neighbors.min(axis=(2, 3)) == neighbors.max(axis=(2, 3))
+    areas = np.unique(values[1:-1, 1:-1][is_flat])
+    gray = areas[(areas > 255 - WHITE) & (areas < WHITE)]
+    if len(gray):
+        raise ValueError(f"areas of it have the gray value {gray[0]}")
     return values.astype(np.uint8)

@@ -91,11 +91,24 @@ def test_points_are_where_cameras_of_colmap_see_them(tmp_path):
         ("1.5 2.5 -1", None),
         ("100 200 7 3 4 8 5 6 9 10 11 12", "1 2 3 4 5 6 7 8 9"),
         ("1e2 2.5 -1", "1 2 -1\n\n"),
+        ("1.5 2.5 18446744073709551615", None),
     ],
 )
 def test_images_of_colmap_are_read_with_and_without_their_lines_of_points(tmp_path, points):
     write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y], points)
     require_expected(tmp_path)
+
+
+def test_a_line_of_colmap_ends_only_at_a_line_feed(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.NAMES", ["a\x85b.png", "a\u2028b.png"])
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
+    require_expected(tmp_path)
+
+
+def test_a_field_of_view_of_zero_is_refused(tmp_path):
+    write_transforms(tmp_path / "a.json", camera_angle_x=0)
+    with pytest.raises(InputError, match=r"a\.json"):
+        renderer.load_cameras(tmp_path / "a.json")
 
 
 def test_a_name_that_occurs_twice_is_refused(tmp_path, monkeypatch):
@@ -116,6 +129,7 @@ def test_a_name_that_occurs_twice_is_refused(tmp_path, monkeypatch):
         {"rolling_shutter": [0, 0, 0.1, 0]},
         {"distortion_params": [0.1, 0, 0, 0]},
         {"ftheta_p1": 0.4},
+        {"camera_type": "fisheye"},
     ],
 )
 @pytest.mark.parametrize("of_frame", [False, True])

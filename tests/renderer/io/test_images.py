@@ -262,6 +262,37 @@ def test_16_bit_tiff_files_are_turned_and_scaled(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "a.tif")[..., 0], np.rot90(pixels // 256))
 
 
+def tiff(content: bytes, bits: int, photometric: int, extra: int | None = None) -> bytes:
+    """Write a TIFF file of 4 × 1 gray pixels (TIFF 6.0, section 2)."""
+    samples = 1 if extra is None else 2
+    tags = [(256, 4), (257, 1), (258, bits if samples == 1 else bits * 65537), (259, 1)]
+    tags += [(262, photometric), (273, 8), (277, samples), (278, 1), (279, len(content))]
+    tags += [] if extra is None else [(338, extra)]
+    content += bytes(len(content) % 2)
+    counts = {258: samples}
+    entries = b"".join(
+        struct.pack("<HHII", tag, 3, counts.get(tag, 1), value) for tag, value in tags
+    )
+    header = struct.pack("<2sHI", b"II", 42, 8 + len(content))
+    return header + content + struct.pack("<H", len(tags)) + entries + bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("content", "bits", "photometric", "extra", "expected"),
+    [
+        (struct.pack("<4H", 0, 0x4000, 0x8000, 0xFFFF), 16, 0, None, [255, 191, 127, 0]),
+        (bytes.fromhex("000400800fff"), 12, 1, None, [0, 64, 128, 255]),
+        (bytes([0, 0, 64, 128, 128, 128, 255, 255]), 8, 1, 1, [255, 191, 255, 255]),
+    ],
+    ids=["white is 0", "12 bits", "premultiplied alpha"],
+)
+def test_gray_tiff_files_have_the_values_of_their_tags(
+    tmp_path, content, bits, photometric, extra, expected
+):
+    (tmp_path / "a.tif").write_bytes(tiff(content, bits, photometric, extra))
+    np.testing.assert_array_equal(read(tmp_path / "a.tif")[0, :, 1], expected)
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.float32])
 def test_tiff_files_whose_white_is_unknown_are_refused(tmp_path, dtype):
     Image.fromarray(np.full((4, 4), 200, dtype)).save(tmp_path / "a.tif")

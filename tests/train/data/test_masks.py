@@ -39,6 +39,7 @@ MASKS = {
     "palette, white first": palette((0, 0, 0), (255, 255, 255)),
     "color": rgba((0, 0, 200), (0, 0, 0)),
     "cut-out": rgba((210, 180, 80, 255), (50, 40, 30, 0)),
+    "translucent cut-out": rgba((210, 180, 80, 128), (50, 40, 30, 0)),
     "black cut-out": rgba((0, 0, 0, 255), (255, 255, 255, 0)),
     "white with transparency": rgba((255, 255, 255, 255), (0, 0, 0, 0)),
     "gray cut-out": rgba((90, 90, 90, 255), (200, 200, 200, 0)).convert("LA"),
@@ -109,8 +110,18 @@ def black_and_white_with_alpha() -> Image.Image:
         Image.new("L", (16, 12), 0),
         black_and_white_with_alpha(),
         Image.fromarray(WHITE_ON_BLACK).resize((17, 12)),
+        Image.fromarray(np.where(np.arange(16) > 10, 128, WHITE_ON_BLACK).astype(np.uint8)),
     ],
-    ids=["three colors", "no black", "labels 0, 1, 2", "white", "black", "two masks", "size"],
+    ids=[
+        "three colors",
+        "no black",
+        "labels 0, 1, 2",
+        "white",
+        "black",
+        "two masks",
+        "size",
+        "gray area",
+    ],
 )
 def test_a_mask_that_does_not_tell_where_the_object_is_is_refused(tmp_path, image):
     with pytest.raises(InputError, match=r"mask=.*mask\.png"):
