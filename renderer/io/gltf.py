@@ -30,8 +30,21 @@ STRIP = 5
 FAN = 6
 # Alpha from which on a texel with 8 bits counts as opaque.
 ALMOST_ONE = 1 - 0.5 / 255
-# Bytes that a face, and a joint of a vertex, take while the parts are read and joined.
+# Widths of the attributes of vertices that are read (3.7.2.1), by the first part of their names.
+ATTRIBUTES = {
+    "POSITION": (3,),
+    "NORMAL": (3,),
+    "TEXCOORD": (2,),
+    "COLOR": (3, 4),
+    "JOINTS": (4,),
+    "WEIGHTS": (4,),
+}
+# Beginnings of the names of attributes that joints use.
+SKINNING = ("JOINTS", "WEIGHTS")
+DRACO = "KHR_draco_mesh_compression"
+# Bytes that a face, a vertex, and a joint of a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
+VERTEX_BYTES = 400
 JOINT_BYTES = 200
 
 
@@ -65,7 +78,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for feature in ignored_features(file.tree):
         mesh_file.ignore(feature)
     nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
-    skeleton = Skeleton(file) if "skins" in file.tree else None
+    skeleton = Skeleton(file) if file.tree.get("skins") else None
     _require_memory(file, nodes, 0 if skeleton is None else len(skeleton))
     material = cache(lambda index: read_material(file, index, gloss))
     part = cache(lambda *key: _read_part(file, material, *key))
@@ -73,9 +86,13 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for index in nodes:
         node = file.tree["nodes"][index]
         mesh = file.entry("meshes", node["mesh"])
+        if "skin" in node:
+            file.entry("skins", node["skin"])
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
-            if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
+            if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
+                mesh_file.ignore("points and lines")
+            else:
                 read = part(node["mesh"], number, weights)
                 placed_parts += _place(file, index, read, skeleton)
     if not placed_parts and any(
@@ -100,7 +117,8 @@ def _require_memory(file: GltfFile, nodes: list[int], joint_count: int) -> None:
                 corners = file.entry("accessors", primitive["indices"])["count"]
             faces = corners / 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else corners
             copies = file.instance_count(index)
-            needed += copies * int(FACE_BYTES * faces + JOINT_BYTES * joint_count * vertices)
+            vertex_bytes = VERTEX_BYTES + JOINT_BYTES * joint_count
+            needed += copies * int(FACE_BYTES * faces + vertex_bytes * vertices)
     require_memory("its faces", needed, torch.device("cpu"))
 
 
@@ -110,7 +128,8 @@ def _read_part(
     """Read a primitive of a mesh, with its morph targets at the given weights."""
     primitive = file.tree["meshes"][mesh]["primitives"][number]
     material: Material = material_of(primitive.get("material"))
-    attributes = _attributes(file, primitive, weights)
+    uv_name = "" if material.placement is None else f"TEXCOORD_{material.placement.uv_set}"
+    attributes = _attributes(file, primitive, weights, uv_name)
     positions = attributes["POSITION"]
     faces = _faces(file, primitive, len(positions))
     colors = np.ones((len(positions), 4))
@@ -120,29 +139,41 @@ def _read_part(
     colors *= material.color
     uvs = np.zeros((len(positions), 2))
     if material.placement is not None:
-        name = f"TEXCOORD_{material.placement.uv_set}"
-        if name not in attributes:
+        if uv_name not in attributes:
             raise ValueError("the mesh has a texture, but no texture coordinates")
-        uvs = attributes[name]
+        uvs = attributes[uv_name]
     require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
     material, uvs = material.placed(uvs)
     normals = attributes.get("NORMAL", np.zeros_like(positions))
     values = np.concatenate([uvs, colors[:, 3:], colors[:, :3], normals], axis=1)
-    joints = {key: v for key, v in attributes.items() if key.startswith(("JOINTS", "WEIGHTS"))}
+    joints = {key: v for key, v in attributes.items() if key.startswith(SKINNING)}
     return _Primitive(positions, faces, values[faces], material, joints)
 
 
 def _attributes(
-    file: GltfFile, primitive: dict[str, Any], weights: tuple[float, ...]
+    file: GltfFile, primitive: dict[str, Any], weights: tuple[float, ...], uv_name: str
 ) -> dict[str, np.ndarray]:
-    """Read the attributes of the vertices of a primitive, with its morph targets (3.7.2.2)."""
+    """Read the attributes of the vertices of a primitive, with its morph targets (3.7.2.2).
+
+    Attributes that nothing uses, such as other texture coordinates, are not read.
+    """
+    if DRACO in primitive.get("extensions", {}) and any(
+        "bufferView" not in file.entry("accessors", index)
+        for index in primitive["attributes"].values()
+    ):
+        raise ValueError(f"its arrays are compressed ({DRACO}): export it without compression")
     attributes = {}
     for name, index in primitive["attributes"].items():
+        kind = name.partition("_")[0]
+        if name not in ("POSITION", "NORMAL", "COLOR_0", uv_name) and kind not in SKINNING:
+            continue
         values = file.array(index)
-        is_vector = not name.startswith("JOINTS")
+        if values.ndim != 2 or values.shape[1] not in ATTRIBUTES[kind]:
+            raise ValueError(f"{name} has a wrong number of values for each vertex")
+        is_vector = kind != "JOINTS"
         if is_vector and values.dtype.kind in "iu":
             # Colors and weights must be normalized. Files that forget to say so are common.
-            if name.startswith(("COLOR", "WEIGHTS")):
+            if kind in ("COLOR", "WEIGHTS"):
                 values = values / np.iinfo(values.dtype).max
             elif QUANTIZATION not in file.tree.get("extensionsUsed", ()):
                 raise ValueError(f"{name} has integers without {QUANTIZATION}: export it again")
@@ -153,7 +184,11 @@ def _attributes(
     for weight, target in zip(weights, targets, strict=False):
         for name, index in target.items():
             if weight != 0 and name in attributes:
-                attributes[name] = attributes[name] + weight * file.array(index)
+                change = file.array(index)
+                # NumPy would repeat a single row.
+                if len(change) != len(attributes[name]):
+                    raise ValueError(f"a morph target has {len(change)} entries of {name}")
+                attributes[name] = attributes[name] + weight * change
     vertex_count = len(attributes["POSITION"])
     for name, values in attributes.items():
         if len(values) != vertex_count:
@@ -170,7 +205,7 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
             raise ValueError(f"it has indices of faces beyond its {vertex_count} vertices")
         indices = indices.astype(np.int64)
     mode = primitive.get("mode", TRIANGLES)
-    if mode == TRIANGLES:
+    if mode == TRIANGLES or len(indices) < 3:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
     if mode == FAN:
         first = np.full(max(len(indices) - 2, 0), indices[0])

@@ -5,13 +5,13 @@ to are read only if they lie below its folder. Positions, normals and vectors
 are rows.
 """
 
-import base64
 import io
 import json
 import struct
 from collections import Counter
 from functools import cached_property
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ JSON_CHUNK = 0x4E4F534A
 BINARY_CHUNK = 0x004E4942
 WEBP = "EXT_texture_webp"
 INSTANCING = "EXT_mesh_gpu_instancing"
+VISIBILITY = "KHR_node_visibility"
 # Bytes that a number of an accessor takes while it is read.
 ARRAY_BYTES = 16
 # Bytes that a texel takes while its image is read and as a texture.
@@ -104,8 +105,10 @@ class GltfFile:
         stride = self.entry("bufferViews", index).get("byteStride", width * size)
         offset = location.get("byteOffset", 0)
         end = offset + stride * (count - 1) + width * size
+        if stride < width * size:
+            raise ValueError(f"the elements of an array overlap in its buffer view {index}")
         # NumPy would read bytes before the buffer at a negative offset.
-        if min(offset, stride, count) < 0 or end > len(view):
+        if min(offset, count) < 0 or end > len(view):
             raise ValueError(f"an array ends behind its buffer view {index}: the file is damaged")
         return np.ndarray((count, width), dtype, view, offset, (stride, size))
 
@@ -135,7 +138,9 @@ class GltfFile:
     def _resource(self, uri: str) -> bytes:
         """Read the bytes that a URI holds (a data URI), or of a file below the folder."""
         if uri.startswith("data:"):
-            return base64.b64decode(uri.partition(",")[2])
+            with urlopen(uri) as response:
+                content: bytes = response.read()
+            return content
         return self.file.read(uri)
 
     # Images
@@ -191,30 +196,35 @@ class GltfFile:
         return dict(edges)
 
     def scene_nodes(self) -> list[int]:
-        """List the nodes of the default scene, parents before their children."""
+        """List the visible nodes of the default scene, parents before their children."""
         # `poses` checks that the nodes form trees. Without this
         # check, 40 nodes could stand for 2^40 copies of a mesh.
-        nodes = list(self.poses)
-        if "scenes" not in self.tree:
-            return nodes
-        roots = self.entry("scenes", self.tree.get("scene", 0)).get("nodes", [])
-        listed = []
+        roots = [node for node in self.poses if node not in self.parents]
+        if "scenes" in self.tree:
+            roots = self.entry("scenes", self.tree.get("scene", 0)).get("nodes", [])
+        # A dictionary without values. A scene may list a node and also its parent.
+        listed: dict[int, None] = {}
         # The next node is at the end.
         waiting = list(dict.fromkeys(reversed(roots)))
         while waiting:
             node = waiting.pop()
-            listed.append(node)
-            waiting += reversed(self.entry("nodes", node).get("children", []))
-        return listed
+            entry = self.entry("nodes", node)
+            # The children of a hidden node are hidden, too.
+            if entry.get("extensions", {}).get(VISIBILITY, {}).get("visible", True):
+                listed[node] = None
+                waiting += reversed(entry.get("children", []))
+        return list(listed)
 
     def instance_count(self, index: int) -> int:
         """Count the copies of its mesh that a node shows (EXT_mesh_gpu_instancing)."""
-        counts = [self.entry("accessors", i)["count"] for i in self._instancing(index).values()]
+        counts = {self.entry("accessors", i)["count"] for i in self._instancing(index).values()}
+        if len(counts) > 1:
+            raise ValueError(f"the arrays of {INSTANCING} have different lengths")
         return min(counts, default=1)
 
     def instances(self, index: int) -> np.ndarray:
         """Return the matrices (N, 4, 4) that place the N copies of a node's mesh in the scene."""
-        arrays = {name.lower(): self.array(i) for name, i in self._instancing(index).items()}
+        arrays = {name: self.array(i) for name, i in self._instancing(index).items()}
         copies = [
             _local_matrix({name: values[row] for name, values in arrays.items()})
             for row in range(self.instance_count(index))
@@ -225,7 +235,9 @@ class GltfFile:
         """Return the accessors of the translations, rotations and scales of the copies."""
         extensions = self.tree["nodes"][index].get("extensions", {})
         attributes: dict[str, int] = extensions.get(INSTANCING, {}).get("attributes", {})
-        return attributes
+        # Files may have more attributes, such as a number of each copy.
+        places = ("translation", "rotation", "scale")
+        return {name: attributes[name.upper()] for name in places if name.upper() in attributes}
 
 
 def _chunks(content: bytes) -> dict[int, bytes]:

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from renderer.image import decode, encode
-from renderer.io.gltf_file import INSTANCING, TEXEL_BYTES, WEBP, GltfFile
+from renderer.io.gltf_file import INSTANCING, TEXEL_BYTES, VISIBILITY, WEBP, GltfFile
 from renderer.memory import require_memory
 
 TRANSFORM = "KHR_texture_transform"
@@ -23,7 +23,10 @@ SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 SPECULAR = "KHR_materials_specular"
 IOR = "KHR_materials_ior"
 # Extensions that are read. SPECULAR and IOR are read only for the gloss.
-READ = {TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR, WEBP, INSTANCING}
+READ = {
+    *(TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR),
+    *(WEBP, INSTANCING, VISIBILITY),
+}
 # Beginnings of the names of extensions that may be required by a
 # file but ignored, because they change neither shape nor color.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_")

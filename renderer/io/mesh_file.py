@@ -1,6 +1,7 @@
 """A mesh file, the files that it refers to, and what a reader ignores of it."""
 
 import io
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,14 +49,16 @@ class Part(NamedTuple):
         mesh = transformed(self.mesh, self.matrix)
         if self.normals is None:
             return mesh, np.zeros((len(mesh.faces), 3, 3))
+        # Only finite normals count. Some programs write NaN for faces without area.
+        normals = np.where(np.abs(self.normals) <= MAX_MAGNITUDE, self.normals, 0)
         # The matrix of cofactors is the inverse of the transpose times the determinant,
         # and exists even without an inverse.
         u, v, w = self.matrix[:3, :3]
         cofactors = np.array([np.cross(v, w), np.cross(w, u), np.cross(u, v)])
         if u @ cofactors[0] < 0:
             # `transformed` reverses the corners of a mirrored mesh.
-            return mesh, self.normals[:, [0, 2, 1]] @ -cofactors.T
-        return mesh, self.normals @ cofactors.T
+            return mesh, normals[:, [0, 2, 1]] @ -cofactors.T
+        return mesh, normals @ cofactors.T
 
 
 class MeshFile:
@@ -82,7 +85,8 @@ class MeshFile:
         """
         written = name.strip('" \t').replace("\\", "/")
         errors = []
-        for path in (written, unquote(written)):
+        # A name in a text file may be followed by a comment.
+        for path in (written, unquote(written), re.split(r"\s+#", written)[0]):
             for candidate in (f"{folder}{path}", path, path.rpartition("/")[2]):
                 try:
                     return file_below(self.path.parent, candidate).read_bytes()
@@ -136,6 +140,11 @@ def as_utf8(text: bytes) -> bytes:
     except UnicodeDecodeError:
         return text.decode("latin-1").encode()
     return text
+
+
+def without_comments(text: bytes) -> bytes:
+    """Remove comments from # on, but keep 1.#IND and 1.#INF, which are NaN and infinity."""
+    return re.sub(rb"(?<!\.)#.*", b"", text)
 
 
 def require_bounded(**values: np.ndarray) -> None:

@@ -178,7 +178,11 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
         else:
             parts = _read_parts(file, suffix)
     except Exception as error:
-        raise InputError(f"{path} cannot be read as a mesh: {single_line(error)}") from error
+        message = single_line(error)
+        # The message of a missing key is only this key.
+        if isinstance(error, KeyError):
+            message = f"the entry {message} is missing or unknown, so export the mesh again"
+        raise InputError(f"{path} cannot be read as a mesh: {message}") from error
     file.warn(stacklevel=3)
     return parts
 

@@ -18,6 +18,7 @@ from renderer.io.mesh_file import (
     require_bounded,
     triangles_of,
     unit_colors,
+    without_comments,
     words_per_line,
 )
 
@@ -77,8 +78,7 @@ class _Lines(NamedTuple):
     def words(self) -> tuple[np.ndarray, bytes]:
         """Return the number of words of each line, and the lines, without keyword and comment."""
         text = b"".join(self.blocks)
-        if b"#" in text:
-            text = re.sub(rb"#.*", b"", text)
+        text = without_comments(text)
         if text.count(self.keyword) != text.count(b"\n"):
             raise ValueError(f"a line {self.keyword.decode()} is damaged: export the file again")
         text = text.replace(self.keyword, b"")
@@ -111,7 +111,7 @@ def read_obj(file: MeshFile) -> list[Part]:
     vertices, vertex_colors = _vertices(lines["v"], file)
     uvs, _ = _table(lines["vt"], (1, 2, 3))
     normals, _ = _table(lines["vn"], (3,))
-    require_bounded(normals=normals, texture_coordinates=uvs)
+    require_bounded(texture_coordinates=uvs)
     line_numbers, indices, sizes = _polygons(lines, file)
     corners, polygons = triangles_of(file, vertices, indices[:, 0], sizes)
     if not len(corners):
@@ -145,12 +145,12 @@ def read_obj(file: MeshFile) -> list[Part]:
 
 def _cleaned(text: bytes) -> bytes:
     """Convert text to UTF-8 with one statement per line, without lines of comments."""
-    text = as_utf8(text).replace(b"\r\n", b"\n").replace(b"\r", b"\n") + b"\n"
+    text = as_utf8(text).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     # Comments are removed first, because a backslash
     # at their end does not continue the line.
     if b"#" in text:
         text = re.sub(rb"^[ \t]*#.*", b"", text, flags=re.MULTILINE)
-    return re.sub(rb"\\[ \t]*\n", b" ", text)
+    return re.sub(rb"\\[ \t]*(?:\n|\Z)", b" ", text) + b"\n"
 
 
 def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
@@ -257,10 +257,11 @@ def _corners(words: list[bytes]) -> np.ndarray:
     firsts = np.flatnonzero(np.append(True, is_last[:-1]))
     corners = np.cumsum(is_last) - is_last
     columns = np.arange(len(is_last)) - firsts[corners]
-    if columns.max() > 2:
-        raise ValueError("a corner of a face has more than three indices")
+    numbers = parse_numbers(text.replace(b"/", b" "), np.int64)
+    if columns.max() > 2 or len(numbers) != len(columns):
+        raise ValueError("a corner of a face is not like 1, 1/2, 1//3 or 1/2/3")
     table = np.full((len(words), 3), _LEFT_OUT)
-    table[corners, columns] = parse_numbers(text.replace(b"/", b" "), np.int64)
+    table[corners, columns] = numbers
     return table
 
 
@@ -345,7 +346,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 material = material._replace(texture=(texture, folder), is_clamped=is_clamped)
             case "d" | "tr" as key:
                 # A number may follow the option "-halo".
-                opacities[key] = float("".join(text.partition("#")[0].split()[-1:]))
+                opacities[key] = float("".join(text.partition(" #")[0].split()[-1:]))
             case key if key in _REFUSED_PROPERTIES:
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:
@@ -357,7 +358,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
 
 def _color(text: str) -> tuple[float, ...]:
     """Parse a color of one gray value, or of red, green and blue."""
-    values = [float(word) for word in text.partition("#")[0].split()]
+    values = [float(word) for word in without_comments(text.encode()).split()]
     # A comparison with NaN is False, so `not` also finds NaN.
     if len(values) not in (1, 3) or not all(0 <= value <= 1 + TOLERANCE for value in values):
         raise ValueError(f'"Kd {text}" is not a color: give red, green and blue from 0 to 1')

@@ -14,6 +14,7 @@ from renderer.io.mesh_file import (
     product,
     triangles_of,
     unit_colors,
+    without_comments,
     words_per_line,
 )
 
@@ -30,7 +31,7 @@ def read_off(file: MeshFile) -> list[Part]:
         ValueError: If the file is damaged, or has features that would change the
             shape or the base color and are not supported.
     """
-    text = re.sub(rb"#.*", b"", as_utf8(file.content).replace(b"\r", b"\n"))
+    text = without_comments(as_utf8(file.content).replace(b"\r", b"\n"))
     header = _HEADER.match(text)
     if header is None:
         raise ValueError("the file does not begin with OFF")

@@ -38,7 +38,8 @@ _UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "textu
 # Names of the vertex indices of a face or a strip.
 _INDICES = ("vertex_indices", "vertex_index")
 # Beginnings of the names of elements and properties that would change the color.
-_REFUSED = ("material", "multi_texture")
+# Colors that are read are removed before, so these are incomplete.
+_REFUSED = ("material", "multi_texture", "red", "green", "blue", "diffuse_", "rgb", "color")
 _TRUNCATED = "the file is truncated or damaged: export it again"
 
 
@@ -195,16 +196,16 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
                 pass
             case ["comment", key, _, *_] if key.lower() == "texturefile":
                 texture_names.append(line.split(None, 2)[2].strip())
-            case ["element", name, count]:
+            case ["element", name, count] if name not in counts:
                 counts[name] = int(count)
                 items = properties[name] = []
             case ["property", "list", length_type, type_, name] if {
                 length_type,
                 type_,
             } <= _TYPES.keys():
-                items.append(_Property(name, _TYPES[type_], _TYPES[length_type]))
+                items.append(_Property(name.lower(), _TYPES[type_], _TYPES[length_type]))
             case ["property", type_, name] if type_ in _TYPES:
-                items.append(_Property(name, _TYPES[type_]))
+                items.append(_Property(name.lower(), _TYPES[type_]))
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -219,6 +220,8 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     for name, items in properties.items():
         if not items:
             raise ValueError(f"the element {name} has no properties")
+        if len({item.name for item in items}) < len(items):
+            raise ValueError(f"the element {name} has two properties of one name")
         stored = [_Property(item.name, "f8", item.length_type and "f8") for item in items]
         layout = stored if form == "ascii" else items
         values, offset = _rows(body, offset, counts[name], layout, _BYTE_ORDERS[form])
@@ -240,9 +243,13 @@ def _rows(
         raise ValueError(_TRUNCATED)
     if count:
         # NumPy reads rows at once if their lists are as long as those of the first row.
-        row = _first_row(body, offset, properties, order)
-        end = offset + count * row.itemsize
-        rows = np.frombuffer(body, row, count if end <= len(body) else 1, offset)
+        try:
+            row = _first_row(body, offset, properties, order)
+            end = offset + count * row.itemsize
+            rows = np.frombuffer(body, row, count if end <= len(body) else 1, offset)
+        # NumPy refuses a list of negative length, or longer than the file.
+        except ValueError as error:
+            raise ValueError(_TRUNCATED) from error
         lengths = {i: rows[f"length {i}"] for i, item in enumerate(properties) if item.length_type}
         if end <= len(body) and all((column == column[0]).all() for column in lengths.values()):
             columns: list[np.ndarray | _Lists] = [rows[str(i)] for i in range(len(properties))]

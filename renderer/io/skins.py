@@ -72,7 +72,10 @@ class Skeleton:
             joints = np.array([self._index_of[joint] for joint in skin["joints"]])
             bind = np.eye(4)
             if "inverseBindMatrices" in skin:
-                bind = self._file.array(skin["inverseBindMatrices"])
+                # There may be more matrices than joints.
+                bind = self._file.array(skin["inverseBindMatrices"])[: len(joints)]
+                if len(bind) < len(joints):
+                    raise ValueError(f"a skin has {len(bind)} matrices for {len(joints)} joints")
             matrices[joints] = joint_poses @ bind
             _add_weights(weights, attributes, joints)
             node_pose = matrices[joints[0]]

@@ -8,6 +8,7 @@ import math
 import struct
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -614,6 +615,36 @@ def test_the_mask_of_a_posed_and_mirrored_mesh_is_cut_out(tmp_path):
     assert_allclose(mesh.skin.carried.sum(axis=1)[:, :3], mesh.vertices, atol=1e-6)
 
 
+@pytest.mark.parametrize("roots", [[0, 2, 3], [0, 2]])
+def test_hidden_nodes_and_their_children_are_not_read_and_others_once(tmp_path, roots):
+    """Nodes 0 and 1 are hidden. A scene should list roots only, but may list children."""
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS[:3]})
+    hidden = {"KHR_node_visibility": {"visible": False}}
+    gltf.tree["nodes"] = [
+        {"mesh": 0, "children": [1], "extensions": hidden},
+        {"mesh": 0, "translation": [1, 1, 1]},
+        {"children": [3]},
+        {"mesh": 0, "translation": [0, 0, 5]},
+    ]
+    gltf.tree["scenes"] = [{"nodes": roots}]
+    gltf.tree["extensionsUsed"] = ["KHR_node_visibility"]
+    assert_allclose(triangle_corners(tmp_path, gltf), [POINTS[:3] + np.array([0, 0, 5])])
+
+
+@pytest.mark.parametrize("form", ["base64", "percent"])
+def test_data_uris_have_the_encodings_of_rfc_2397(tmp_path, form):
+    gltf = Gltf()
+    gltf.mesh({"POSITION": POINTS[:3]})
+    text = quote(gltf.buffer)
+    if form == "base64":
+        text = quote(base64.b64encode(gltf.buffer).decode(), safe="")
+    uri = "data:application/octet-stream" + (";base64," if form == "base64" else ",") + text
+    gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer), "uri": uri}]
+    (tmp_path / "mesh.gltf").write_text(json.dumps(gltf.tree))
+    assert_allclose(corners_of(load_mesh(tmp_path / "mesh.gltf", up="z")), [POINTS[:3]])
+
+
 def test_meshes_outside_of_the_default_scene_are_not_read(tmp_path):
     gltf = Gltf()
     gltf.mesh({"POSITION": POINTS[:3]})
@@ -682,6 +713,15 @@ def small_file_of_zeros() -> Gltf:
     return gltf
 
 
+def small_file_of_unused_vertices() -> Gltf:
+    """One face of 3 million vertices."""
+    gltf = Gltf()
+    accessor = {"componentType": 5126, "count": 3 * 10**6, "type": "VEC3"}
+    gltf.tree["accessors"].append(accessor)
+    gltf.mesh({"POSITION": 0}, np.uint16([0, 1, 2]))
+    return gltf
+
+
 def small_file_of_a_large_image() -> Gltf:
     gltf = Gltf()
     content = io.BytesIO()
@@ -712,6 +752,7 @@ def small_file_of_many_joints() -> Gltf:
     [
         small_file_of_many_copies,
         small_file_of_zeros,
+        small_file_of_unused_vertices,
         small_file_of_a_large_image,
         small_file_of_many_joints,
     ],
@@ -740,7 +781,14 @@ def with_entries(gltf: Gltf, **entries: Any) -> Gltf:
     return gltf
 
 
+def with_points() -> Gltf:
+    gltf = plain()
+    gltf.tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
+    return gltf
+
+
 IGNORED = {
+    "points and lines": with_points(),
     "normalTexture": plain(normalTexture={"index": 0}),
     "occlusionTexture": plain(occlusionTexture={"index": 0}),
     "emitted light": plain(emissiveFactor=[0, 1, 0]),
@@ -803,7 +851,56 @@ def negative_offset() -> Gltf:
     return gltf
 
 
+def overlapping(stride: int) -> Gltf:
+    gltf = plain()
+    gltf.tree["bufferViews"][0]["byteStride"] = stride
+    return gltf
+
+
+def short_morph_target() -> Gltf:
+    gltf = plain()
+    target = {"POSITION": gltf.array(np.float32([[0, 0, 1]]))}
+    gltf.tree["meshes"][0] |= {"weights": [1]}
+    gltf.tree["meshes"][0]["primitives"][0]["targets"] = [target]
+    return gltf
+
+
+def compressed_without_requirement() -> Gltf:
+    gltf = plain()
+    primitive = gltf.tree["meshes"][0]["primitives"][0]
+    primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0}}
+    del gltf.tree["accessors"][0]["bufferView"]
+    return gltf
+
+
+def different_instances() -> Gltf:
+    gltf = plain()
+    attributes = {
+        "TRANSLATION": gltf.array(np.float32([[0, 0, 0], [0, 0, 2]])),
+        "SCALE": gltf.array(np.float32([[1, 1, 1]])),
+    }
+    extensions = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    return with_entries(gltf, nodes=[{"mesh": 0, "extensions": extensions}])
+
+
+def one_matrix_for_two_joints() -> Gltf:
+    gltf = plain()
+    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = gltf.array(np.zeros((4, 4), np.uint8))
+    attributes["WEIGHTS_0"] = gltf.array(np.float32([[1, 0, 0, 0]] * 4))
+    matrices = gltf.array(np.float32([np.eye(4).ravel()]))
+    skins = [{"joints": [1, 2], "inverseBindMatrices": matrices}]
+    return with_entries(gltf, nodes=[{"mesh": 0, "skin": 0}, {}, {}], skins=skins)
+
+
 REFUSED = {
+    "overlap in its buffer view": overlapping(0),
+    "elements of an array overlap": overlapping(8),
+    "a morph target has 1 entries": short_morph_target(),
+    r"compressed \(KHR_draco": compressed_without_requirement(),
+    "have different lengths": different_instances(),
+    "number 0 of 0 skins": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
+    "1 matrices for 2 joints": one_matrix_for_two_joints(),
     "an array ends behind its buffer view": negative_offset(),
     "KHR_draco_mesh_compression": with_entries(
         plain(), extensionsRequired=["KHR_draco_mesh_compression"]

@@ -3,10 +3,11 @@
 Ignored features change neither the shape nor the base color.
 """
 
+import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -115,6 +116,42 @@ def stl(attribute: int, header: bytes = b"", face_count: int = 1) -> dict[str, s
     return {"mesh.stl": start + numbers + attribute.to_bytes(2, "little")}
 
 
+def gltf(**material: Any) -> dict[str, str | bytes]:
+    """Return a .gltf file with more entries of its material."""
+    return gltf_vertices(material=material)
+
+
+def gltf_vertices(
+    name: str = "", width: int = 3, kind: int = 5126, material: Any = None
+) -> dict[str, str | bytes]:
+    """Return a .gltf file with a further attribute, whose vectors begin with 1 0 0 1."""
+    rows = np.array([1, 0, 0, 1][:width] * 3, np.uint8 if kind == 5121 else "<f4")
+    content = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + rows.tobytes()
+    attributes = {"POSITION": 0} | ({name: 1} if name else {})
+    tree = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
+        "materials": [material or {}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": kind, "count": 3, "type": f"VEC{width}"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": rows.nbytes},
+        ],
+        "buffers": [{"byteLength": len(content), "uri": "mesh.bin"}],
+    }
+    return {"mesh.gltf": json.dumps(tree), "mesh.bin": content}
+
+
+def alpha(value: float) -> dict[str, Any]:
+    """Return the entries of a white material with an alpha."""
+    return {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, value]}}
+
+
 STL_TEXT = """solid vertex
 facet normal 0 0 1
  outer loop
@@ -168,6 +205,9 @@ ROWS = [
             "f 1 2 3.5",
             "v 1 2",
             "v 1 2 x",
+            "v 0 0 1.#QNAN",
+            "vt 0 1.#IND",
+            "f 1 /1 2 /1 3 /1",
             "vt nan 0",
             "\0",
         )
@@ -182,6 +222,7 @@ ROWS = [
         obj(mtl="map_Kd red.png\nKd 0.5 1 1", vertex="1 0 0", face=TEXTURED),
         (0.5, 0.0, 0.0),
     ),
+    Row("obj", "map_Kd and comment", obj(mtl="map_Kd red.png # base", face=TEXTURED), RED),
     Row("obj", "map_Kd without vt", obj(mtl="map_Kd red.png"), REFUSED),
     Row("obj", "map_Kd with some vt", obj(mtl="map_Kd red.png", face="f 1/1 2/2 3"), REFUSED),
     Row("obj", "d 1, Tr 0", obj(mtl="d 1\nTr 0"), WHITE),
@@ -218,6 +259,7 @@ ROWS = [
             "Kd 2 0 0",
             "Kd -1 0 0",
             "Kd nan 0 0",
+            "Kd 1.#IND 0 0",
             "Kd spectral red.rfl",
             "map_Kd",
             "map_Kd missing.png",
@@ -281,6 +323,13 @@ ROWS = [
         ply("uchar r;uchar g;uchar b;uchar red;uchar green;uchar blue", values=("9 9 9 8 8 8", "")),
         REFUSED,
     ),
+    Row("ply", "Red", ply(RGB.title().replace("Uchar", "uchar"), values=("255 0 0", "")), RED),
+    *(
+        Row("ply", f"only {name}", ply(f"uchar {name}", values=("9", "")), REFUSED)
+        for name in ("red", "diffuse_green", "rgb")
+    ),
+    Row("ply", "x twice", ply("float x", values=("7", "")), REFUSED),
+    Row("ply", "vertex twice", ply(tail="element vertex 1;property int a;0"), REFUSED),
     Row("ply", "alpha 255", ply(f"{RGB};uchar alpha", values=("255 0 0 255", "")), RED),
     Row("ply", "alpha", ply(f"{RGB};uchar alpha", values=("255 0 0 25", "")), REFUSED),
     Row("ply", "face red", ply(face=RGB, values=("", "255 0 0")), RED),
@@ -374,9 +423,34 @@ ROWS = [
     Row("off", "lines with CRLF", {"mesh.off": off()["mesh.off"].replace("\n", "\r\n")}, WHITE),
     Row("off", "face color 256", off(face="256 0 0"), REFUSED),
     Row("off", "color of a map", off(face="7"), REFUSED),
+    Row("off", "1.#IND", {"mesh.off": off()["mesh.off"].replace("0 0 0", "0 0 0.#IND")}, REFUSED),
     Row("off", "comments", off("# OFF\nOFF # 1 2 3\n\n", face="255 0 0 # red"), RED),
     Row("off", "missing vertex", {"mesh.off": off()["mesh.off"].replace("3 0", "3 9")}, REFUSED),
     Row("off", "no faces", {"mesh.off": off()["mesh.off"].rpartition("\n")[0]}, REFUSED),
+    Row("gltf", "triangle", gltf(), WHITE),
+    Row(
+        "gltf", "baseColorFactor", gltf(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]}), RED
+    ),
+    Row("gltf", "normalTexture", gltf(normalTexture={"index": 0}), IGNORED),
+    Row("gltf", "alpha of OPAQUE", gltf(**alpha(0.1)), WHITE),
+    Row("gltf", "alpha of MASK", gltf(alphaMode="MASK", **alpha(0.5)), WHITE),
+    Row("gltf", "low alpha of MASK", gltf(alphaMode="MASK", **alpha(0.49)), REFUSED),
+    Row("gltf", "alpha of BLEND", gltf(alphaMode="BLEND", **alpha(0.9)), REFUSED),
+    Row("gltf", "opaque BLEND", gltf(alphaMode="BLEND", **alpha(1)), WHITE),
+    Row("gltf", "unlit", gltf(extensions={"KHR_materials_unlit": {}}), IGNORED),
+    *(
+        Row("gltf", f"{name} VEC{width}", gltf_vertices(name, width), outcome)
+        for name, width, outcome in (
+            ("COLOR_0", 3, RED),
+            ("COLOR_0", 4, RED),
+            ("COLOR_0", 2, REFUSED),
+            ("COLOR_1", 3, WHITE),
+            ("NORMAL", 3, WHITE),
+            ("NORMAL", 4, REFUSED),
+            ("_FEATURE_ID_0", 3, WHITE),
+        )
+    ),
+    Row("gltf", "_FEATURE_ID_0 of integers", gltf_vertices("_FEATURE_ID_0", 3, 5121), WHITE),
     Row("stl", "text", {"mesh.stl": STL_TEXT}, WHITE),
     Row("stl", "text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
     Row(

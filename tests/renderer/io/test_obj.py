@@ -101,6 +101,11 @@ SPELLINGS = {
     "late library": PLAIN.replace("mtllib m.mtl\n", "") + "mtllib m.mtl\n",
     "groups": PLAIN.replace("f ", "g one two\no f 1 2 3\nf "),
     "slashes": re.sub(r"^f .*", lambda line: re.sub(r"(\d)", r"\1//", line[0]), PLAIN, flags=re.M),
+    "backslash at the end": PLAIN.rstrip("\n") + " \\",
+    "normals of NaN": re.sub(
+        r"^f .*", lambda line: re.sub(r"(\d)", r"\1//1", line[0]), PLAIN, flags=re.M
+    )
+    + "vn -nan(ind) nan 1\n",
     "exponents": PLAIN.replace("v 1 0 0", "v 1E+0 0.0e-5 -0."),
 }
 

@@ -111,6 +111,19 @@ def test_a_truncated_ply_is_refused(tmp_path, form, faces):
             load_mesh(path)
 
 
+@pytest.mark.parametrize("length", [-5, 2**31 - 1])
+def test_a_list_of_an_impossible_length_is_refused(tmp_path, length):
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element face 1\nproperty list int int vertex_indices\nend_header\n"
+    numbers = np.array([length, 0, 1, 2], "<i4").tobytes()
+    (tmp_path / "mesh.ply").write_bytes(
+        header.encode() + np.eye(3, dtype="<f4").tobytes() + numbers
+    )
+    with pytest.raises(InputError, match="truncated"):
+        load_mesh(tmp_path / "mesh.ply")
+
+
 @pytest.mark.filterwarnings("ignore:.*quality, flag")
 @pytest.mark.parametrize("index", [-1, len(VERTICES)])
 @pytest.mark.parametrize("form", FORMS)
