@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
 from augment.classifiers.files import SUFFIXES, build_file, load_file
+from augment.classifiers.inputs import say_inputs_of
 from augment.classifiers.plain_networks import (
     NetworkFacts,
     Normalization,
@@ -124,6 +125,9 @@ def load_classifier(
 ) -> Classifier:
     """Load a classifier by name, on the CPU.
 
+    The size and the normalization of its images are logged once, with what of
+    them is assumed.
+
     Files of weights (safetensors, state dicts) and of ONNX may come from
     strangers. Files of TorchScript and of `torch.export` are programs that can
     run any code, and so are the functions that `python:` names.
@@ -168,12 +172,13 @@ def load_classifier(
     path = None if weights is None else as_path("weights", weights)
     facts = as_facts(classes, size, normalization)
     require_flag("trust_code", trust_code)
-    classifier = _load(name, path, facts, trust_code)
+    classifier = load_source(name, path, facts, trust_code)
+    say_inputs_of(classifier)
     return classifier.normalizing_light(normalize_light)
 
 
-def _load(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
-    """Load a classifier by name, without the normalization of light.
+def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
+    """Load a classifier by name, without the normalization of light, and without any message.
 
     Args:
         name: Name of a source with its model, or path of a file with a network.

@@ -220,6 +220,8 @@ class Classifier(nn.Module):
     Attributes:
         operating_points: Thresholds for `detect`, at most one for each class.
             Empty if the network has none.
+        assumed: Those of "size" and "normalization" that neither the user nor
+            the file of the network gave.
 
     Raises:
         InputError: If a class name occurs twice, if there are fewer than two
@@ -227,6 +229,7 @@ class Classifier(nn.Module):
     """
 
     operating_points: Sequence[OperatingPoint] = ()
+    assumed: Sequence[str] = ()
 
     def __init__(
         self,

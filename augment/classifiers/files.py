@@ -19,7 +19,14 @@ import torch
 from torch import Tensor, nn
 
 from augment.classifiers.adapter import ArrayFunction, Classifier, Wrapper
-from augment.classifiers.plain_networks import NO_FACTS, NetworkFacts, as_classifier
+from augment.classifiers.inputs import normalization_of
+from augment.classifiers.plain_networks import (
+    NO_FACTS,
+    USUAL_SIZE,
+    NetworkFacts,
+    as_classifier,
+    assumed_facts,
+)
 from augment.classifiers.sources import advice_for_pickles, is_torchscript
 from renderer.errors import InputError, require_file, single_line
 
@@ -33,8 +40,6 @@ SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
 CODE_MEMBERS = ("custom_obj_", "opaque_obj_")
 # Part of the names of their compiled members.
 COMPILED = "/aotinductor/"
-# Pixels per side of the images of a network whose size is unknown.
-DEFAULT_SIZE = 224
 
 
 @dataclass(frozen=True)
@@ -96,8 +101,12 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = Fals
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
             module.training = False
-    size = facts.size or height or DEFAULT_SIZE
-    return as_classifier(network, size, facts.classes, facts.normalization, name=name)
+    size = facts.size or height
+    classifier = as_classifier(
+        network, size or USUAL_SIZE, facts.classes, facts.normalization, name=name
+    )
+    classifier.assumed = assumed_facts(size, normalization_of(classifier.function) or None)
+    return classifier
 
 
 def build_file(

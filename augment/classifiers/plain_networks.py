@@ -21,6 +21,7 @@ from augment.classifiers.adapter import (
     Normalized,
     as_class_names,
 )
+from augment.classifiers.inputs import normalization_of, say_inputs
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_device, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
@@ -68,6 +69,12 @@ class NetworkFacts:
 
 
 NO_FACTS = NetworkFacts()
+
+
+def assumed_facts(size: int | None, normalization: Normalization) -> tuple[str, ...]:
+    """Return which of the two arguments neither the user nor the network gives."""
+    given = {"size": size, "normalization": normalization}
+    return tuple(name for name, value in given.items() if value is None)
 
 
 def as_facts(
@@ -145,7 +152,9 @@ def as_classifier(
         network: A plain network from images to logits: a `torch.nn.Module` in
             evaluation mode, or a function of tensors or of NumPy arrays. If it
             is a `Classifier`, only `normalize_light` is applied.
-        size: Pixels per side of the images. None for 224.
+        size: Pixels per side of the images. None for the size that a network of
+            torchvision or timm tells or, if it tells none, for 224. It is
+            then logged, and so is an assumed normalization.
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
         normalization: "imagenet", or mean and standard deviation of the
@@ -197,17 +206,34 @@ def as_classifier(
         name = network.__name__
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
     require_evaluation_mode(network, argument)
-    size = USUAL_SIZE if size is None else size
+    known_size = own_size(network) if size is None else size
     device = device_of(network) if device is None else as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
+    name = name or type(network).__name__
+    if size is None:
+        assumed = assumed_facts(known_size, normalization_of(function) or None)
+        say_inputs(name, function, known_size or USUAL_SIZE, assumed)
+    size = known_size or USUAL_SIZE
     count = _count_outputs(function, size, device, dtype, argument)
     if names is not None and len(names) != count:
         raise InputError(
             f"classes has {len(names)} names, but the network returns {count} outputs: "
             "give one name per output",
         )
-    name = name or type(network).__name__
     return Classifier(function, size, names or index_names(count), name, normalize_light)
+
+
+def own_size(network: object) -> int | None:
+    """Return the pixels per side that a transformer of torchvision or timm was built for.
+
+    Its position embeddings have a fixed size. None for any other network.
+    """
+    for module in network.modules() if isinstance(network, nn.Module) else ():
+        for size in (getattr(module, "image_size", None), getattr(module, "img_size", None)):
+            found = size[0] if isinstance(size, tuple) and size else size
+            if isinstance(found, int):
+                return found
+    return None
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:

@@ -8,6 +8,7 @@ compared with those of the network.
 
 import argparse
 import importlib
+import math
 import pickle
 import re
 import textwrap
@@ -22,7 +23,14 @@ import torch
 from torch import Tensor, nn
 
 from augment.classifiers.adapter import Classifier, Normalized, nearest
-from augment.classifiers.plain_networks import NO_FACTS, NetworkFacts, index_names, mean_and_std
+from augment.classifiers.plain_networks import (
+    NO_FACTS,
+    NetworkFacts,
+    assumed_facts,
+    index_names,
+    mean_and_std,
+    own_size,
+)
 from renderer.errors import InputError, require_file, single_line
 
 if TYPE_CHECKING:
@@ -38,6 +46,8 @@ _CAFFE_SIZE = 227
 _CAFFE_MEAN = (104, 117, 123)
 # Keys under which training scripts store the weights of a network in a checkpoint.
 _WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
+# Ends of the names of position embeddings in the transformers of torchvision and timm.
+POSITIONS = ("pos_embedding", "pos_embed")
 # Prefixes that `DataParallel`, `torch.compile` and other wrappers of a network add to the names of
 # its weights.
 _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
@@ -93,6 +103,8 @@ def load_torchvision(
     changed_facts = _facts_for_weights(classifier, state, last_weight, facts, source)
     if changed_facts is not None:
         classifier = build_torchvision(model, None, changed_facts, published)
+    if weights is not None and not published.url.endswith(f"/{weights.name}"):
+        classifier.assumed = assumed_facts((changed_facts or facts).size, facts.normalization)
     return fill(classifier, state, source)
 
 
@@ -159,7 +171,10 @@ def _facts_for_weights(
     facts: NetworkFacts,
     source: str | Path,
 ) -> NetworkFacts | None:
-    """Name as many classes as a file of weights has, if a classifier has another number.
+    """Return the facts that a file of weights tells: the number of classes, and a fixed size.
+
+    The size follows from the position embeddings of a transformer, one for each
+    patch of the image.
 
     Args:
         classifier: Classifier that was built from the facts.
@@ -169,8 +184,9 @@ def _facts_for_weights(
         source: File or address of the weights, for the error.
 
     Returns:
-        A copy of the facts with the class names "0", "1" and so on. None if the classifier has
-        the right number of classes, or if the weights belong to another network.
+        A copy of the facts with the size, and with the class names "0", "1" and so on if the
+        classifier has another number of classes. None if the weights tell nothing, or belong to
+        another network.
 
     Raises:
         InputError: If the user named another number of classes than the weights have.
@@ -184,9 +200,25 @@ def _facts_for_weights(
             "name each class of the weights, in the order of the outputs",
             "classes",
         )
-    if count == len(classifier.classes):
-        return None
-    return replace(facts, classes=index_names(count))
+    told = facts
+    if facts.size is None:
+        told = replace(told, size=_size_for_positions(classifier, state))
+    if count != len(classifier.classes):
+        told = replace(told, classes=index_names(count))
+    return None if told == facts else told
+
+
+def _size_for_positions(classifier: Classifier, state: Mapping[str, Tensor]) -> int | None:
+    """Return the pixels per side for which weights have position embeddings (1, tokens, channels).
+
+    There is one token for each patch, and at most a few others, which the whole
+    part of the root leaves out. None if there are no such embeddings.
+    """
+    for name, own in _network(classifier).state_dict().items():
+        is_position = name.endswith(POSITIONS) and own.ndim == 3
+        if is_position and name in state and state[name].ndim == 3:
+            return classifier.size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
+    return None
 
 
 def require_architecture(model: str) -> None:
@@ -362,6 +394,7 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
         changed_facts = _facts_for_weights(classifier, state, last_weight, facts, weights)
         if changed_facts is not None:
             classifier = build_timm(model, None, changed_facts)
+        classifier.assumed = assumed_facts((changed_facts or facts).size, facts.normalization)
         return fill(classifier, state, weights)
     try:
         return build_timm(model, None, facts, pretrained=True)
@@ -423,6 +456,8 @@ def build_timm(
             "name",
         )
     size = size or facts.size or published["input_size"][-1]
+    if own_size(network) not in (None, size):
+        network = timm.create_model(model, pretrained=pretrained, img_size=size, **options)
     mean, std = _normalization(facts, published["mean"], published["std"])
     return Classifier(Normalized(network, mean, std), size, classes, name)
 

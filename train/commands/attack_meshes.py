@@ -10,13 +10,21 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from warnings import catch_warnings, filterwarnings
 
 import torch
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
-from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
+from augment.attacks.attack import (
+    ZERO_GRADIENT,
+    AttackResult,
+    attack,
+    fooled_in_views,
+    logits_of,
+    predictions,
+)
 from augment.attacks.attack_files import require_renderers, save
 from augment.attacks.checks import (
     check,
@@ -177,7 +185,11 @@ def run(settings: AttackExperimentSettings) -> None:
     with sole_writer("out", out):
         remove_attack(out)
         mesh_attacks = attacks(settings, classifier, device, adversary)
-        outcomes, sweeps = _write_attacks(mesh_attacks, out, settings, targets)
+        with catch_warnings():
+            if settings.attack.checks is not False:
+                # The checks say this for each mesh.
+                filterwarnings("ignore", ZERO_GRADIENT)
+            outcomes, sweeps = _write_attacks(mesh_attacks, out, settings, targets)
         if not is_verbose():
             print("\n".join(shortened(format_outcomes(outcomes))))
         if sweeps:

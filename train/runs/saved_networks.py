@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
 from augment.classifiers.adapter import unwrapped, with_normalized_light
 from augment.classifiers.files import is_network_file
+from augment.classifiers.inputs import say_inputs_of
 from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, single_line
@@ -175,6 +176,7 @@ def load_run(
         for point in classifier.operating_points:
             # This call raises InputError if the network lacks the class.
             classifier.label(point.label)
+        say_inputs_of(classifier)
         return classifier
 
 

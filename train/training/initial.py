@@ -8,11 +8,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers import Classifier, load_classifier
+from augment.classifiers import Classifier, load_source
 from augment.classifiers.adapter import without_normalized_light
 from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
+from renderer.validation import as_path
 from train import console
 from train.class_names import (
     class_of_name,
@@ -59,12 +60,14 @@ class Initial:
         weights: State dict of the network.
         network: The network itself, of which the run trains a copy. None if
             `build_network` can build it from the description.
+        assumed: Which of "size" and "normalization" are assumed.
     """
 
     source: Path
     architecture: dict[str, Any]
     weights: dict[str, Tensor]
     network: nn.Module | None = None
+    assumed: Sequence[str] = ()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -246,14 +249,9 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
         known_size = size if is_file else None
-        classifier = load_classifier(
-            name,
-            settings.weights,
-            settings.classes,
-            known_size,
-            settings.normalization,
-            trust_code=settings.trust,
-        )
+        facts = as_facts(settings.classes, known_size, settings.normalization)
+        weights = None if settings.weights is None else as_path("weights", settings.weights)
+        classifier = load_source(name, weights, facts, settings.trust)
     network = cast(nn.Module, classifier.function)
     if not list(network.parameters()):
         raise InputError(
@@ -264,7 +262,8 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     # The absolute path of a file is recorded, so that it is found from any folder.
     shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
-    return Initial(Path(name), architecture, network.state_dict())
+    assumed = [fact for fact in classifier.assumed if size is None or fact != "size"]
+    return Initial(Path(name), architecture, network.state_dict(), assumed=assumed)
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:

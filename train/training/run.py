@@ -22,6 +22,7 @@ from augment.classifiers.adapter import (
     with_normalized_light,
     without_normalized_light,
 )
+from augment.classifiers.inputs import say_inputs
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
@@ -681,6 +682,8 @@ def build_trainer(
     }
     if initial:
         initial.copy_to(network, facts)
+        if initial.network is None:
+            say_inputs(str(settings.train.init_from), network, data.size, initial.assumed)
     light = settings.normalize_light or (initial.normalize_light if initial else None)
     if light is not None:
         facts[NORMALIZE_LIGHT] = light
