@@ -153,7 +153,7 @@ class NetworkCall:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
             remedy = f"convert it with network.to({images.dtype}), or use light in {of_weights}"
             return f"{reason}: its weights are {of_weights}, {remedy}"
-        return f"{reason}: use a network that takes such images"
+        return f"{reason}: give the size of its images, or use a network that takes such images"
 
     def _require_no_probabilities(self, logits: Tensor) -> None:
         """Check that the network does not return probabilities instead of logits.

@@ -26,6 +26,7 @@ from augment.classifiers.plain_networks import (
     NetworkFacts,
     as_classifier,
     assumed_facts,
+    own_size,
 )
 from augment.classifiers.sources import advice_for_pickles, is_torchscript
 from renderer.errors import InputError, require_file, single_line
@@ -101,7 +102,7 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = Fals
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
             module.training = False
-    size = facts.size or height
+    size = facts.size or height or own_size(network)
     classifier = as_classifier(
         network, size or USUAL_SIZE, facts.classes, facts.normalization, name=name
     )

@@ -8,6 +8,7 @@ from torch import nn
 
 import norm_balls as nb
 from augment.classifiers import inputs
+from augment.classifiers.plain_networks import as_classifier
 
 IMAGENET = "mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
 ASSUMED = "size and normalization are assumed"
@@ -138,3 +139,13 @@ def test_a_plain_network_is_mentioned_only_if_its_size_is_assumed(said):
     (line,) = said()
     assert "224 × 224" in line
     assert ASSUMED in line
+
+
+def test_a_transformer_in_memory_tells_its_size(said):
+    from torchvision.models import vit_b_32
+
+    network = vit_b_32(num_classes=3, image_size=64).eval()
+    assert as_classifier(network, normalization="imagenet").size == 64
+    (line,) = said()
+    assert "64 × 64" in line
+    assert "assumed" not in line

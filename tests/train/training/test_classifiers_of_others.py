@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchvision.models import get_model
 
 from augment.classifiers import load_classifier
+from augment.classifiers.inputs import _say_once
 from augment.classifiers.normalized_light import normalize_light
 from augment.settings import NormalizedLightSettings
 from renderer.errors import InputError
@@ -122,6 +123,17 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     init_from = [f"train.init_from={folder}", "weights=null"]
     continued, _ = tuned("unlabelled", *init_from, ALMOST_FIXED)
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_run_says_the_size_of_its_images_and_that_their_normalization_is_assumed(tuned, caplog):
+    _say_once.cache_clear()
+    tuned("unlabelled", ALMOST_FIXED)
+    (line,) = [item.message for item in caplog.records if "pixels, " in item.message]
+    assert f"torchvision:{NAME}" in line
+    assert f"{SIZE} × {SIZE}" in line
+    assert "(0.485, 0.456, 0.406)" in line
+    assert "normalization is assumed" in line
+    assert "size" not in line
 
 
 class TestNormalizedLight:
