@@ -37,7 +37,7 @@ from augment import AugmentationService, AugmentationSettings, StepSettings
 from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 from train.runs.saved_networks import load_run
 from train.system.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
 

@@ -41,18 +41,19 @@ from torch import Tensor
 from benchmarks import common
 from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
-from renderer.geometry.mesh import Mesh, concatenate, normalize, subdivide
-from renderer.geometry.shapes import solid
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
+from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.operators import rays
+from renderer.operators import shadows as precomputed
+from renderer.operators.apply import TransferOperator, build_operators
 from renderer.settings import ImageSettings
-from renderer.transport import precomputed, rays
-from renderer.transport.operators import TransferOperator, build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.solids import solid
+from renderer.visibility.rasterizer import choose
 
 CAMERA = OrthographicCamera(math.degrees(0.9), math.degrees(0.6), 2.2)
 # Number of views over which the time of building an operator is averaged.

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from benchmarks import reference
 from renderer.camera import Camera
-from renderer.geometry.mesh import Mesh
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.mesh import Mesh
+from renderer.visibility.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)

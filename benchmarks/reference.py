@@ -1,4 +1,4 @@
-"""Readable reference of the shading in `renderer.shading.shading`.
+"""Readable reference of the shading in `renderer.surface.shading`.
 
 It uses plain torch operations, which autograd differentiates, in the dtype of
 its inputs. The spherical harmonics follow the Legendre recurrences of the

@@ -52,10 +52,10 @@ from benchmarks.scene import (
 )
 from benchmarks.steps import ANALYTIC, SHADINGS, LightStep, VertexStep, shade_by_face
 from benchmarks.whole_steps import measure_many_views, measure_whole_steps
-from renderer.geometry.mesh import Mesh
 from renderer.light.basis import DEGREE
+from renderer.mesh import Mesh
 from renderer.settings import RASTERIZERS
-from renderer.visibility.rasterizers import Rasterizer, choose
+from renderer.visibility.rasterizer import Rasterizer, choose
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 # Degrees of the spherical harmonics that are compared.

@@ -13,9 +13,9 @@ from benchmarks.common import Row, medians
 from benchmarks.scene import CAMERA, View, coefficients
 from benchmarks.steps import LightStep
 from renderer import rendering
-from renderer.geometry.mesh import Mesh
 from renderer.light.basis import COEFFICIENTS, DEGREE
-from renderer.shading.gloss import Gloss
+from renderer.mesh import Mesh
+from renderer.surface.gloss import Gloss
 
 Call = Callable[[], object]
 

@@ -8,8 +8,8 @@ from torch import Tensor
 from benchmarks import reference
 from benchmarks.scene import BACKGROUND, Result, View, VisibleSurface
 from renderer.image import tonemap
-from renderer.shading import shading
-from renderer.transport.operators import TransferOperator
+from renderer.operators.apply import TransferOperator
+from renderer.surface import shading
 from renderer.visibility.fragments import Fragments
 
 # A function of fragments with S samples and P covered pixels, vertices (V, 3),

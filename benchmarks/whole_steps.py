@@ -17,12 +17,12 @@ from benchmarks.common import Row, quartiles_of_ratio, times_in_turn
 from benchmarks.peer import Peer
 from benchmarks.scene import BACKGROUND, CAMERA, View, coefficients
 from renderer.camera import orbit_cameras
-from renderer.geometry.mesh import Mesh
 from renderer.light.basis import DEGREE
+from renderer.mesh import Mesh
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.stack import TransferOperators
 from renderer.settings import ImageSettings
-from renderer.transport.operator_stacks import TransferOperators
-from renderer.transport.operators import TransferOperator, build_operators
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 
 # Number of views that one call renders, and their pixels per side.
 MANY_VIEWS_COUNT = 100

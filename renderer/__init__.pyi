@@ -4,27 +4,27 @@ from renderer.camera import PerspectiveCamera as PerspectiveCamera
 from renderer.camera import PinholeCamera as PinholeCamera
 from renderer.camera import orbit_cameras as orbit_cameras
 from renderer.errors import InputError as InputError
-from renderer.fitting import FittedScene as FittedScene
-from renderer.fitting import fit_scene as fit_scene
-from renderer.geometry.mesh import Mesh as Mesh
-from renderer.geometry.mesh import normalize as normalize
-from renderer.geometry.mesh import subdivide as subdivide
-from renderer.geometry.shapes import solid as solid
+from renderer.fit import FittedScene as FittedScene
+from renderer.fit import fit_scene as fit_scene
 from renderer.io.cameras import load_cameras as load_cameras
 from renderer.io.export import export_mesh as export_mesh
 from renderer.io.meshes import load_mesh as load_mesh
 from renderer.light import harmonics as harmonics
 from renderer.light import skylight as skylight
+from renderer.light.files import save_light as save_light
 from renderer.light.lamps import Lamps as Lamps
-from renderer.light.light_files import save_light as save_light
 from renderer.light.presets import load_light as load_light
 from renderer.light.projector import Projector as Projector
+from renderer.mesh import Mesh as Mesh
+from renderer.mesh import normalize as normalize
+from renderer.mesh import subdivide as subdivide
+from renderer.operators.apply import TransferOperator as TransferOperator
+from renderer.operators.stack import TransferOperators as TransferOperators
 from renderer.rendering import light_sphere as light_sphere
 from renderer.rendering import precompute_transfer as precompute_transfer
 from renderer.rendering import render as render
 from renderer.settings import ImageSettings as ImageSettings
-from renderer.shading.gloss import Gloss as Gloss
-from renderer.transport.operator_stacks import TransferOperators as TransferOperators
-from renderer.transport.operators import TransferOperator as TransferOperator
+from renderer.solids import solid as solid
+from renderer.surface.gloss import Gloss as Gloss
 
 __version__: str

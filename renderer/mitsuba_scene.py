@@ -35,7 +35,6 @@ from PIL import Image
 
 from renderer.camera import Camera
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
@@ -43,8 +42,9 @@ from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_o
 from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
+from renderer.mesh import Mesh
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
-from renderer.shading.lobes import coat_mean
+from renderer.surface.lobes import coat_mean
 from renderer.surface.texture_bake import with_added_albedo
 
 # Name of the file in which a Mitsuba scene is written.

@@ -25,22 +25,22 @@ from renderer.errors import (
     require_choice,
     require_range,
 )
-from renderer.geometry.mesh import Mesh, require_mesh
-from renderer.geometry.shapes import sphere
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
+from renderer.mesh import Mesh, require_mesh
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.rays import Rays, Surface
+from renderer.operators.shadows import build_transport
+from renderer.operators.stack import TransferOperators
 from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
-from renderer.shading.gloss import Gloss
+from renderer.solids import sphere
 from renderer.surface.albedo import NO_TEXTURE, face_albedo, surface_albedo
-from renderer.transport.operator_stacks import TransferOperators
-from renderer.transport.operators import TransferOperator, build_operators
-from renderer.transport.precomputed import build_transport
-from renderer.transport.rays import Rays, Surface
+from renderer.surface.gloss import Gloss
 from renderer.validation import as_list, as_tensor, require_kind, require_number
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -16,14 +16,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.camera import Camera
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode
 from renderer.light.basis import SplitLight
+from renderer.mesh import Mesh
+from renderer.operators.lamp_paths import LocalLightView
+from renderer.operators.rays import Rays
 from renderer.settings import ImageSettings
-from renderer.shading.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.shading.shading import glossy_radiance, normals_in_sight, radiance
-from renderer.transport.lamp_paths import LocalLightView
-from renderer.transport.rays import Rays
+from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss
+from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.visibility.fragments import Fragments
 from renderer.visibility.silhouettes import moving_outlines
 

@@ -13,7 +13,7 @@ import torch
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 
 # Property tests draw the same examples everywhere. With `-m slow`, they draw 30 times as many, and
 # others in each run.

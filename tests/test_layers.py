@@ -40,7 +40,7 @@ def test_only_one_module_imports_opengl():
         for path in (ROOT / package).rglob("*.py")
         if "moderngl" in imported_packages(path)
     ]
-    assert users == ["renderer/visibility/rasterizers/opengl.py"]
+    assert users == ["renderer/visibility/opengl.py"]
 
 
 def modules() -> dict[str, Path]:
@@ -67,7 +67,7 @@ def test_no_import_leads_back_to_its_module():
     # A circle raises CycleError, which names it.
     order = list(TopologicalSorter(imported_modules()).static_order())
     path = [
-        "renderer.geometry.mesh",
+        "renderer.mesh",
         "renderer.io.meshes",
         "augment.scene.scene",
         "train.training.run",

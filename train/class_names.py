@@ -8,7 +8,7 @@ from typing import Any
 from augment.classifiers.adapter import class_index, nearest
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
+from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.data.photographs import OTHER_PREFIX
 from train.settings import OTHER, ExperimentSettings, label_names, simplified, solid_name
 

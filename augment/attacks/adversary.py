@@ -32,16 +32,16 @@ from renderer.io.files import atomic_write
 from renderer.io.images import gray_or_image, write_image
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
-from renderer.light.light_files import read_light, save_light
+from renderer.light.files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
-from renderer.shading.gloss import Gloss
 from renderer.short_repr import ShortRepr
+from renderer.surface.gloss import Gloss
 from renderer.surface.texture_bake import with_added_albedo
 from renderer.validation import as_folder
-from renderer.visibility.rasterizers import Rasterizer, choose
+from renderer.visibility.rasterizer import Rasterizer, choose
 
 # Names of files in the folder of an adversary, and of the images before and after the attack.
 DESCRIPTION = "adversary.json"

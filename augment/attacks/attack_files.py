@@ -28,7 +28,7 @@ from renderer.io.tiles import Tile, draw_grid, tiles_of
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 
 # File in which `save` writes one JSON line for each example, and a last line with the checks.
 LINES = "attack.jsonl"

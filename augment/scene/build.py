@@ -19,15 +19,15 @@ from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError, as_device, describe, require_bounded
-from renderer.geometry.mesh import Mesh, require_mesh, subdivide
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Basis, LocalBasis, with_local_lights
 from renderer.light.harmonics import degree_of
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
+from renderer.mesh import Mesh, require_mesh, subdivide
 from renderer.settings import ImageSettings
 from renderer.validation import as_list, as_tensor, require_flag, require_kind, require_whole
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from renderer.camera import Camera
-from renderer.geometry.mesh import Mesh
+from renderer.mesh import Mesh
 from renderer.short_repr import ShortRepr
 from renderer.validation import as_tensor
 

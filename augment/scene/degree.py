@@ -19,14 +19,14 @@ from augment.parameter_settings import MaterialSettings
 from augment.scene.materials import ROUGHNESS, initial_materials
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
-from renderer.geometry.mesh import select_faces
 from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
 from renderer.light.highlights import highlight_error, required_degree
 from renderer.light.presets import load_light
 from renderer.memory import has_memory
+from renderer.mesh import select_faces
 from renderer.settings import MIN_ROUGHNESS
-from renderer.shading.gloss import Gloss, smallest_roughness
+from renderer.surface.gloss import Gloss, smallest_roughness
 
 if TYPE_CHECKING:
     from augment.settings import SpecularLayerSettings

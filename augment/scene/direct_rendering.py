@@ -3,7 +3,7 @@
 Each view of moved vertices is rasterized again. The shadows and bounces of environment light take
 long to compute. `FrozenTransport` keeps them for one shape, and they are used again while the
 vertices are within `NEAR` of this shape. The shadows of projector and lamps are always those of
-the moved shape itself (`renderer.transport.lamp_paths`).
+the moved shape itself (`renderer.operators.lamp_paths`).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from torch import Tensor
 
 from augment.scene.objects import SceneObject
 from renderer.camera import Camera
-from renderer.geometry.mesh import Mesh
 from renderer.light.basis import Basis, split_light
+from renderer.mesh import Mesh
+from renderer.operators.lamp_paths import LocalLightView
+from renderer.operators.rays import Rays, Surface
+from renderer.operators.shadows import build_transport
 from renderer.settings import ImageSettings
 from renderer.shaded_view import PixelRadiance, ShadedView
-from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import paint_faces, surface_albedo
-from renderer.transport.lamp_paths import LocalLightView
-from renderer.transport.precomputed import build_transport
-from renderer.transport.rays import Rays, Surface
+from renderer.surface.gloss import Gloss
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 
 if TYPE_CHECKING:
     from augment.scene.conditions import Conditions

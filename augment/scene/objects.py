@@ -12,7 +12,7 @@ import numpy as np
 from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
 from renderer.camera import Camera
 from renderer.errors import InputError
-from renderer.geometry.mesh import (
+from renderer.mesh import (
     Mesh,
     center_and_extent,
     concatenate,
@@ -20,8 +20,8 @@ from renderer.geometry.mesh import (
     select_faces,
     subdivide,
 )
-from renderer.geometry.shapes import solid
-from renderer.shading.gloss import Gloss
+from renderer.solids import solid
+from renderer.surface.gloss import Gloss
 
 # Smallest distance of the sides of a table from its center below the object, in world units.
 MIN_TABLE_REACH = 1.2

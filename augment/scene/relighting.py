@@ -19,9 +19,9 @@ from augment.scene.objects import SceneObject
 from renderer.camera import Camera
 from renderer.image import background_term
 from renderer.memory import require_memory
+from renderer.operators.apply import TransferOperator
+from renderer.operators.stack import PIXELS_PER_STACK, OperatorStack, Rows
 from renderer.settings import ImageSettings
-from renderer.transport.operator_stacks import PIXELS_PER_STACK, OperatorStack, Rows
-from renderer.transport.operators import TransferOperator
 
 
 class Layer(NamedTuple):

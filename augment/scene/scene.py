@@ -20,15 +20,15 @@ from augment.scene.objects import SceneObject
 from augment.scene.relighting import Layer, Relighting
 from renderer.camera import Camera
 from renderer.errors import InputError, describe, require_bounded
-from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.memory import require_memory
+from renderer.mesh import Mesh
+from renderer.operators.apply import build_operators
+from renderer.operators.stack import OperatorStack, ScatterLayers
 from renderer.settings import ImageSettings
-from renderer.transport.operator_stacks import OperatorStack, ScatterLayers
-from renderer.transport.operators import build_operators
 from renderer.validation import as_integers, as_list, as_tensor, require_kind
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -107,7 +107,7 @@ class Scene:
         if not hasattr(rasterizer, "rasterize"):
             raise InputError(
                 f"rasterizer is {describe(rasterizer)}: "
-                "give renderer.visibility.rasterizers.choose(name)",
+                "give renderer.visibility.rasterizer.choose(name)",
             )
         self.objects = as_list("objects", objects, SceneObject, "a list of scene objects")
         examples = as_list("examples", examples, Example, "a list of examples")

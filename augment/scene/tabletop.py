@@ -23,12 +23,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.geometry.mesh import Mesh
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.harmonics import bands, cache_tensors, degree_of
+from renderer.mesh import Mesh
+from renderer.operators.lamp_paths import unoccluded
+from renderer.operators.rays import NO_FACE, Rays, sphere
 from renderer.settings import ImageSettings
-from renderer.transport.lamp_paths import unoccluded
-from renderer.transport.rays import NO_FACE, Rays, sphere
 
 # Number of directions of the sky that are traced from each point of the table or the wall, to find
 # out whether the object blocks them.

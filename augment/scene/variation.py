@@ -26,8 +26,8 @@ from renderer.image import clamp, decode, encode
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
-from renderer.shading.gloss import Gloss
-from renderer.transport.rays import Rays
+from renderer.operators.rays import Rays
+from renderer.surface.gloss import Gloss
 from renderer.vectors import rotation_matrices
 
 # Smallest and largest elevation of a camera above a table, in degrees.

@@ -13,9 +13,9 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_range
-from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
 from renderer.image import decode
 from renderer.io.files import atomic_write
+from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
 from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from renderer.geometry.mesh import NO_TEXTURE, Mesh
 from renderer.image import encode
 from renderer.io.cutout import cut_out
 from renderer.io.gltf_file import GltfFile
@@ -23,6 +22,7 @@ from renderer.io.gltf_material import QUANTIZATION, Material, ignored_features, 
 from renderer.io.mesh_file import MeshFile, Part, require_bounded
 from renderer.io.skins import Skeleton
 from renderer.memory import require_memory
+from renderer.mesh import NO_TEXTURE, Mesh
 
 # Kinds of primitives that consist of triangles (5.24.4).
 TRIANGLES = 4

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from renderer.errors import MAX_MAGNITUDE
-from renderer.geometry.mesh import NO_TEXTURE, Mesh, transformed
-from renderer.geometry.polygons import triangulate
 from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
 from renderer.memory import require_memory
+from renderer.mesh import NO_TEXTURE, Mesh, transformed
+from renderer.polygons import triangulate
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
 TOLERANCE = 1e-3

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from renderer.geometry.mesh import NO_TEXTURE
 from renderer.io.mesh_file import (
     OPAQUE,
     TOLERANCE,
@@ -21,6 +20,7 @@ from renderer.io.mesh_file import (
     without_comments,
     words_per_line,
 )
+from renderer.mesh import NO_TEXTURE
 
 # Statements that describe the surface or name groups of faces.
 _READ = {"v", "vt", "vn", "f", "usemtl", "mtllib", "g", "o"}

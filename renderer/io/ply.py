@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from renderer.geometry.mesh import NO_TEXTURE
 from renderer.io.mesh_file import (
     OPAQUE,
     MeshFile,
@@ -18,6 +17,7 @@ from renderer.io.mesh_file import (
     triangles_of,
     unit_colors,
 )
+from renderer.mesh import NO_TEXTURE
 
 # Types of NumPy by the names of types in the header.
 _TYPES = {

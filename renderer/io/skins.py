@@ -7,8 +7,8 @@ file together have J joints.
 
 import numpy as np
 
-from renderer.geometry.skin import NO_PARENT, Skin
 from renderer.io.gltf_file import GltfFile
+from renderer.skin import NO_PARENT, Skin
 
 # The weights of the joints of a vertex should add up to 1. Their sum may
 # differ from 1 by at most this much, because weights with 8 bits are rounded.

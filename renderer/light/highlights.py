@@ -1,7 +1,7 @@
 """The degree of environment light that highlights need, and errors of highlights at lower degrees.
 
 A highlight is the light that a rough surface reflects specularly toward the
-camera (see `renderer.surface.microfacets`). In light with few spherical
+camera (see `renderer.microfacets`). In light with few spherical
 harmonics, a highlight is blurred, or it rings: there are dark rings or negative
 radiance around it.
 
@@ -20,8 +20,8 @@ from torch import Tensor
 from renderer.light.environment import FEWEST_ROWS, to_map
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.light.window import best_window
+from renderer.microfacets import SCHLICK, reflectance
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
-from renderer.surface.microfacets import SCHLICK, reflectance
 
 # `required_degree` leaves out the degrees of a light whose amplitude in a highlight
 # is at most this fraction of the amplitude of degree 0, by default.

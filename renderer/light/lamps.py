@@ -16,7 +16,7 @@ from renderer.camera import PerspectiveCamera
 from renderer.errors import MAX_SCALE, InputError, require_range
 from renderer.io.mitsuba_entries import pose_of
 from renderer.light.basis import LightPaths, LocalBasis
-from renderer.light.light_files import read_light
+from renderer.light.files import read_light
 from renderer.settings import require_field_types
 from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes

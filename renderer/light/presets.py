@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import InputError, require_bounded
-from renderer.geometry.mesh import Y_UP_TO_Z_UP
 from renderer.image import LUMINANCE
 from renderer.light.basis import COEFFICIENTS, DEGREE, Harmonics
 from renderer.light.environment import SUFFIXES, read_panorama
+from renderer.light.files import read_light
 from renderer.light.harmonics import (
     basis,
     degree_of,
@@ -27,7 +27,7 @@ from renderer.light.harmonics import (
     rotate,
 )
 from renderer.light.highlights import window_without_ringing
-from renderer.light.light_files import read_light
+from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.validation import as_path
 
 # Coefficients of three light probes, as RGB rows in the order L00, L1-1, L10,

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from renderer.errors import require_bounded
-from renderer.geometry.mesh import Mesh
 from renderer.image import clamp, decode
+from renderer.mesh import Mesh
 from renderer.visibility.fragments import BLOCK, Fragments
 
 # Value of `Mesh.texture_ids` for a face without a texture.

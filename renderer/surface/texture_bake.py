@@ -29,8 +29,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
+from renderer.mesh import Mesh
 from renderer.surface.albedo import changed_albedo
 
 # Approximate limit for the number of texels of a new texture. If it would have more texels,

@@ -1,6 +1,6 @@
 """Gradients of images with respect to the positions of surfaces and silhouettes in the image.
 
-`renderer.shading.shading` differentiates the shading of samples, but holds fixed
+`renderer.surface.shading` differentiates the shading of samples, but holds fixed
 which face a sample shows. This module adds the gradient that is missing: how the
 image changes if the surfaces move in it.
 
@@ -41,9 +41,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.camera import Camera
-from renderer.geometry.mesh import EDGES
+from renderer.mesh import EDGES
 from renderer.visibility.fragments import Fragments
-from renderer.visibility.rasterizers.numpy import SUBSAMPLES, to_fixed_point
+from renderer.visibility.numpy import SUBSAMPLES, to_fixed_point
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

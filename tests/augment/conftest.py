@@ -18,10 +18,10 @@ from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
-from renderer.geometry.mesh import Mesh
 from renderer.light.presets import ambient
+from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 SIZE = 6
 ANGLES = (51.6, 17.2), (74.5, 108.9), (63.0, 200.5)  # polar angles and azimuths in degrees

@@ -24,8 +24,8 @@ from augment.settings import (
     VariationSettings,
 )
 from renderer.errors import InputError
-from renderer.geometry.shapes import solid
 from renderer.light.presets import probe
+from renderer.solids import solid
 
 EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")

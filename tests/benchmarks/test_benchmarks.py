@@ -22,8 +22,8 @@ from benchmarks import (
     training,
     whole_steps,
 )
-from renderer.transport import precomputed
-from renderer.visibility.rasterizers import choose
+from renderer.operators import shadows as precomputed
+from renderer.visibility.rasterizer import choose
 
 PNG_SIGNATURE = b"\x89PNG"
 

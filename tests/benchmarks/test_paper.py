@@ -25,7 +25,7 @@ from benchmarks.paper import (
     transfer,
 )
 from renderer import orbit_cameras
-from renderer.geometry.mesh import Mesh
+from renderer.mesh import Mesh
 
 RECORDS = Path(__file__).parents[2] / "docs" / "paper"
 PNG_SIGNATURE = b"\x89PNG"

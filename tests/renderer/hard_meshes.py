@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from renderer.geometry.mesh import Mesh, concatenate
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.mesh import Mesh, concatenate
+from renderer.visibility.rasterizer import Rasterizer
 
 NO_FACE = -1
 

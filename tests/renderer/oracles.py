@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.special import sph_harm_y_all
 
-from renderer.geometry.mesh import Mesh, normalize
-from renderer.geometry.shapes import SOLIDS, solid
 from renderer.io.meshes import load_mesh
 from renderer.light.harmonics import lambertian_factors
+from renderer.mesh import Mesh, normalize
+from renderer.solids import SOLIDS, solid
 
 SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 

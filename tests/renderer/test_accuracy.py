@@ -29,18 +29,18 @@ from oracles import draw, scipy_basis
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
-from renderer.geometry.mesh import Mesh, normalize
 from renderer.light.basis import Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import ambient
+from renderer.mesh import Mesh, normalize
+from renderer.operators import rays
+from renderer.operators.apply import build_operators
+from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
-from renderer.shading.shading import radiance
 from renderer.surface.albedo import surface_albedo
-from renderer.transport import rays
-from renderer.transport.operators import build_operators
-from renderer.transport.rays import Surface
+from renderer.surface.shading import radiance
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import Rasterizer, choose
+from renderer.visibility.rasterizer import Rasterizer, choose
 
 CAMERA = OrthographicCamera(polar=57.3, azimuth=28.6, width=2.2)
 TOWARDS = CAMERA.axes()[2]

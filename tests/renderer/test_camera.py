@@ -20,11 +20,11 @@ from renderer.camera import (
     orbit_cameras,
 )
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
+from renderer.mesh import Mesh
+from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
-from renderer.transport.rays import Surface
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 EPS = np.finfo(np.float64).eps
 # Corners of the cube [-1, 1]³.

@@ -9,20 +9,20 @@ from torch import Tensor
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import MAX_MAGNITUDE, InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.normals import face_normals, vertex_normals
 from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
+from renderer.mesh import Mesh
+from renderer.normals import face_normals, vertex_normals
+from renderer.operators.apply import build_operators
 from renderer.settings import ImageSettings
-from renderer.shading.shading import (
+from renderer.surface.albedo import face_albedo, surface_albedo
+from renderer.surface.shading import (
     irradiance,
     normals_in_sight,
     radiance,
 )
-from renderer.surface.albedo import face_albedo, surface_albedo
-from renderer.transport.operators import build_operators
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 MESH = Mesh.plain(
     [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],

@@ -13,7 +13,7 @@ from torch import Tensor
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.fitting import (
+from renderer.fit import (
     FINAL_GRID,
     MIN_RADIANCE_RATIO,
     FittedScene,

@@ -19,14 +19,14 @@ import trimesh
 from oracles import mesh_of
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.geometry.mesh import Mesh, normalize
-from renderer.geometry.shapes import solid
 from renderer.light.environment import write_map
+from renderer.mesh import Mesh, normalize
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.operators import rays
+from renderer.operators.apply import build_operators
 from renderer.settings import ImageSettings
-from renderer.transport import rays
-from renderer.transport.operators import build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.solids import solid
+from renderer.visibility.rasterizer import choose
 
 pytest.importorskip("mitsuba")
 

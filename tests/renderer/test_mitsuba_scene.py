@@ -12,10 +12,10 @@ from oracles import mesh_of
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, PinholeCamera
-from renderer.geometry.mesh import Mesh, normalize
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
+from renderer.mesh import Mesh, normalize
 from renderer.mitsuba_scene import (
     SCENE,
     mitsuba,
@@ -23,14 +23,14 @@ from renderer.mitsuba_scene import (
     render_mitsuba_scene,
     write_mitsuba_scene,
 )
-from renderer.settings import ImageSettings
-from renderer.shading.gloss import Gloss
-from renderer.transport.operators import (
+from renderer.operators.apply import (
     TransferOperator,
     build_operators,
 )
+from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss
 from renderer.vectors import unit_vectors
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 pytest.importorskip("mitsuba")
 drjit = pytest.importorskip("drjit")

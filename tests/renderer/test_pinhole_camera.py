@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 import renderer
 from renderer.camera import PinholeCamera
 from renderer.errors import InputError
+from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
-from renderer.transport.rays import Surface
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 from tests.renderer.test_camera import RASTERIZERS, open_torus
 
 SIZE = 64

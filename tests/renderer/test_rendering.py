@@ -17,10 +17,10 @@ from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.light.projector import Projector
+from renderer.operators.apply import build_operators
 from renderer.rendering import light_sphere
 from renderer.settings import ENCODINGS, NORMALS, ImageSettings
-from renderer.transport.operators import build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

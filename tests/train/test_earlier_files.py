@@ -16,7 +16,7 @@ import yaml
 import augment
 import renderer
 from augment.attacks.adversary import write_adversary
-from renderer.light.light_files import read_light
+from renderer.light.files import read_light
 from renderer.light.projector import Projector
 from train.__main__ import main
 from train.runs.run_config import read_config

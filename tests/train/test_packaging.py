@@ -155,7 +155,7 @@ class TestAnInstallation:
         )
         mistake, revealed, *_ = done.stdout.splitlines()
         assert "user.py:2" in mistake and 'incompatible type "str"; expected "int"' in mistake
-        assert '"renderer.geometry.mesh.Mesh"' in revealed
+        assert '"renderer.mesh.Mesh"' in revealed
 
     def run(self, target: Path, folder: Path, command: str, *arguments: str) -> str:
         """Run an installed command in a folder, and return its output."""

@@ -40,7 +40,7 @@ from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 from train.auditing.frames import SIDE, frames_of
 
 # Number of images that a classifier classifies in one pass.

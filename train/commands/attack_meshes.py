@@ -44,7 +44,7 @@ from augment.scene.objects import SceneObject, add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.visibility.rasterizers import Rasterizer
+from renderer.visibility.rasterizer import Rasterizer
 from train.class_names import class_name, class_of_meshes
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings

@@ -19,13 +19,13 @@ from augment.scene.build import load_backgrounds
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
-from renderer.geometry.mesh import Mesh, normalize
-from renderer.geometry.shapes import SOLIDS, solid
 from renderer.image import to_bytes
 from renderer.light.presets import ambient, directional
 from renderer.memory import require_memory
+from renderer.mesh import Mesh, normalize
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizers import choose
+from renderer.solids import SOLIDS, solid
+from renderer.visibility.rasterizer import choose
 from train import console
 from train.data.cache import TensorCache, source_key
 from train.data.sets import DataSet, Split

@@ -10,9 +10,9 @@ from typing import Any
 from augment.classifiers import Classifier
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
-from renderer.geometry.mesh import Mesh
 from renderer.io.export import export_mesh
 from renderer.io.files import atomic_write
+from renderer.mesh import Mesh
 from renderer.validation import as_list
 from train.class_names import classes_of_meshes
 

@@ -13,7 +13,7 @@ from augment import distributed
 from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
-from renderer.visibility.rasterizers import Rasterizer, choose
+from renderer.visibility.rasterizer import Rasterizer, choose
 from train import console
 from train.system.user_errors import keyed
 

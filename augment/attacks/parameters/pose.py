@@ -19,8 +19,8 @@ from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
-from renderer.geometry.skin import Skin
 from renderer.light.ball import Ball, nearest_in_box
+from renderer.skin import Skin
 from renderer.vectors import rotation_matrices
 
 # An attack on the pose changes a vector of values. The following constants are positions in it:

@@ -17,10 +17,10 @@ from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, add_table, with_props
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh, normalize
-from renderer.geometry.shapes import solid
-from renderer.shading.gloss import Gloss
-from renderer.visibility.rasterizers import choose
+from renderer.mesh import Mesh, normalize
+from renderer.solids import solid
+from renderer.surface.gloss import Gloss
+from renderer.visibility.rasterizer import choose
 
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # Each has a test of its own.
 CHANGE_TEXTURES = {"material", "albedo"}

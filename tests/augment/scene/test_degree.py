@@ -17,14 +17,14 @@ from augment.scene.degree import Smoothest, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import ObjectSettings, PropSettings, SpecularLayerSettings, VariationSettings
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import solid
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import quadrature
 from renderer.light.highlights import required_degree
 from renderer.light.presets import directional, load_light, probe
-from renderer.shading.gloss import Gloss, smallest_roughness
+from renderer.mesh import Mesh
+from renderer.solids import solid
+from renderer.surface.gloss import Gloss, smallest_roughness
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}

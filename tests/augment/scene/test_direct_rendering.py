@@ -10,12 +10,12 @@ from torch import Tensor
 import augment
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import solid
 from renderer.image import decode, encode
+from renderer.mesh import Mesh
+from renderer.operators.apply import build_operators
 from renderer.settings import ENCODINGS
-from renderer.transport.operators import build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.solids import solid
+from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

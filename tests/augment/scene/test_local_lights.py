@@ -18,11 +18,11 @@ from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from renderer.errors import InputError
-from renderer.light.light_files import read_light, save_light
+from renderer.light.files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
-from renderer.transport import lamp_paths
-from renderer.transport.operators import build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.operators import lamp_paths
+from renderer.operators.apply import build_operators
+from renderer.visibility.rasterizer import choose
 
 SIZE = 16
 BOTH = torch.arange(2)  # indices of both examples

@@ -9,8 +9,8 @@ import trimesh
 from augment.scene.objects import add_table, load_object, resample_instance, rotated
 from augment.settings import ObjectSettings, PropSettings
 from renderer.errors import InputError
-from renderer.geometry.mesh import normalize
-from renderer.geometry.shapes import solid
+from renderer.mesh import normalize
+from renderer.solids import solid
 
 GRAY = (0.5, 0.5, 0.5)
 

@@ -25,15 +25,15 @@ from augment.scene.scene import Scene
 from augment.settings import ObjectSettings, count_views
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
 from renderer.light.highlights import required_degree
 from renderer.light.presets import ambient, probe
+from renderer.mesh import Mesh
+from renderer.operators.apply import build_operators
 from renderer.settings import ImageSettings
-from renderer.transport.operators import build_operators
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

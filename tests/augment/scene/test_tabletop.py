@@ -10,13 +10,13 @@ import torch
 import renderer
 from augment.scene import tabletop
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.geometry.mesh import Mesh, concatenate, normalize
-from renderer.geometry.shapes import sphere
 from renderer.light.basis import HARMONICS
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, probe
+from renderer.mesh import Mesh, concatenate, normalize
+from renderer.operators.rays import Rays
 from renderer.settings import ImageSettings
-from renderer.transport.rays import Rays
+from renderer.solids import sphere
 
 SIZE = 32
 FAR = 1000.0

@@ -28,12 +28,12 @@ from augment.settings import (
     VariationSettings,
 )
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode
 from renderer.io.images import read_image
 from renderer.light.basis import HARMONICS
-from renderer.light.light_files import save_light
+from renderer.light.files import save_light
 from renderer.light.presets import ambient, load_light, probe
+from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
 
 SIZE = 48

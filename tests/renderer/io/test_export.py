@@ -22,10 +22,10 @@ from renderer.camera import (
     orbit_cameras,
 )
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import solid
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh
+from renderer.mesh import Mesh
+from renderer.solids import solid
 
 EPS32 = np.finfo(np.float32).eps
 

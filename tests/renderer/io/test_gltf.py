@@ -21,11 +21,11 @@ from scipy.spatial import KDTree
 
 from renderer import memory
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode
 from renderer.io import cutout
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh, read_parts
+from renderer.mesh import Mesh
 
 TYPES = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125}
 KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}

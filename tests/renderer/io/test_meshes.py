@@ -19,8 +19,8 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.io.meshes import load_mesh
+from renderer.mesh import Mesh
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
 WHITE = [1.0, 1.0, 1.0]

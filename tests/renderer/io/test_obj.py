@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, png_of, srgb_of
 
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
 from renderer.io.meshes import load_mesh
+from renderer.mesh import Mesh
 
 RED = (1.0, 0.0, 0.0)
 GREEN = (0.0, 1.0, 0.0)

@@ -11,7 +11,7 @@ from skinned_arm import ARM, BIND, GLOVE, LOCAL, ROOT, STONE, WEIGHTS
 
 import renderer
 from renderer.errors import InputError
-from renderer.geometry.mesh import Y_UP_TO_Z_UP, concatenate
+from renderer.mesh import Y_UP_TO_Z_UP, concatenate
 from renderer.vectors import rotation_matrices
 
 # Rotation vectors of the three joints.

@@ -7,8 +7,6 @@ import torch
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import sphere
 from renderer.light.basis import (
     Harmonics,
     SumBasis,
@@ -18,8 +16,10 @@ from renderer.light.basis import (
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
+from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, write_mitsuba_scene
 from renderer.settings import ImageSettings
+from renderer.solids import sphere
 
 # The three lights have 9, 2 and 9 coefficients.
 SKY = Harmonics(2)

@@ -21,7 +21,7 @@ from renderer.light.harmonics import (
     rotate,
 )
 from renderer.settings import MAX_DEGREE
-from renderer.shading.shading import irradiance
+from renderer.surface.shading import irradiance
 
 EPS = np.finfo(np.float64).eps
 every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])

@@ -10,7 +10,7 @@ from oracles import draw_uniform, linear_of, patchwork
 from scipy.ndimage import map_coordinates
 
 from renderer.camera import OrthographicCamera
-from renderer.geometry.mesh import Mesh
+from renderer.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import (
     changed_albedo,
@@ -20,7 +20,7 @@ from renderer.surface.albedo import (
 )
 from renderer.surface.texture_bake import with_added_albedo
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 # Camera whose image shows x to the right and y up, from -1 to 1.

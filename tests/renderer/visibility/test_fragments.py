@@ -11,7 +11,7 @@ import trimesh
 from renderer.camera import OrthographicCamera
 from renderer.settings import ImageSettings
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizers import choose
+from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")

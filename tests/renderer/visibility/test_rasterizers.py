@@ -18,9 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+import renderer.visibility
 from renderer.errors import InputError
-from renderer.visibility import rasterizers
-from renderer.visibility.rasterizers import SPAN, Rasterizer, choose, opengl
+from renderer.visibility import opengl
+from renderer.visibility.rasterizer import SPAN, Rasterizer, choose
 
 HAS_NUMBA = find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not HAS_NUMBA, reason="numba is not installed")
@@ -401,7 +402,7 @@ def test_triton_can_be_loaded_after_opengl():
 
     The test runs in another process, because a crash would end this one.
     """
-    opengl_first = "from renderer.visibility import rasterizers; rasterizers.choose('opengl')"
+    opengl_first = "from renderer.visibility import rasterizer; rasterizer.choose('opengl')"
     script = f"{opengl_first}; import triton"
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
@@ -431,8 +432,8 @@ def test_numpy_takes_less_memory_than_a_list_of_all_candidates():
 def without_numba(monkeypatch) -> None:
     """Make the import of numba fail."""
     monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "renderer.visibility.rasterizers.numba", raising=False)
-    monkeypatch.delattr(rasterizers, "numba", raising=False)
+    monkeypatch.delitem(sys.modules, "renderer.visibility.numba", raising=False)
+    monkeypatch.delattr(renderer.visibility, "numba", raising=False)
 
 
 @needs_numba

@@ -13,10 +13,10 @@ from torch import Tensor
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
-from renderer.geometry.mesh import concatenate
-from renderer.geometry.shapes import SOLIDS
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
+from renderer.mesh import concatenate
+from renderer.solids import SOLIDS
 
 FAR = OrthographicCamera(63.0, 22.9, 2.8)
 NEAR = PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)

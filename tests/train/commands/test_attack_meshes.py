@@ -12,7 +12,7 @@ from augment.classifiers import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe
-from renderer.visibility.rasterizers import opengl
+from renderer.visibility import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings

@@ -19,8 +19,8 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.images import read_image
 from renderer.light.environment import read_panorama, to_map
+from renderer.light.files import save_light
 from renderer.light.harmonics import equirectangular
-from renderer.light.light_files import save_light
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network

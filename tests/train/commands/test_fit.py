@@ -16,13 +16,13 @@ import renderer
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_image
 from renderer.light.environment import read_panorama, to_map, write_map
 from renderer.light.harmonics import equirectangular, project
 from renderer.light.presets import load_light
+from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from scripts.attack import main as attack_command

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
+from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photographs import OTHER_PREFIX
 from train.settings import ExperimentSettings, label_names, simplified

@@ -18,8 +18,6 @@ from augment.progress import progress
 from augment.random_streams import stream_seed
 from augment.scene.objects import load_object
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import HARD_NEGATIVES
 from renderer.image import decode, encode
 from renderer.io.files import atomic_write
 from renderer.io.images import read_image, write_image
@@ -27,7 +25,9 @@ from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
+from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
+from renderer.solids import HARD_NEGATIVES
 from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION

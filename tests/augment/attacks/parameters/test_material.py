@@ -19,11 +19,11 @@ from augment.parameter_settings import MATERIAL_PARTS
 from augment.scene.objects import SceneObject, add_table
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import sphere
+from renderer.mesh import Mesh
 from renderer.settings import MIN_ROUGHNESS
-from renderer.shading.gloss import Gloss
+from renderer.solids import sphere
 from renderer.surface.albedo import changed_albedo
+from renderer.surface.gloss import Gloss
 
 FIRST = torch.zeros(1, dtype=torch.int64)  # index of the only example
 TABLE = [0.5, 0.4, 0.3]

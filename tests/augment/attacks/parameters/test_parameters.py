@@ -31,8 +31,8 @@ from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import ZENITH, coefficients
+from renderer.operators.apply import build_operators
 from renderer.settings import TURBIDITY
-from renderer.transport.operators import build_operators
 
 EPS = torch.finfo(torch.float64).eps
 SKY = (51.6, 22.9, 3.0)  # zenith and azimuth in degrees, turbidity

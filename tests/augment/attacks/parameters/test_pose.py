@@ -17,7 +17,7 @@ from augment.attacks.problem import AttackProblem
 from augment.parameter_settings import POSE_PARTS
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
+from renderer.mesh import Mesh
 
 ONLY = dict.fromkeys(POSE_PARTS, 0.0)  # Add the parts that may change.
 MESHES = Path(__file__).parents[5] / "shared" / "data" / "meshes"

@@ -15,8 +15,8 @@ import pytest
 import trimesh
 
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh
-from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS, solid
+from renderer.mesh import Mesh
+from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
 from train.evaluation.laboratory import lab_patterns as patterns

@@ -1,0 +1,1052 @@
+"""Estimate the camera and the light of a photograph of an object whose mesh is known.
+
+All pixels outside of the object are set to one gray value in the photograph and
+in the render, so that the images show the silhouette and the shading at once. An
+image is linear in the light, and the radiance of the light must not be negative.
+The best light for a given camera is therefore the solution of a convex quadratic
+program. The differences of the pixels are then a function of the camera alone
+(variable projection, Golub and Pereyra 1973). The Gauss-Newton method minimizes
+the sum of the squared differences.
+
+Only the product of light and albedo can be seen: with twice the albedo, half the
+light is found.
+
+A light is environment light with 49 spherical-harmonic (SH) coefficients per
+color channel (degree 6).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares, nnls
+from torch import Tensor
+
+from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
+from renderer.errors import InputError
+from renderer.image import decode
+from renderer.light.basis import COEFFICIENTS, DEGREE
+from renderer.light.harmonics import bands, basis
+from renderer.mesh import Mesh
+from renderer.photograph import Photograph, Window
+from renderer.rendering import precompute_transfer, render
+from renderer.solids import sphere
+from renderer.validation import as_tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
+
+# Polar angles in degrees of the first cameras of a search:
+# the angles between +z and the direction to the camera.
+FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)
+# Number of first cameras at each polar angle, with equally spaced azimuths.
+FIRST_AZIMUTH_COUNT = 16
+# Width in world units that a first camera shows, before it is changed
+# so that the mesh looks as large as the object in the photograph.
+FIRST_WIDTH = 2.0
+# Width and height in pixels of the small images in which cameras are
+# searched. The best cameras are then refined in images of the full size.
+COARSE_SIZE = 32
+# The search refines this many of its first cameras: those whose images
+# differ least from the photograph. It returns at most as many.
+KEPT_CAMERAS = 3
+# Largest number of steps when one camera
+# is refined with the Gauss-Newton method.
+MAX_STEPS = 20
+# The refinement of a camera ends if a step changes the
+# squared error, or the camera, by less than this fraction.
+MIN_GAIN = 1e-3
+# Step sizes of numerical derivatives, times the image size in pixels. The
+# five parameters of a camera are the polar angle and the azimuth in radians,
+# the relative width, and the shifts right and up as fractions of the width.
+DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
+# Smallest angle in radians between a refined camera and +z
+# or -z. Exactly there, the azimuth would have no effect.
+MIN_POLE_ANGLE = 0.02
+# Number of samples along one side of a pixel in renders.
+SAMPLES = 8
+# Two cameras count as the same one if all their
+# axes differ by less than this angle in degrees.
+MIN_CAMERA_ANGLE = 2.0
+# A camera of the search in small images is refined in full size if its
+# squared error is at most this multiple of the smallest squared error.
+MAX_ERROR_RATIO = 3
+# Weight of the smoothness penalty of the light, relative to the squared
+# brightness of the object under uniform light. Without a penalty, light from
+# directions that the object hardly reflects could become arbitrarily bright.
+SMOOTHNESS_WEIGHT = 1e-6
+# A pixel of the photograph with this linear value or more counts as
+# clipped: the scene may have been brighter than the photograph can show.
+CLIPPED_VALUE = 0.995
+# The light is fitted up to this many times. Each fit ignores
+# the clipped pixels that the last fit made brighter than 1.
+CLIPPING_ROUNDS = 3
+# Smallest radiance of a light in all directions of a grid, as a fraction of its
+# mean radiance. The margin keeps the radiance positive between the directions.
+MIN_RADIANCE_RATIO = 0.01
+# Largest number of iterations of SciPy's `nnls`, per direction of the grid in
+# which the radiance of a light is constrained. Three iterations are usual.
+MAX_NNLS_ITERATIONS = 100
+# The radiance of a light is first constrained in every 16th direction of the
+# grid. Directions in which the radiance is negative are added afterwards.
+FIRST_DIRECTION_STEP = 16
+# The search for a camera prevents negative radiance of its lights in the
+# directions of the vertices of an icosphere with this number of subdivisions.
+SEARCH_GRID = 2
+# The same number for the light that is returned.
+FINAL_GRID = 5
+# The object covers a pixel completely if its share of the pixel
+# is larger than this. A limit of 0.99 would be too low: a white
+# background in the other hundredth of the pixel can be brighter
+# than the object, for example in the blue channel of a banana.
+WHOLE_PIXEL = 0.999
+# The bounding box of a mask contains the pixels that it covers by more than this.
+HALF_PIXEL = 0.5
+# A pixel on the border of the object gets the mean color of the pixels that the
+# object covers completely and that are at most this many rows and columns away.
+BORDER = 2
+# Side of the square window that is cut around an object,
+# divided by the longer side of the object's bounding box.
+WINDOW_SCALE = 1.6
+# A pixel of an 8-bit mask belongs to the
+# object if its value is larger than this.
+MASK_THRESHOLD = 127
+# First guess of the angle between +z and
+# the direction to the camera, in degrees.
+GUESSED_POLAR = 60.0
+# A window of the photograph is cut and fitted again if the first fit
+# changes a component of the axes of the window by more than this.
+MAX_AXIS_CHANGE = 1e-3
+# Smallest number of pixels of an image that the object must cover.
+MIN_COVERED_PIXELS = 16
+# Number of color channels.
+CHANNELS = 3
+
+
+class FittedPhotograph(NamedTuple):
+    """Camera and light of an object anywhere in a photograph, and the window that was fitted.
+
+    Attributes:
+        scene: Camera and light. The camera looks at the center of the mesh.
+        window: Square part of the photograph that the camera shows.
+    """
+
+    scene: FittedScene
+    window: Window
+
+
+class FittedScene(NamedTuple):
+    """Camera and light with which a render resembles a photograph most.
+
+    Attributes:
+        camera: Camera from which the mesh looks most like the photograph.
+        light: SH coefficients of environment light without negative radiance,
+            shape (49, 3).
+        error: Root mean square difference between the linear values of the
+            render and of the photograph, over the pixels of the object, divided
+            by the root mean square of the photograph.
+        overlap: Intersection over union of the silhouettes in the render and in
+            the mask.
+    """
+
+    camera: Camera
+    light: Tensor
+    error: float
+    overlap: float
+
+
+def fit_photograph(
+    photograph: UInt8[NDArray[Any], "height width 3"],
+    mask: UInt8[NDArray[Any], "height width"],
+    mesh: Mesh,
+    size: int = 64,
+    *,
+    fov: float | None = None,
+    encoding: str = "srgb",
+    **options: Any,
+) -> FittedPhotograph:
+    """Find the camera and the light of an object anywhere in a photograph.
+
+    The function cuts a square window around the object out of the photograph.
+    The window shows what a camera would see if it were turned toward the object
+    (see `renderer.photograph`). The window is fitted with `fit_scene`. The upward
+    direction in the window depends on the height of the camera, which is only
+    known after the fit. If the first window was tilted, a second window is cut
+    and fitted.
+
+    Args:
+        photograph: Photograph with 8 bits per channel, shape (H, W, 3) for H
+            rows and W columns. The camera of the photograph is upright, and its
+            optical axis passes through the center of the photograph.
+        mask: Mask with 8 bits, white where the object is, shape (H, W).
+        mesh: Mesh of the object, normalized and upright.
+        size: Number of pixels per side of the images that are compared.
+        fov: Field of view of the window in degrees. The window is 1.6 times as
+            wide as the object. None for a camera without perspective.
+        encoding: Encoding of the photograph and of the images that will be
+            rendered with the result, "linear" or "srgb".
+        **options: Other arguments of `fit_scene`.
+
+    Returns:
+        Camera and light, and the window of the photograph that the camera shows.
+
+    Raises:
+        InputError: If no pixel of the mask is white.
+    """
+    is_object = mask > MASK_THRESHOLD
+    rows = np.flatnonzero(is_object.any(axis=1))
+    columns = np.flatnonzero(is_object.any(axis=0))
+    if not len(rows):
+        raise InputError(
+            "the mask has no white pixels: give a mask that is white where the object is, "
+            "or a box around the object"
+        )
+    # Center (column, row) of the object's
+    # bounding box in the photograph, in pixels.
+    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
+    # Side of the window in pixels.
+    side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
+    focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
+    camera_image = Photograph(photograph, focal_length)
+    fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
+
+    # The window needs the direction of the world's z-axis
+    # in the axes of the photograph's camera: right, up and
+    # back. For the first fit, this direction is guessed.
+    guessed_polar = math.radians(GUESSED_POLAR)
+    guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
+    window = camera_image.window(center, side, guessed_up)
+    scene = fit.fit(window, None)
+    # The first fit gives a better direction of the z-axis for the second fit.
+    up = _up_direction(scene.camera, window)
+    # The camera of the photograph is upright,
+    # so the z-axis does not point to its right.
+    up[0] = 0
+    upright_window = camera_image.window(center, side, up)
+    if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
+        window = upright_window
+        scene = fit.fit(window, scene.camera)
+    return _centered_on_mesh(scene, window, camera_image)
+
+
+def _centered_on_mesh(
+    scene: FittedScene, window: Window, camera_image: Photograph
+) -> FittedPhotograph:
+    """Turn a fitted camera and its window so that the mesh center is in their center.
+
+    Args:
+        scene: Fitted camera and light. The camera may show the mesh center
+            elsewhere in its image.
+        window: Window of the photograph that the camera shows.
+        camera_image: Photograph with its focal length.
+
+    Returns:
+        Turned camera with the same light, and a window of the same size.
+    """
+    camera = scene.camera
+    # Offset (right, up) of the mesh center from the window center, in pixels.
+    offset = np.array([camera.right, camera.up]) * window.side / camera.width
+    mesh_center = np.array(window.pixels(*offset))
+    up = _up_direction(camera, window)
+    centered_scene = scene._replace(camera=_turned_to_mesh(camera))
+    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, window.side, up))
+
+
+@dataclass(frozen=True)
+class _WindowFit:
+    """Photograph with the settings for fitting a camera and a light to windows of it.
+
+    Attributes:
+        photograph: Photograph with 8 bits per channel, shape (H, W, 3).
+        mask: Mask with 8 bits, white where the object is, shape (H, W).
+        mesh: Mesh of the object.
+        size: Number of pixels per side of the images that are compared.
+        options: Keyword arguments of `fit_scene`.
+    """
+
+    photograph: NDArray[Any]
+    mask: NDArray[Any]
+    mesh: Mesh
+    size: int
+    options: dict[str, Any]
+
+    def fit(self, window: Window, start: Camera | None) -> FittedScene:
+        """Fit the camera and the light in one window.
+
+        Args:
+            window: Window of the photograph.
+            start: Camera that is refined. None searches for a camera.
+
+        Returns:
+            Camera and light with which a render resembles the window most.
+        """
+        linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
+        # Share of each pixel that the object covers, shape (size, size).
+        coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
+        return fit_scene(linear_image, coverage, self.mesh, start=start, **self.options)
+
+
+def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
+    """Convert the world's z-axis to the axes of the camera that took the photograph.
+
+    Args:
+        camera: Fitted camera, which shows the window.
+        window: Window of the photograph.
+
+    Returns:
+        Unit vector along the z-axis with the components right, up and back,
+        shape (3,).
+    """
+    # The z-components of the axes right, up and back of the fitted
+    # camera. These axes are also the axes of the window.
+    z_axis_in_window = camera.axes()[:, 2]
+    return window.axes.T @ z_axis_in_window
+
+
+def _turned_to_mesh(camera: Camera) -> Camera:
+    """Return a copy of a camera at the same place that looks at the center of the mesh.
+
+    The center of the mesh is the origin. A perspective camera is turned if it does
+    not show the origin in the center of its image. An orthographic camera is
+    shifted.
+
+    Args:
+        camera: Camera that may show the origin elsewhere in its image
+            (`camera.right` and `camera.up`).
+
+    Returns:
+        Camera that shows the origin in the center of its image.
+    """
+    if not isinstance(camera, PerspectiveCamera):
+        return replace(camera, right=0.0, up=0.0)
+    x, y, z = camera.eye()[:3].tolist()
+    distance = math.hypot(x, y, z)
+    return replace(
+        camera,
+        polar=math.degrees(math.acos(z / distance)),
+        azimuth=math.degrees(math.atan2(y, x)),
+        width=camera.width * distance / camera.distance,
+        right=0.0,
+        up=0.0,
+        distance=distance,
+    )
+
+
+@dataclass(frozen=True)
+class _RenderOptions:
+    """Arguments for `render` and `precompute_transfer` while a camera or a light is fitted.
+
+    Attributes:
+        albedo_scale: Factor for the albedo of the mesh.
+        encoding: Encoding of image values, "linear" or "srgb".
+        normals: "flat" or "smooth".
+        rasterizer: "auto", "opengl", "numba" or "numpy".
+        samples: Number of samples along one side of a pixel.
+        bounces: Number of light bounces, with shadows.
+    """
+
+    albedo_scale: float
+    encoding: str
+    normals: str
+    rasterizer: str
+    samples: int = SAMPLES
+    bounces: int = 0
+
+
+def fit_scene(
+    photograph: Float[Tensor, "3 size size"],
+    mask: Float[Tensor, "size size"],
+    mesh: Mesh,
+    *,
+    fov: float | None = None,
+    albedo_scale: float = 1.0,
+    encoding: str = "linear",
+    normals: str = "smooth",
+    bounces: int = 0,
+    rasterizer: str = "auto",
+    start: Camera | None = None,
+) -> FittedScene:
+    """Find the camera and the light with which a render of a mesh resembles a photograph most.
+
+    The light is environment light. The camera is upright. The mesh may be shifted
+    from the center of the image (`Camera.right`, `Camera.up`).
+
+    Args:
+        photograph: Linear values in [0, 1], shape (3, size, size). Values of 0.995
+            or more count as clipped: the scene may have been brighter.
+        mask: Share of each pixel that the object covers, in [0, 1],
+            shape (size, size).
+        mesh: Mesh of the object, normalized and upright.
+        fov: Angle between opposite sides of the image in degrees. None for a
+            camera without perspective.
+        albedo_scale: Factor for the albedo of the mesh.
+        encoding: Encoding of the images that will be rendered with the result,
+            "linear" or "srgb". With "srgb", the colors of the mesh are decoded,
+            as in `render`. The photograph is linear in both cases.
+        normals: "flat" or "smooth".
+        bounces: Number of light bounces, with shadows, with which the returned
+            light is fitted. With 0, the light for a concave mesh is too bright
+            or too dim. The search for the camera ignores shadows and bounces.
+        rasterizer: "auto", "opengl", "numba" or "numpy".
+        start: Camera that is refined. None searches for a camera.
+
+    Returns:
+        Camera and light, the error of the pixels, and the overlap of the
+        silhouettes.
+
+    Raises:
+        InputError: If the photograph or the mask has a wrong shape, or if the
+            mask covers fewer than `MIN_COVERED_PIXELS` pixels, or no pixel by
+            more than `HALF_PIXEL`.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> mesh = nb.solid("cup")
+        >>> camera = nb.OrthographicCamera(polar=60.0, azimuth=0.0, width=2.4)
+        >>> light = 0.3 * nb.load_light("grace")
+        >>> photograph = nb.render(mesh, camera, light, size=32).clamp(0, 1)
+        >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0]
+        >>> found = nb.fit_scene(photograph, mask, mesh)  # doctest: +SKIP
+    """
+    photograph = as_tensor("photograph", photograph)
+    mask = as_tensor("mask", mask)
+    for name, values in (("photograph", photograph), ("mask", mask)):
+        if not (values.min() >= 0 and values.max() <= 1):
+            raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
+    size = photograph.shape[-1]
+    if photograph.shape != (CHANNELS, size, size) or mask.shape != (size, size):
+        given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
+        raise InputError(
+            f"photograph and mask have the shapes {given}: "
+            "give a photograph (3, size, size) and a mask (size, size)"
+        )
+    covered_pixels = float(mask.sum())
+    if covered_pixels < MIN_COVERED_PIXELS:
+        raise InputError(
+            f"the mask covers {covered_pixels:.0f} pixels of {size} × {size}, but at least "
+            f"{MIN_COVERED_PIXELS} are needed: give a mask that shows the object"
+        )
+    if mask.max() <= HALF_PIXEL:
+        raise InputError(
+            f"the mask covers no pixel by more than {HALF_PIXEL}: give a mask with values in "
+            "[0, 1], 1 where the object is"
+        )
+    options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
+    photograph = photograph.double()
+    mask = mask.double()
+    target = _Target.from_photograph(photograph, mask, mesh, size, options)
+    if start is None:
+        # A search in a small copy of the photograph is faster.
+        coarse_size = min(COARSE_SIZE, size)
+        coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
+        start_cameras = _plausible_cameras(coarse_target, mask, fov)
+    else:
+        start_cameras = [start]
+    refined_cameras = [target.refine_camera(camera) for camera in start_cameras]
+    _, best_camera = target.rank_cameras(refined_cameras)[0]
+    # Bounces are slow to compute, so only the
+    # returned light is fitted with bounces.
+    target_with_bounces = target._replace(options=replace(options, bounces=bounces))
+    return target_with_bounces.fit_final_light(best_camera)
+
+
+def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
+    """Search all directions for a few cameras, one of which should be near the best camera.
+
+    Args:
+        target: Small copy of the photograph, to which renders are compared.
+        mask: Share of each pixel of the photograph that the object covers,
+            shape (size, size).
+        fov: Field of view in degrees. None for cameras without perspective.
+
+    Returns:
+        At most `KEPT_CAMERAS` different cameras, the best one first.
+    """
+    mesh = target.mesh
+    radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
+    first_cameras = []
+    for polar in FIRST_POLAR_ANGLES:
+        for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov):
+            first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
+    ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
+    # All azimuths fit a round object equally well, so the
+    # best cameras may all have the same polar angle. The best
+    # camera of each polar angle is therefore refined, too.
+    best_of_polar: dict[float, Camera] = {}
+    for camera in ranked_cameras:
+        best_of_polar.setdefault(camera.polar, camera)
+    # dict.fromkeys removes duplicates, and keeps the order.
+    start_cameras = dict.fromkeys([*ranked_cameras[:KEPT_CAMERAS], *best_of_polar.values()])
+    refined = target.rank_cameras(target.refine_camera(camera) for camera in start_cameras)
+    smallest_error, _ = refined[0]
+    largest_error = MAX_ERROR_RATIO * smallest_error
+    plausible_cameras = [camera for error, camera in refined if error <= largest_error]
+    return _distinct(plausible_cameras)[:KEPT_CAMERAS]
+
+
+def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
+    """Remove cameras that look in nearly the same direction as an earlier camera.
+
+    Args:
+        cameras: Cameras in order of preference.
+
+    Returns:
+        Different cameras in the same order. A camera is left out if all its axes
+        differ from those of an earlier camera by less than `MIN_CAMERA_ANGLE`
+        degrees.
+    """
+    kept_cameras: list[Camera] = []
+    max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
+    for camera in cameras:
+        is_new = True
+        for kept_camera in kept_cameras:
+            # Cosines of the angles between the axes
+            # right, up and back of both cameras.
+            cosines = (camera.axes() * kept_camera.axes()).sum(axis=1)
+            is_new = is_new and float(cosines.min()) < max_cosine
+        if is_new:
+            kept_cameras.append(camera)
+    return kept_cameras
+
+
+class _LightFit(NamedTuple):
+    """Light with which a render from a given camera resembles the photograph most.
+
+    Attributes:
+        residuals: Differences between the render and the photograph for all pixels
+            and channels, followed by the weighted differences between the SH
+            coefficients of the light and of the expected light, shape (N,). The
+            sum of the squared residuals is the error of the camera.
+        light: SH coefficients, shape (49, 3).
+        coverage: Share of each pixel that the mesh covers in the render,
+            shape (size²,).
+    """
+
+    residuals: Tensor
+    light: Tensor
+    coverage: Tensor
+
+
+class _Target(NamedTuple):
+    """Photograph of an object that renders of a mesh should resemble.
+
+    Attributes:
+        image: Linear values of the photograph, shape (3, size²). Pixels outside
+            of the object have the value `gray`.
+        mask: Share of each pixel that the object covers, shape (size²,).
+        gray: Linear value outside of the object, 0 or 1.
+        mesh: Mesh of the object.
+        size: Number of pixels per side.
+        options: Arguments with which the mesh is rendered.
+    """
+
+    image: Tensor
+    mask: Tensor
+    gray: float
+    mesh: Mesh
+    size: int
+    options: _RenderOptions
+
+    @staticmethod
+    def from_photograph(
+        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
+    ) -> _Target:
+        """Resample a photograph and its mask, and replace the background by black or white.
+
+        Pixels on the border of the object show a mixture of object and
+        background. They get the mean color of the object's pixels around them.
+
+        Args:
+            photograph: Linear values, shape (3, H, H).
+            mask: Share of each pixel that the object covers, shape (H, H).
+            mesh: Mesh of the object.
+            size: Number of pixels per side of the resampled photograph.
+            options: Arguments with which the mesh is rendered.
+
+        Returns:
+            Resampled photograph with `size` pixels per side.
+        """
+        # 1 in pixels that the object covers
+        # completely, and 0 elsewhere, shape (1, H, H).
+        is_inside = (mask > WHOLE_PIXEL).double()[None]
+        # Side of the square of pixels around each
+        # pixel over which colors are averaged.
+        side = 2 * BORDER + 1
+        mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
+        inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
+        # Mean color of those pixels of the square
+        # that lie inside of the object.
+        border_color = mean_color / inside_fraction.clamp(min=1e-9)
+        color = torch.where(is_inside > 0, photograph, border_color)
+        object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
+        mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
+        # The background becomes black behind a bright object, and
+        # white behind a dark one, so that the silhouette stands out.
+        is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum())
+        gray = 0.0 if is_bright else 1.0
+        image = object_image + gray * (1 - mask)
+        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
+
+    def fit_light(
+        self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
+    ) -> _LightFit:
+        """Find the light under which a render from a camera resembles the photograph most.
+
+        Args:
+            camera: Camera from which the mesh is rendered.
+            min_coverage: Smallest share of a pixel that both the mesh and the mask
+                must cover. The fit ignores other pixels.
+            grid: Number of subdivisions of the icosphere whose vertices are the
+                directions in which the radiance of the light is constrained.
+
+        Returns:
+            Best light, with its residuals and the rendered coverage.
+        """
+        operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
+        # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
+        unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
+        unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
+        # Radiance of the P covered pixels under
+        # each of the 49 lights, shape (3, 49, P).
+        transfer = operator.radiance(unit_lights).permute(1, 0, 2)
+        pixels = operator.pixels
+        no_coverage = self.mask.new_zeros(self.size**2)
+        coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
+        background = self.gray * (1 - coverage)
+        image = self.image[:, pixels]
+        is_covered = torch.minimum(coverage, self.mask)[pixels] >= min_coverage
+        light, rendered, penalties = self._fit_pixels(
+            transfer, background[pixels], image, is_covered.expand(CHANNELS, -1), grid
+        )
+        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
+        differences = rendered_image.clamp(max=1) - self.image
+        residuals = torch.cat([differences.flatten(), penalties.flatten()])
+        return _LightFit(residuals, light, coverage)
+
+    def _fit_pixels(
+        self,
+        transfer: Tensor,
+        background: Tensor,
+        image: Tensor,
+        is_covered: Tensor,
+        grid: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Fit a light to P pixels of the photograph by least squares.
+
+        A pixel that is clipped in the photograph may have been brighter. The fit
+        is repeated without the clipped pixels that the render makes brighter than 1.
+
+        Args:
+            transfer: Radiance of each pixel in each channel under 49 lights, each
+                of which has a single coefficient of 1, shape (3, 49, P).
+            background: Linear values that the background adds, shape (P,).
+            image: Linear values of the photograph, shape (3, P).
+            is_covered: True for the pixels to which the light is fitted,
+                shape (3, P).
+            grid: Number of subdivisions of the icosphere whose vertices are the
+                directions in which the radiance of the light is constrained.
+
+        Returns:
+            A tuple of
+            - the SH coefficients of the light, shape (49, 3);
+            - the values of the pixels in a render with this light, shape (3, P);
+            - the weighted differences between the coefficients of the light and of
+              the expected light, shape (3, 49).
+        """
+        object_radiance = image - background
+        is_clipped = image >= CLIPPED_VALUE
+        is_used = is_covered
+        for _ in range(CLIPPING_ROUNDS):
+            # Matrix and right side of the normal equations of
+            # each channel, shape (3, 49, 49) and (3, 49).
+            used_transfer = transfer * is_used[:, None]
+            normal_matrix = used_transfer @ transfer.mT
+            right_side = (used_transfer @ object_radiance[..., None])[..., 0]
+            penalty = self.penalty(normal_matrix)
+            light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
+            rendered = (light.T[:, None] @ transfer)[:, 0] + background
+            is_trusted = is_covered & ~(is_clipped & (rendered > 1))
+            if torch.equal(is_trusted, is_used):
+                break
+            is_used = is_trusted
+        return light, rendered, penalty.sqrt() * (light - expected_light).T
+
+    def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
+        """Sort cameras by the squared error of a render with the best light of each camera.
+
+        Args:
+            cameras: Cameras to compare.
+
+        Returns:
+            Pairs of the squared error and the camera, the smallest error first.
+        """
+        pairs = []
+        for camera in cameras:
+            residuals = self.fit_light(camera).residuals
+            pairs.append((float(residuals.square().sum()), camera))
+        return sorted(pairs, key=lambda pair: pair[0])
+
+    def penalty(self, normal_matrix: Tensor) -> Tensor:
+        """Compute the weights of the smoothness penalty of a light.
+
+        The penalty is the weighted sum of the squared differences between the SH
+        coefficients and expected coefficients. The weight in band l is
+        proportional to 1 + (l (l + 1))², because -l (l + 1) is the eigenvalue of
+        the Laplacian on the sphere. It is also proportional to the squared
+        brightness of the object under uniform light. The fit therefore does not
+        depend on the scale of the albedo.
+
+        Args:
+            normal_matrix: Matrix of the normal equations of each channel,
+                shape (3, 49, 49). Entry (j, k) is the sum over pixels of the
+                radiance under coefficient j times the radiance under coefficient k.
+
+        Returns:
+            Weight of each coefficient, shape (49,).
+        """
+        # Entry (0, 0) is the sum over pixels of the squared radiance under
+        # uniform light (coefficient 0). The small summand keeps the sum
+        # above 0 if the object is black.
+        squared_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
+        band = bands(DEGREE).double()
+        return SMOOTHNESS_WEIGHT * squared_brightness * (1 + (band * (band + 1)).square())
+
+    def refine_camera(self, camera: Camera) -> Camera:
+        """Find the camera near a given camera whose render resembles the photograph most."""
+        return _Descent(self, camera).run()
+
+    def render_linear(self, camera: Camera, light: Tensor) -> Tensor:
+        """Render the mesh in front of the gray background, and decode the image to linear values.
+
+        Args:
+            camera: Camera of the image.
+            light: SH coefficients, shape (49, 3).
+
+        Returns:
+            Linear values, shape (3, size²).
+        """
+        options = asdict(self.options)
+        image = render(self.mesh, camera, light, self.size, self.gray, **options)
+        return decode(image, self.options.encoding).flatten(1)
+
+    def fit_final_light(self, camera: Camera) -> FittedScene:
+        """Fit the light for the final camera, and compute how well the render fits.
+
+        Only the pixels that the object covers completely count.
+
+        Args:
+            camera: Camera that was found.
+
+        Returns:
+            Camera and light, with the error and the overlap of the silhouettes.
+        """
+        fit = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
+        rendered = self.render_linear(camera, fit.light)
+        is_inside = self.mask > WHOLE_PIXEL
+        inside_image = self.image[:, is_inside]
+        error = (rendered - self.image)[:, is_inside].norm() / inside_image.norm()
+        intersection = torch.minimum(fit.coverage, self.mask).sum()
+        union = torch.maximum(fit.coverage, self.mask).sum()
+        overlap = intersection / union
+        return FittedScene(camera, fit.light, float(error), float(overlap))
+
+
+class _Descent:
+    """Refinement of a camera: Gauss-Newton method in a trust region over five parameters.
+
+    The parameters are the polar angle and the azimuth in radians, the width
+    divided by the width of the first camera, and the shifts right and up divided
+    by the width of the first camera. For each camera, the best light is computed
+    (variable projection). The error jumps slightly if a sample changes from one
+    face to another. Derivatives are therefore differences over about a pixel.
+
+    Args:
+        target: Photograph that the render should resemble.
+        camera: First camera, from which the method starts.
+    """
+
+    def __init__(self, target: _Target, camera: Camera):
+        """Store the photograph and the first camera, without computing anything."""
+        self._target = target
+        self._first_camera = camera
+
+    def run(self) -> Camera:
+        """Minimize the error, and return the camera with the smallest error."""
+        camera = self._first_camera
+        right = camera.right / camera.width
+        up = camera.up / camera.width
+        # Bounds of the parameters: polar angle,
+        # azimuth, relative width, right and up.
+        lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
+        highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
+        polar = math.radians(camera.polar)
+        azimuth = math.radians(camera.azimuth)
+        start = np.array([polar, azimuth, 1.0, right, up]).clip(lowest, highest)
+        found = least_squares(
+            self._residuals,
+            start,
+            self._jacobian,
+            bounds=(lowest, highest),
+            x_scale="jac",
+            ftol=MIN_GAIN,
+            xtol=MIN_GAIN,
+            max_nfev=MAX_STEPS,
+        )
+        return self._camera_of(found.x)
+
+    def _camera_of(self, parameters: np.ndarray) -> Camera:
+        """Convert the five parameters of the refinement to a camera.
+
+        Args:
+            parameters: Polar angle and azimuth in radians, width divided by the
+                width of the first camera, and shifts right and up divided by the
+                width of the first camera, shape (5,).
+
+        Returns:
+            Camera.
+        """
+        polar, azimuth, relative_width, right, up = parameters.tolist()
+        width = self._first_camera.width
+        moved = replace(
+            self._first_camera,
+            polar=math.degrees(polar),
+            azimuth=math.degrees(azimuth),
+            width=width * relative_width,
+            right=width * right,
+            up=width * up,
+        )
+        # The distance changes with the width, so
+        # that the field of view stays the same.
+        if isinstance(moved, PerspectiveCamera):
+            moved = replace(moved, distance=moved.distance * relative_width)
+        return moved
+
+    def _residuals(self, parameters: np.ndarray) -> np.ndarray:
+        """Compute the differences between the photograph and a render with the best light.
+
+        Args:
+            parameters: Polar angle, azimuth, relative width, and shifts right and up
+                of the camera, shape (5,).
+
+        Returns:
+            Residuals of the best light, shape (N,). The sum of their squares is the
+            error to minimize.
+        """
+        return self._target.fit_light(self._camera_of(parameters)).residuals.numpy()
+
+    def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
+        """Compute the derivatives of the residuals by central differences.
+
+        The residuals are the differences between the photograph and a render.
+
+        Args:
+            parameters: Polar angle, azimuth, relative width, and shifts right and up
+                of the camera, shape (5,).
+
+        Returns:
+            Derivatives of the N residuals with respect to the parameters,
+            shape (N, 5).
+        """
+        columns = []
+        step_sizes = np.array(DERIVATIVE_STEPS) / self._target.size
+        # Row k of the diagonal matrix is a step that changes only parameter k.
+        for step in np.diag(step_sizes):
+            difference = self._residuals(parameters + step) - self._residuals(parameters - step)
+            columns.append(difference / (2 * step.sum()))
+        return np.stack(columns, axis=1)
+
+
+def _fit_channels(
+    normal_matrix: Tensor, right_side: Tensor, penalty: Tensor, grid: int
+) -> tuple[Tensor, Tensor]:
+    """Fit the light of each color channel, with the light of the brightest channel as a guide.
+
+    An object may hardly reflect one color. For example, a yellow object hardly
+    shows from where blue light comes. The light of each channel is therefore
+    expected to be a multiple of the light of the brightest channel. Differences
+    between the light and this expected light are penalized.
+
+    Args:
+        normal_matrix: Matrix of the normal equations of each channel,
+            shape (3, 49, 49). Entry (j, k) is the sum over pixels of the radiance
+            under coefficient j times the radiance under coefficient k.
+        right_side: Right side of the normal equations of each channel,
+            shape (3, 49). Entry j is the sum over pixels of the radiance under
+            coefficient j times the radiance in the photograph.
+        penalty: Weight of the squared difference between each coefficient and the
+            expected coefficient, shape (49,).
+        grid: Number of subdivisions of the icosphere whose vertices are the
+            directions in which the radiance of the light is constrained.
+
+    Returns:
+        The light and the expected light, shape (49, 3) each. For the brightest
+        channel, the expected light is zero.
+    """
+    regularized = normal_matrix + torch.diag(penalty)
+    # The brightest channel reflects most of a
+    # uniform light, which is coefficient 0.
+    best = int(normal_matrix[:, 0, 0].argmax())
+    best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
+    # The expected light of a channel is the multiple
+    # of `best_light` with the smallest squared error.
+    squared_radiance = (normal_matrix @ best_light) @ best_light
+    tiny = torch.finfo(torch.float64).tiny
+    factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
+    expected = best_light[:, None] * factors.clamp(min=0)
+    expected[:, best] = 0
+    # The penalty pulls the light of each channel toward its expected light.
+    penalized_right_side = right_side + (penalty[:, None] * expected).T
+    return _nonnegative_light(regularized, penalized_right_side, grid), expected
+
+
+def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tensor:
+    """Minimize xᵀ S x / 2 - wᵀ x over all lights x without negative radiance.
+
+    The rows of a matrix R map a light x to its radiance in the directions of a
+    grid, so the constraint is R x ≥ 0. With the Cholesky decomposition S = L Lᵀ
+    and y = Lᵀ x, the problem is to find the point y of the cone
+    {y: R L⁻ᵀ y ≥ 0} that is nearest to L⁻¹ w. By Moreau's decomposition, this
+    point is L⁻¹ w + L⁻¹ Rᵀ m. Here m ≥ 0 is the vector that makes the length of
+    this sum as small as possible. SciPy's `nnls` (non-negative least squares)
+    finds m.
+
+    Args:
+        matrices: Positive definite matrix S of each of C channels,
+            shape (C, 49, 49).
+        right_sides: Vector w of each channel, shape (C, 49).
+        grid: Number of subdivisions of the icosphere whose vertices are the
+            directions.
+
+    Returns:
+        Light x of each channel, shape (49, C).
+    """
+    # Matrix R that maps a light to its radiance in N directions, shape (N, 49).
+    radiance_rows = _radiance_rows(grid)
+    lights = []
+    for matrix, right_side in zip(matrices.numpy(), right_sides.numpy(), strict=True):
+        lower = np.linalg.cholesky(matrix)
+        # L⁻¹ w is the value of y without constraints.
+        unconstrained = solve_triangular(lower, right_side, lower=True)
+        # The columns of L⁻¹ Rᵀ are the vectors whose
+        # dot product with y must not be negative.
+        constraints = solve_triangular(lower, radiance_rows.T, lower=True)
+        nearest = _nearest_in_cone(unconstrained, constraints)
+        # The light is x = L⁻ᵀ y.
+        lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
+    return torch.from_numpy(np.stack(lights, axis=1))
+
+
+def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[Any]:
+    """Find the nearest point whose dot product with each of N vectors is not negative.
+
+    Only few of the vectors limit the result. The problem is first solved with
+    some of them. Vectors whose dot product with the solution is negative are
+    added until there are none. The result is the same as with all vectors.
+
+    Args:
+        point: Given point in K dimensions, shape (K,).
+        constraints: The N vectors as columns, shape (K, N).
+
+    Returns:
+        Nearest point to the given point, shape (K,).
+    """
+    constraint_count = constraints.shape[1]
+    is_used = np.arange(constraint_count) % FIRST_DIRECTION_STEP == 0
+    nearest = point
+    is_negative = point @ constraints < 0
+    while is_negative.any():
+        used_constraints = constraints[:, is_used]
+        max_iterations = MAX_NNLS_ITERATIONS * constraint_count
+        multipliers, _ = nnls(used_constraints, -point, maxiter=max_iterations)
+        nearest = point + used_constraints @ multipliers
+        is_negative = (nearest @ constraints < 0) & ~is_used
+        is_used |= is_negative
+    return nearest
+
+
+@cache
+def _radiance_rows(grid: int) -> NDArray[Any]:
+    """Compute the matrix that maps a light to its radiance above the smallest allowed radiance.
+
+    The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance
+    of the light.
+
+    Args:
+        grid: Number of subdivisions of the icosphere whose N vertices are the
+            directions.
+
+    Returns:
+        Matrix that maps the 49 SH coefficients of a light to N directions,
+        shape (N, 49).
+    """
+    directions, _ = sphere(grid)
+    rows = basis(torch.from_numpy(directions), DEGREE).numpy()
+    # The product of column 0 and coefficient 0 is the
+    # mean radiance of the light. Reducing the column
+    # therefore subtracts the smallest allowed radiance.
+    rows[:, 0] *= 1 - MIN_RADIANCE_RATIO
+    return rows
+
+
+def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
+    """Change the width and the shift of a camera so that the mesh is as large as the mask.
+
+    The bounding box of the mesh in the image gets the center and the area of the
+    bounding box of the mask.
+
+    Args:
+        camera: Camera whose direction is kept.
+        mesh: Mesh of the object.
+        mask: Share of each pixel that the object covers, shape (size, size).
+
+    Returns:
+        Copy of the camera with another width, shift and, if it has perspective,
+        distance.
+    """
+    # Bounding boxes in image coordinates from
+    # -1 to 1, with x to the right and y up.
+    points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
+    mesh_low = points.min(0)
+    mesh_high = points.max(0)
+    mask_low, mask_high = _mask_box(mask)
+    mesh_area = float(np.prod(mesh_high - mesh_low))
+    mask_area = float(np.prod(mask_high - mask_low))
+    # A camera that is wider by this factor
+    # shows the mesh smaller by this factor.
+    factor = math.sqrt(mesh_area / mask_area)
+    width = camera.width * factor
+    mask_center = (mask_low + mask_high) / 2
+    shift = mask_center - (mesh_low + mesh_high) / 2 / factor
+    framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
+    if isinstance(framed, PerspectiveCamera):
+        framed = replace(framed, distance=framed.distance * factor)
+    return framed
+
+
+def _mask_box(mask: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Compute the bounding box of the pixels that an object covers by more than half.
+
+    Args:
+        mask: Share of each pixel that the object covers, shape (size, size).
+
+    Returns:
+        Lower left and upper right corner of the box in image coordinates from -1
+        to 1, with x to the right and y up, shape (2,) each.
+    """
+    size = len(mask)
+    rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
+    columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())
+    left = 2 * columns[0] / size - 1
+    right = 2 * (columns[-1] + 1) / size - 1
+    bottom = 1 - 2 * (rows[-1] + 1) / size
+    top = 1 - 2 * rows[0] / size
+    return np.array([left, bottom]), np.array([right, top])

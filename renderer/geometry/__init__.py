@@ -1,1 +1,0 @@
-"""The shape of objects: meshes, normals, generated solids and skins."""

@@ -1,0 +1,809 @@
+"""Triangle meshes with colors, and functions that normalize, divide and join meshes.
+
+World axes are right-handed with z up. Colors are stored as they are displayed
+(sRGB-encoded). Shading first decodes them to linear values.
+
+Shapes use these letters: a mesh has V vertices and F faces.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from renderer.creases import CREASE, normal_groups
+from renderer.errors import InputError, describe, require_choice, require_range
+from renderer.normals import doubled_area_vectors, plain_face_normals, vertex_normals
+from renderer.settings import MAX_VERTICES, NORMALS
+from renderer.skin import Skin
+from renderer.validation import as_array, require_whole
+
+# Affine matrix, shape (4, 4), that rotates the y-axis
+# to the z-axis. It converts meshes from files in
+# which y points up to our axes, in which z points up.
+Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+# Value of `Mesh.texture_ids` for a face without a texture.
+NO_TEXTURE = -1
+# Allowed types of each array of a mesh, as values of `dtype.kind`: f is
+# floating-point, i is a signed integer, and u is an unsigned integer.
+_KINDS = {
+    "vertices": "fiu",
+    "faces": "iu",
+    "corner_colors": "fiu",
+    "corner_uvs": "fiu",
+    "texture_ids": "iu",
+    "gloss": "fiu",
+    "normal_ids": "iu",
+}
+# Arrays of a mesh that may be None when it is created.
+_OPTIONAL = ("gloss", "normal_ids")
+# Names of the arrays of a mesh that have one row for each face.
+PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "normal_ids")
+# Largest index of a normal. A larger one is a mistake that would take all memory.
+MAX_NORMAL_ID = 2**31 - 1
+# The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
+EDGES = ((0, 1), (1, 2), (2, 0))
+# Corners of the four triangles into which a triangle is
+# divided. Points 0, 1 and 2 are its corners. Points 3, 4
+# and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
+_QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+# Roughness, metallic and specular factor of a face without specular reflection.
+_MATTE = np.array([[1, 0, 0]], dtype=np.float32)
+# Gloss texture with one texel that leaves roughness and
+# metallic unchanged. The stored value 255 means the factor 1.
+_NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
+# Factors that pack the red, green and blue bytes of a texel into one integer:
+# red in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
+_PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangle mesh with F faces, V vertices, and a color at each corner of a face.
+
+    Two faces with a common vertex may have different colors at this vertex.
+
+    Attributes:
+        vertices: Positions in world axes, float64, shape (V, 3).
+        faces: Vertex indices of the three corners of each face, counter-clockwise
+            seen from outside, int64, shape (F, 3).
+        corner_colors: sRGB-encoded colors in [0, 1] of the three corners of each
+            face, float32, shape (F, 3, 3).
+        corner_uvs: Texture coordinates of the three corners of each face,
+            float32, shape (F, 3, 2). The origin is the bottom left corner of the
+            texture. Zeros for faces without a texture.
+        texture_ids: Index in `textures` of the texture of each face, int32,
+            shape (F,). -1 for a face without a texture.
+        textures: sRGB-encoded textures, uint8, shape (H, W, 3) each, for H rows
+            and W columns of texels. Row 0 is at the top.
+        gloss: Roughness, metallic and specular factor of each face, in [0, 1]
+            (see `nb.Gloss`), float32, shape (F, 3). None for a matte mesh.
+        gloss_textures: For each texture, a texture with factors for roughness
+            and metallic, uint8, shape (H, W, 2) each, with 255 for the factor 1.
+            Empty if the mesh has no gloss textures.
+        skin: Joints that move the vertices (linear blend skinning). None without
+            joints.
+        normal_ids: Index of the normal of each of the three corners of each face,
+            int64, shape (F, 3). With `normals="smooth"`, corners with the same
+            index share a normal, which is computed anew if the vertices move. If
+            it is not given, edges at which faces meet at more than 40° are sharp.
+            `replace(mesh, normal_ids=mesh.faces)` makes all edges smooth.
+
+    Raises:
+        InputError: If an array has a wrong shape or type, if there are no faces,
+            or if an index is out of range.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+        >>> square = nb.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
+        >>> square.face_areas().tolist()
+        [0.5, 0.5]
+        >>> square.face_normals()[0].tolist()
+        [0.0, 0.0, 1.0]
+        >>> square.closed
+        False
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    corner_colors: np.ndarray
+    corner_uvs: np.ndarray
+    texture_ids: np.ndarray
+    textures: tuple[np.ndarray, ...] = ()
+    gloss: np.ndarray | None = None
+    gloss_textures: tuple[np.ndarray, ...] = ()
+    skin: Skin | None = None
+    # Always an array after `__post_init__`.
+    normal_ids: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Convert lists to arrays, check all fields, and find sharp edges."""
+        # A frozen dataclass forbids assignments,
+        # so fields are set by object.__setattr__.
+        for name, kinds in _KINDS.items():
+            value = getattr(self, name)
+            is_missing = name in _OPTIONAL and value is None
+            if not isinstance(value, np.ndarray) and not is_missing:
+                object.__setattr__(self, name, as_array(name, value, kinds))
+        self._require_shapes()
+        self._require_indices()
+        if self.normal_ids is None:
+            object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
+        textures = _as_textures("textures", self.textures, 3)
+        object.__setattr__(self, "textures", textures)
+        gloss_textures = _as_textures("gloss_textures", self.gloss_textures, 2)
+        object.__setattr__(self, "gloss_textures", gloss_textures)
+        if self.texture_ids.max() >= len(self.textures):
+            raise InputError(
+                f"texture_ids has the index {self.texture_ids.max()}, but the mesh has "
+                f"{len(self.textures)} textures: give indices below {len(self.textures)}, "
+                f"or {NO_TEXTURE} for faces without a texture"
+            )
+
+    def _require_shapes(self) -> None:
+        """Raise `InputError` if an array of the mesh has a wrong shape or type."""
+        vertex_count = len(self.vertices) if self.vertices.ndim else 0
+        face_count = len(self.faces) if self.faces.ndim else 0
+        shapes = {
+            "vertices": (vertex_count, 3),
+            "faces": (face_count, 3),
+            "corner_colors": (face_count, 3, 3),
+            "corner_uvs": (face_count, 3, 2),
+            "texture_ids": (face_count,),
+        }
+        if self.gloss is not None:
+            shapes["gloss"] = (face_count, 3)
+        if self.normal_ids is not None:
+            shapes["normal_ids"] = (face_count, 3)
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape or values.dtype.kind not in _KINDS[name]:
+                raise InputError(
+                    f"{name} has the type {values.dtype} and the shape {values.shape}: "
+                    f"give numbers in the shape {shape}"
+                )
+
+    def _require_indices(self) -> None:
+        """Raise `InputError` if there are no faces, or if a vertex index is out of range."""
+        require_range("the number of faces", len(self.faces), 1, np.inf)
+        vertex_count = len(self.vertices)
+        lowest = self.faces.min()
+        highest = self.faces.max()
+        if not 0 <= lowest <= highest < vertex_count:
+            raise InputError(
+                f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
+                f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
+            )
+        if self.normal_ids is not None:
+            require_range("the smallest of normal_ids", self.normal_ids.min(), 0, MAX_NORMAL_ID)
+            require_range("the largest of normal_ids", self.normal_ids.max(), 0, MAX_NORMAL_ID)
+
+    @staticmethod
+    def plain(
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        color: ArrayLike = (1.0, 1.0, 1.0),
+        crease: float = CREASE,
+    ) -> Mesh:
+        """Create a mesh without textures.
+
+        Args:
+            vertices: Positions in world axes, shape (V, 3).
+            faces: Vertex indices of the three corners of each face,
+                counter-clockwise seen from outside, shape (F, 3).
+            color: sRGB-encoded color in [0, 1], shape (3,), or one color per
+                vertex, shape (V, 3).
+            crease: Angle in degrees. With `normals="smooth"`, edges at which faces
+                meet at a larger angle are sharp. 180 makes all edges smooth.
+
+        Returns:
+            Matte mesh with float64 vertices.
+
+        Raises:
+            InputError: If an argument has a wrong shape or is out of range.
+        """
+        vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
+        given_faces = as_array("faces", faces)
+        # astype turns NaN into an arbitrary integer, with
+        # a warning. The warning is suppressed, because
+        # the comparison below finds the difference.
+        with np.errstate(invalid="ignore"):
+            faces = given_faces.astype(np.int64)
+        if not np.array_equal(faces, given_faces):
+            raise InputError("faces has numbers that are not whole: give the indices of vertices")
+        color = as_array("color", color).astype(np.float32)
+        if not color.size or not (color.min() >= 0 and color.max() <= 1):
+            given = reprlib.repr(color.tolist())
+            raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
+        try:
+            vertex_colors = np.broadcast_to(color, vertices.shape)
+            # Vertex indices out of range are clipped, because
+            # `Mesh(...)` below raises a better error than `take` would.
+            corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
+        except (TypeError, ValueError, OverflowError, IndexError) as error:
+            raise InputError(
+                f"vertices, faces and color do not fit together ({error}): give the shapes "
+                "(V, 3), (F, 3) and (3,)"
+            ) from error
+        require_range("crease", crease, 0, 180)
+        mesh = Mesh(
+            vertices=vertices,
+            faces=faces,
+            corner_colors=corner_colors,
+            corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
+            texture_ids=np.full(len(faces), NO_TEXTURE, dtype=np.int32),
+            normal_ids=faces,
+        )
+        return replace(mesh, normal_ids=normal_groups(vertices, faces, crease=crease))
+
+    def face_normals(self) -> np.ndarray:
+        """Compute the outward unit normals of the F faces, shape (F, 3).
+
+        The normal of a face without area is zero.
+        """
+        return plain_face_normals(self.vertices, self.faces)
+
+    def face_areas(self) -> np.ndarray:
+        """Compute the areas of the F faces in squared world units, shape (F,)."""
+        # The length of each of these vectors is twice the area of a face.
+        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
+        return np.linalg.norm(doubled_vectors, axis=1) / 2
+
+    @cached_property
+    def corner_normals(self) -> np.ndarray:
+        """Outward unit normals of the corners with `normals="smooth"`, shape (F, 3, 3).
+
+        A normal is the mean of the normals of the faces that share it, weighted
+        with the areas of the faces.
+        """
+        arrays = (self.vertices, self.faces, self.normal_ids)
+        vertices, faces, normal_ids = map(torch.from_numpy, arrays)
+        normals = vertex_normals(vertices, faces, normal_ids, self.normal_ids.max() + 1)
+        return normals.numpy()[self.normal_ids]
+
+    def written_normals(self, normals: str) -> np.ndarray:
+        """Compute the unit normals of the corners for a file, shape (F, 3, 3).
+
+        Args:
+            normals: "flat" gives a corner the normal of its face, and "smooth" gives
+                it one of `corner_normals`. (0, 0, 1) replaces a normal of zero.
+
+        Raises:
+            InputError: If `normals` is neither "smooth" nor "flat".
+        """
+        require_choice("normals", normals, NORMALS)
+        values = self.corner_normals
+        if normals == "flat":
+            values = np.broadcast_to(self.face_normals()[:, None], values.shape)
+        return np.where(values.any(axis=-1, keepdims=True), values, [0.0, 0.0, 1.0])
+
+    @cached_property
+    def displayable(self) -> bool:
+        """True if all corner colors are in [0, 1], and none of them is NaN."""
+        return bool(self.corner_colors.min() >= 0 and self.corner_colors.max() <= 1)
+
+    @cached_property
+    def one_color_per_face(self) -> bool:
+        """True if the three corners of each face have the same color."""
+        return bool((self.corner_colors == self.corner_colors[:, :1]).all())
+
+    def moved(self, vertices: np.ndarray) -> Mesh:
+        """Return a copy of the mesh with other vertex positions and without a skin.
+
+        Args:
+            vertices: Vertex positions of the copy, shape (V, 3).
+
+        Returns:
+            Copy of the mesh, which shares the packed textures with this mesh.
+        """
+        moved_mesh = replace(self, vertices=vertices, skin=None)
+        # Packing the textures again would take long. A
+        # cached property stores its value in `__dict__`.
+        moved_mesh.__dict__["packed_textures"] = self.packed_textures
+        return moved_mesh
+
+    @cached_property
+    def packed_textures(self) -> tuple[np.ndarray, ...]:
+        """Textures with one integer per texel, int32, shape (H, W) each.
+
+        Bits 0 to 7 of the integer are red, bits 8 to 15 are green, and bits 16 to
+        23 are blue. Looking up one integer per texel is faster than looking up
+        three bytes.
+        """
+        return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
+
+    @cached_property
+    def closed(self) -> bool:
+        """True if no camera outside of the mesh can see a face from behind.
+
+        Each connected part of the mesh must be watertight, and its faces must be
+        counter-clockwise seen from outside. This is so if each edge of the part
+        belongs to one face in one direction and to one face in the other
+        direction, and if the faces enclose a positive volume.
+        """
+        part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
+        if part_of_face is None:
+            return False
+        centered_vertices = self.vertices - self.vertices.mean(axis=0)
+        first_corners = centered_vertices[self.faces[:, 0]]
+        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
+        # Six times the volume of the tetrahedron of each
+        # face and the mesh center, shape (F,). It is
+        # negative if the face is turned toward the center.
+        sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
+        volume_of_part = np.bincount(part_of_face, sixfold_volumes)
+        return bool((volume_of_part > 0).all())
+
+
+# The result for the last mesh is cached. The next mesh often has the same
+# faces, for example if it is another instance of the same procedural solid.
+@lru_cache(maxsize=1)
+def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
+    """Find the connected parts of a mesh, all of which must be closed surfaces.
+
+    Args:
+        face_bytes: Bytes of the int64 array `Mesh.faces`, shape (F, 3). Unlike an
+            array, bytes can be a key of the cache.
+
+    Returns:
+        Index of the connected part of each face, shape (F,). None if a part is not
+        closed, or if two neighboring faces have opposite orientations.
+    """
+    # trimesh is imported here because the import takes half a second.
+    from trimesh.graph import connected_component_labels
+
+    faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
+    # First and last vertex of each edge of each face, shape (3 F, 2).
+    # The edges in rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
+    edge_ends = faces[:, EDGES].reshape(-1, 2)
+    vertex_count = faces.max(initial=0) + 1
+    # An edge from vertex a to vertex b gets the key a · V + b, for V vertices.
+    keys = edge_ends @ [vertex_count, 1]
+    # Key of the same edge in the opposite direction: b · V + a.
+    reversed_keys = edge_ends @ [1, vertex_count]
+    key_order = np.argsort(keys)
+    reversed_key_order = np.argsort(reversed_keys)
+    sorted_keys = keys[key_order]
+    is_repeated = (np.diff(sorted_keys) == 0).any()
+    # Each edge of a closed surface occurs once in each direction,
+    # so the set of keys equals the set of reversed keys.
+    if is_repeated or not np.array_equal(sorted_keys, reversed_keys[reversed_key_order]):
+        return None
+    # Both orders list the edges by the same keys, so entry i of the
+    # first order and entry i of the second one are the same edge in
+    # two neighboring faces. The edge in row r belongs to face r // 3.
+    neighboring_faces = np.stack([key_order, reversed_key_order], axis=1) // 3
+    return connected_component_labels(neighboring_faces, node_count=len(faces))
+
+
+def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
+    """Check textures, and convert them to a tuple of arrays.
+
+    Args:
+        name: Name of the argument in the error.
+        textures: List or tuple of textures.
+        channels: Number of channels that each texture must have.
+
+    Returns:
+        Textures, uint8, shape (H, W, channels) each. A tuple of arrays is
+        returned as it is.
+
+    Raises:
+        InputError: If a texture has a wrong shape or type.
+    """
+    expected = f"a list of arrays (height, width, {channels}) of uint8"
+    if not isinstance(textures, list | tuple):
+        raise InputError(f"{name} is {describe(textures)}: give {expected}")
+    arrays = [as_array(name, texture) for texture in textures]
+    for array in arrays:
+        if array.ndim != 3 or array.shape[2] != channels or array.dtype != np.uint8:
+            raise InputError(f"{name} has a texture that is {describe(array)}: give {expected}")
+    is_unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
+    return textures if isinstance(textures, tuple) and is_unchanged else tuple(arrays)
+
+
+def require_mesh(name: str, value: object) -> None:
+    """Check that an argument is a mesh with colors in [0, 1].
+
+    Args:
+        name: Name of the argument in the error.
+        value: Value of the argument.
+
+    Raises:
+        InputError: If the value is no `Mesh`, or if a color is not in [0, 1].
+    """
+    if not isinstance(value, Mesh):
+        path = repr(value) if isinstance(value, str) else "path"
+        raise InputError(
+            f"{name} is {describe(value)}: give an nb.Mesh, "
+            f"such as nb.load_mesh({path}) or nb.Mesh.plain(vertices, faces)"
+        )
+    if not value.displayable:
+        raise InputError(
+            f"{name}.corner_colors has values outside of [0, 1]: divide 8-bit colors by 255"
+        )
+
+
+def concatenate(meshes: Sequence[Mesh]) -> Mesh:
+    """Join several meshes to one mesh, which has the faces of all meshes in order.
+
+    Vertices are not merged. The result has the joints of the first mesh. These
+    joints do not move the vertices of meshes that have no joints.
+
+    Args:
+        meshes: One or more meshes.
+
+    Returns:
+        Mesh with all vertices, faces and textures.
+    """
+    faces = []
+    texture_ids = []
+    normal_ids = []
+    # Numbers of vertices, textures and normals of the meshes before the
+    # mesh of the loop. The indices of this mesh grow by these numbers.
+    vertex_count = 0
+    texture_count = 0
+    normal_count = 0
+    for mesh in meshes:
+        faces.append(mesh.faces + vertex_count)
+        normal_ids.append(mesh.normal_ids + normal_count)
+        shifted_ids = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
+        texture_ids.append(shifted_ids.astype(np.int32))
+        vertex_count += len(mesh.vertices)
+        texture_count += len(mesh.textures)
+        normal_count += mesh.normal_ids.max() + 1
+    return Mesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate(faces),
+        corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
+        corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
+        texture_ids=np.concatenate(texture_ids),
+        textures=tuple(texture for mesh in meshes for texture in mesh.textures),
+        gloss=_concatenate_gloss(meshes),
+        gloss_textures=_concatenate_gloss_textures(meshes),
+        skin=_concatenate_skins(meshes),
+        normal_ids=np.concatenate(normal_ids),
+    )
+
+
+def _concatenate_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
+    """Concatenate the gloss (specular reflection) of the faces of several meshes.
+
+    Args:
+        meshes: Meshes with F faces in total.
+
+    Returns:
+        Roughness, metallic and specular factor of each face, float32,
+        shape (F, 3). None if all meshes are matte.
+    """
+    if all(mesh.gloss is None for mesh in meshes):
+        return None
+    gloss_by_mesh = []
+    for mesh in meshes:
+        matte_gloss = _MATTE.repeat(len(mesh.faces), 0)
+        gloss_by_mesh.append(matte_gloss if mesh.gloss is None else mesh.gloss)
+    return np.concatenate(gloss_by_mesh)
+
+
+def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
+    """Concatenate the gloss textures of several meshes.
+
+    A gloss texture has factors for roughness and metallic. If a mesh has any, it
+    has one for each of its color textures.
+
+    Args:
+        meshes: Meshes with T color textures in total.
+
+    Returns:
+        T gloss textures, uint8, shape (H, W, 2) each. The color textures of a mesh
+        without gloss textures get gloss textures with the factor 1. Empty if no
+        mesh has gloss textures.
+    """
+    if not any(mesh.gloss_textures for mesh in meshes):
+        return ()
+    gloss_textures: list[np.ndarray] = []
+    for mesh in meshes:
+        neutral_textures = (_NEUTRAL_GLOSS,) * len(mesh.textures)
+        gloss_textures += mesh.gloss_textures or neutral_textures
+    return tuple(gloss_textures)
+
+
+def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
+    """Create a skin with the joints of the first mesh for the vertices of several meshes.
+
+    Args:
+        meshes: Meshes with V vertices in total. Each has the joints of the first
+            mesh, or none.
+
+    Returns:
+        Skin for all V vertices. Its joints do not move the vertices of meshes
+        without joints. None if the first mesh has no joints.
+    """
+    skin = meshes[0].skin
+    if skin is None:
+        return None
+    carried_by_mesh = []
+    for mesh in meshes:
+        zeros = np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32)
+        carried_by_mesh.append(mesh.skin.carried if mesh.skin else zeros)
+    return replace(skin, carried=np.concatenate(carried_by_mesh))
+
+
+def normalize(mesh: Mesh) -> Mesh:
+    """Return a copy of a mesh that is centered and scaled to the cube [-1, 1]³.
+
+    The centroid of the surface moves to the origin. It is the mean of the face
+    centers, weighted with the areas of the faces. The largest magnitude of a
+    coordinate becomes 1. The vertices are rounded to float32. Mesh files store
+    float32 numbers exactly, so a mesh that is saved and loaded covers the same
+    pixels.
+
+    The appendix of the paper "Beyond Pixel Norm-Balls" averages the vertices,
+    weighted with the areas around them. This gives the same point.
+
+    Args:
+        mesh: Mesh to normalize.
+
+    Returns:
+        Normalized mesh, with float64 vertices.
+
+    Raises:
+        InputError: If the surface has no area. A mesh from `load_mesh` always
+            has an area.
+
+    Example:
+        >>> import numpy as np
+        >>> import norm_balls as nb
+        >>> bottle = nb.normalize(nb.solid("bottle"))
+        >>> float(np.abs(bottle.vertices).max())
+        1.0
+    """
+    require_mesh("mesh", mesh)
+    center, extent = center_and_extent(mesh)
+    centered = mesh.vertices - center
+    normalized = (centered / extent).astype(np.float32).astype(np.float64)
+    # Affine matrix that subtracts the center and divides by the extent.
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([np.eye(3), -center]) / extent
+    skin = mesh.skin and mesh.skin.transformed(matrix)
+    return replace(mesh, vertices=normalized, skin=skin)
+
+
+def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
+    """Compute the center of a mesh, and its largest extent from the center along an axis.
+
+    `normalize` moves the center to the origin and scales the extent to 1.
+
+    Args:
+        mesh: Mesh to measure.
+
+    Returns:
+        A tuple of
+        - the mean of the face centers, weighted with the areas of the faces, in
+          world axes, shape (3,);
+        - the largest distance of a vertex from the center along an axis, in
+          world units.
+
+    Raises:
+        InputError: If the surface has no area.
+    """
+    areas = mesh.face_areas()
+    if not areas.sum() > 0:
+        raise InputError(
+            "the surface of the mesh has the area 0: give a mesh whose faces have an area"
+        )
+    face_centers = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
+    center = np.average(face_centers, axis=0, weights=areas)
+    return center, np.abs(mesh.vertices - center).max()
+
+
+def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """Return a copy of a mesh after an affine transformation.
+
+    A transformation that mirrors the mesh would make its faces clockwise seen
+    from outside. The order of their corners is therefore reversed.
+
+    Args:
+        mesh: Mesh to transform.
+        matrix: Affine matrix, shape (4, 4). The product with a column (x, y, z, 1)
+            is the transformed point.
+
+    Returns:
+        Transformed copy of the mesh, with transformed joints.
+    """
+    is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
+    corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
+    return replace(
+        mesh,
+        vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
+        faces=mesh.faces[:, corner_order],
+        corner_colors=mesh.corner_colors[:, corner_order],
+        corner_uvs=mesh.corner_uvs[:, corner_order],
+        normal_ids=mesh.normal_ids[:, corner_order],
+        skin=mesh.skin and mesh.skin.transformed(matrix),
+    )
+
+
+def subdivide(mesh: Mesh, vertices: float) -> Mesh:
+    """Divide all faces of a mesh into four, until the mesh has more than `vertices` vertices.
+
+    The surface stays the same. New vertices are the midpoints of edges. Faces
+    that share an edge share the new vertex, so a closed mesh stays closed. The
+    sRGB-encoded colors and the texture coordinates are interpolated. The old
+    vertices keep their indices. Each division replaces face f by the faces 4 f
+    to 4 f + 3.
+
+    Args:
+        mesh: Mesh to divide.
+        vertices: Number of vertices that the result must exceed, from 0 to
+            `MAX_VERTICES`.
+
+    Returns:
+        Divided mesh. The given mesh itself if it already has more vertices.
+
+    Raises:
+        InputError: If `vertices` is not whole or out of range.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> table = nb.solid("table")
+        >>> finer = nb.subdivide(table, vertices=1000)
+        >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
+        (True, 0)
+    """
+    require_mesh("mesh", mesh)
+    # A whole number may be written as a float, such as 1e4.
+    is_whole_float = isinstance(vertices, float) and vertices.is_integer()
+    require_whole("vertices", int(vertices) if is_whole_float else vertices)
+    require_range("vertices", vertices, 0, MAX_VERTICES)
+    while len(mesh.vertices) <= vertices:
+        mesh = _quartered(mesh)
+    return mesh
+
+
+def refine(mesh: Mesh, area: float) -> Mesh:
+    """Divide the large faces of a mesh into four, until all faces are small enough.
+
+    The surface stays the same, but the order of the faces changes. The old
+    vertices keep their indices. A new vertex of a divided face may lie in the
+    middle of an edge of a neighboring face that is not divided.
+
+    Args:
+        mesh: Mesh to divide.
+        area: Largest allowed area of a face in squared world units.
+
+    Returns:
+        Divided mesh. The given mesh itself if all its faces are small enough.
+    """
+    is_large = mesh.face_areas() > area
+    if not is_large.any():
+        return mesh
+    if is_large.all():
+        return refine(_quartered(mesh), area)
+    small_faces = select_faces(mesh, ~is_large)
+    divided = refine(_quartered(select_faces(mesh, is_large)), area)
+    arrays: dict[str, Any] = {}
+    for name in PER_FACE:
+        rows_of_small_faces = getattr(small_faces, name)
+        # The array `gloss` of a matte mesh is None.
+        if rows_of_small_faces is not None:
+            rows_of_divided_faces = getattr(divided, name)
+            arrays[name] = np.concatenate([rows_of_small_faces, rows_of_divided_faces])
+    # The divided mesh has all old vertices, so the vertex
+    # indices of the small faces are valid in it, too.
+    return replace(divided, **arrays)
+
+
+def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
+    """Return a copy of a mesh with some of its faces and all of its vertices.
+
+    Args:
+        mesh: Mesh with F faces.
+        faces: Faces to keep: their indices, a mask of shape (F,), or a slice.
+
+    Returns:
+        Copy of the mesh with the chosen faces.
+    """
+    selected_rows = {}
+    for name in PER_FACE:
+        rows = getattr(mesh, name)
+        # The array `gloss` of a matte mesh is None.
+        if rows is not None:
+            selected_rows[name] = rows[faces]
+    return replace(mesh, **selected_rows)
+
+
+def _quartered(mesh: Mesh) -> Mesh:
+    """Return a copy of a mesh in which each face is divided into four triangles.
+
+    New vertices are the midpoints of edges. Two faces that share an edge also
+    share its midpoint.
+
+    Args:
+        mesh: Mesh with V vertices and F faces.
+
+    Returns:
+        Mesh with 4 F faces. Its first V vertices are the old ones.
+    """
+    edge_ends, edge_of_side = _shared_edges(mesh.faces)
+    midpoints = mesh.vertices[edge_ends].mean(axis=1)
+    skin = mesh.skin
+    if skin is not None:
+        midpoint_shares = skin.carried[edge_ends].mean(axis=1)
+        skin = replace(skin, carried=np.concatenate([skin.carried, midpoint_shares]))
+    # The midpoints follow the old vertices, so their indices begin at V.
+    midpoint_vertices = len(mesh.vertices) + edge_of_side
+    # Vertices of the three corners and of the
+    # three midpoints of each face, shape (F, 6).
+    points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
+    # Two faces share the normal in the middle of an edge if they share the normals at both ends.
+    _, normal_of_side = _shared_edges(mesh.normal_ids)
+    midpoint_normals = mesh.normal_ids.max() + 1 + normal_of_side
+    normals = np.concatenate([mesh.normal_ids, midpoint_normals], axis=1)
+    return replace(
+        mesh,
+        vertices=np.concatenate([mesh.vertices, midpoints]),
+        faces=points[:, _QUARTERS].reshape(-1, 3),
+        corner_colors=_interpolate_quarters(mesh.corner_colors),
+        corner_uvs=_interpolate_quarters(mesh.corner_uvs),
+        texture_ids=mesh.texture_ids.repeat(4),
+        gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
+        skin=skin,
+        normal_ids=normals[:, _QUARTERS].reshape(-1, 3),
+    )
+
+
+def _shared_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """List the E edges of a mesh. Sides of faces with the same two vertices are one edge.
+
+    Args:
+        faces: Vertex indices of the faces, shape (F, 3).
+
+    Returns:
+        A tuple of
+        - the two vertices of each edge, shape (E, 2);
+        - the index of the edge of each of the three sides of each face,
+          shape (F, 3).
+    """
+    vertex_count = faces.max() + 1
+    # The two vertices of each side, the smaller index first, shape (3 F, 2).
+    side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
+    # A side from vertex a to vertex b gets the key a · V + b, for V
+    # vertices. np.unique sorts these numbers faster than pairs of vertices.
+    side_keys = side_ends @ [vertex_count, 1]
+    edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
+    # Dividing the key a · V + b by V gives the quotient a and the remainder b.
+    edge_ends = np.stack(np.divmod(edge_keys, vertex_count), axis=1)
+    return edge_ends, edge_of_side.reshape(-1, 3)
+
+
+def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
+    """Interpolate values at the corners of faces to the corners of the four parts of each face.
+
+    The four parts are the triangles between the corners of a face and the
+    midpoints of its edges.
+
+    Args:
+        corner_values: D values at the three corners of each of F faces,
+            shape (F, 3, D).
+
+    Returns:
+        Values at the three corners of each of the four parts of each face, in the
+        order of `_QUARTERS`, shape (4 F, 3, D).
+    """
+    # Values at both ends of each edge of each
+    # face, shape (F, 3 edges, 2 ends, D).
+    edge_values = corner_values[:, EDGES]
+    midpoint_values = edge_values.mean(axis=2)
+    # Values at the three corners and the three
+    # midpoints of each face, shape (F, 6, D).
+    point_values = np.concatenate([corner_values, midpoint_values], axis=1)
+    return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])

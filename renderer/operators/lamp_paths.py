@@ -1,0 +1,373 @@
+"""Light from lamps and projectors: which samples of a view it reaches, and how bright they are.
+
+A local light is a lamp or a projector. Each lamp, and each pixel of a
+projector's pattern, is one basis function of local light. Its coefficient is
+its RGB power. Each sample of a view casts a ray to each source. A ray that hits
+a face means that the sample is in shadow.
+
+Shapes use these letters: a view has S covered samples in P pixels of a mesh
+with V vertices. A basis has K functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from renderer.light.basis import LightPaths, LocalBasis
+from renderer.mesh import Mesh
+from renderer.operators.rays import NO_FACE, Rays, Surface
+from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss, at_samples
+from renderer.vectors import unit, unit_vectors
+from renderer.visibility.fragments import Fragments
+
+# A matrix with a smaller fraction of nonzero entries is faster to multiply entry by entry
+# than as a dense matrix.
+SPARSE_FRACTION = 1 / 16
+# A matrix with at most this many entries is always faster to multiply as a dense matrix.
+SMALL_MATRIX_SIZE = 2**16
+
+
+class SparseTransfer(NamedTuple):
+    """The N nonzero entries of a matrix from light coefficients to pixel radiance.
+
+    Attributes:
+        function: Index of the basis function (lamp, or pixel of a projector) whose
+            light each entry describes, int64, shape (N,).
+        pixel: Index of the covered pixel of each entry, int64, shape (N,).
+        weight: Radiance of the pixel per unit of the function's coefficient, in
+            C = 1 or 3 color channels, shape (N, C).
+    """
+
+    function: Tensor
+    pixel: Tensor
+    weight: Tensor
+
+    def dense(self, pixel_count: int) -> tuple[Tensor, Tensor]:
+        """Write the entries into a dense matrix, without rows that would only have zeros.
+
+        Args:
+            pixel_count: Number P of covered pixels.
+
+        Returns:
+            A tuple of
+            - the matrix with one row for each of the L basis functions that have an
+              entry, in C color channels, shape (C, L, P);
+            - the indices of these functions, ascending, shape (L,).
+        """
+        functions, row_of_entry = self.function.unique(return_inverse=True)
+        # One row for each channel, which has all rows of the matrix after each other.
+        zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
+        flat_position = row_of_entry * pixel_count + self.pixel
+        flat_matrix = zeros.index_copy_(1, flat_position, self.weight.T)
+        return flat_matrix.unflatten(1, (len(functions), pixel_count)), functions
+
+    def is_sparse(self, pixel_count: int) -> bool:
+        """Tell whether multiplying entry by entry is faster than a product with a dense matrix.
+
+        The dense matrix has one column for each covered pixel, and one row for each
+        basis function that has a nonzero entry.
+
+        Args:
+            pixel_count: Number P of covered pixels.
+
+        Returns:
+            True if entry by entry is faster.
+        """
+        row_count = len(self.function.unique())
+        dense_size = row_count * pixel_count
+        if dense_size <= SMALL_MATRIX_SIZE:
+            return False
+        entry_count = len(self.weight)
+        return entry_count < SPARSE_FRACTION * dense_size
+
+    def to(self, device: torch.device | str) -> SparseTransfer:
+        """Return a copy of the entries on another device.
+
+        Args:
+            device: Device of the copy, such as "cuda".
+        """
+        return SparseTransfer(*(field.to(device) for field in self))
+
+    def radiance(self, lights: Tensor, image: Tensor, pixel_count: int) -> Tensor:
+        """Compute the radiance of B images, each with its own light.
+
+        The entries must have three channels. They may belong to several views.
+        The result is differentiable with respect to the lights.
+
+        Args:
+            lights: Light coefficients of each image, shape (B, K, 3).
+            image: Index of the image to which each entry belongs, shape (N,).
+            pixel_count: Number P of covered pixels of an image.
+
+        Returns:
+            Radiance, shape (B, 3, P).
+        """
+        # Row of the coefficient of each entry, if the coefficients of all images are
+        # written below each other.
+        light_row = image * lights.shape[1] + self.function
+        contributions = lights.flatten(0, 1).index_select(0, light_row) * self.weight
+        radiance_row = image * pixel_count + self.pixel
+        # One row for each pixel of each image, one column for each color.
+        zeros = contributions.new_zeros(len(lights) * pixel_count, 3)
+        radiance = zeros.index_add(0, radiance_row, contributions)
+        return radiance.unflatten(0, (len(lights), pixel_count)).mT
+
+
+def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
+    """Concatenate the nonzero entries of several transfer matrices, in their order.
+
+    Args:
+        parts: Nonzero entries of each matrix.
+
+    Returns:
+        All entries, or None if there is no matrix.
+    """
+    if not parts:
+        return None
+    return SparseTransfer(
+        function=torch.cat([part.function for part in parts]),
+        pixel=torch.cat([part.pixel for part in parts]),
+        weight=torch.cat([part.weight for part in parts]),
+    )
+
+
+def local_transfer(
+    rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis
+) -> SparseTransfer:
+    """Compute the matrix from coefficients of local light to the radiance of a view.
+
+    Each sample casts a ray to each source, so the edges of shadows are as sharp
+    as those of the mesh.
+
+    Args:
+        rays: Rays among the faces of the mesh.
+        surface: Points, normals and gloss at the S samples of the view.
+        albedo: Linear albedo at the samples, shape (S, C), with C = 1 or 3
+            channels.
+        basis: Basis of the local light.
+
+    Returns:
+        Nonzero entries of the matrix, float64.
+
+    Raises:
+        InputError: If Embree is not installed.
+    """
+    fragments = surface.fragments
+    paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
+    # One row for each path, one column for each channel: radiance of the sample at the end
+    # of the path, per unit of the coefficient of its light.
+    weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None]
+    weights = weights / fragments.samples**2
+    # The paths of a pixel that come from the same basis function are added up to one entry.
+    # Pixel and function are combined to one number, because sorting numbers is faster.
+    pixel_of_path = fragments.sample_to_pixel[paths.point]
+    key_of_path = pixel_of_path * basis.size + paths.function
+    keys, path_to_entry = key_of_path.unique(return_inverse=True)
+    zeros = weights.new_zeros(len(keys), albedo.shape[1])
+    return SparseTransfer(
+        function=keys % basis.size,
+        pixel=keys // basis.size,
+        weight=zeros.index_add_(0, path_to_entry, weights),
+    )
+
+
+def local_radiance(
+    surface: Surface,
+    albedo: Tensor,
+    paths: LightPaths,
+    light: Tensor,
+    fragments: Fragments | None = None,
+) -> Tensor:
+    """Compute the radiance of a view under local light.
+
+    The result is differentiable with respect to the light, the albedo, the
+    irradiance of the paths and the gloss.
+
+    Args:
+        surface: Points, normals and gloss at the S samples of the view.
+        albedo: Linear albedo at the samples, shape (S, 3).
+        paths: Paths from the sources to the samples that no face blocks.
+        light: Coefficients of the K basis functions, shape (K, 3).
+        fragments: The same samples, grouped into other pixels. None uses
+            `surface.fragments`.
+
+    Returns:
+        Radiance of the P pixels, times the fraction of each pixel that the mesh
+        covers, float64, shape (3, P).
+    """
+    fragments = fragments or surface.fragments
+    # Irradiance at the end of each path: one row for each path, one column for each color.
+    irradiance = paths.irradiance[:, None] * light[paths.function]
+    radiance = _reflectance(surface, albedo, paths) / fragments.samples**2 * irradiance
+    pixel_of_path = fragments.sample_to_pixel[paths.point]
+    zeros = radiance.new_zeros(len(fragments.pixels), 3)
+    return zeros.index_add(0, pixel_of_path, radiance).T
+
+
+def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
+    """Compute the reflected radiance, per irradiance, at the ends of E paths of light.
+
+    Args:
+        surface: Points, normals and gloss at the S samples of the view.
+        albedo: Linear albedo at the samples, shape (S, C).
+        paths: Paths from local lights to samples.
+
+    Returns:
+        Reflected radiance per irradiance, shape (E, C). A matte sample reflects
+        its albedo.
+    """
+    sample = paths.point
+    path_albedo = albedo[sample]
+    gloss = surface.gloss
+    if gloss is None:
+        return path_albedo
+    # The function `unit` takes vectors with their components along the first axis.
+    to_light = unit((paths.source - surface.points[sample]).T).T
+    normals = surface.normals[sample]
+    path_gloss = gloss.at(sample)
+    to_camera = at_samples(surface.toward, sample)
+    # The reflection of metals (colored) is multiplied by the albedo. All other specular
+    # reflection (white) has the color of the light.
+    colored, white = path_gloss.reflect_beams(normals, to_camera, to_light)
+    diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
+    # The transmittance is the fraction of light that passes the coat to the diffuse layer.
+    diffuse = diffuse_factor * path_gloss.coat_transmittance((normals * to_light).sum(1))
+    return path_albedo * (diffuse + colored)[:, None] + white[:, None]
+
+
+def unoccluded(
+    rays: Rays,
+    basis: LocalBasis,
+    points: Tensor,
+    normals: Tensor,
+    planes: Tensor,
+    positions: Tensor | None = None,
+) -> LightPaths:
+    """Find the paths from local lights to surface points that no face of the mesh blocks.
+
+    A path must also arrive above the plane of the face on which the point lies.
+
+    Args:
+        rays: Rays among the faces of the mesh.
+        basis: Basis of the local light.
+        points: Surface points in world axes, shape (S, 3).
+        normals: Unit shading normals at the points, shape (S, 3).
+        planes: Unit normals of the faces on which the points lie, shape (S, 3).
+        positions: Positions to which the L lamps have moved, shape (L, 3). None
+            uses the positions of the basis.
+
+    Returns:
+        Unblocked paths.
+    """
+    paths = basis.connect(points, normals, positions)
+    # Whether a path is blocked has no gradient, so no operations are recorded.
+    with torch.no_grad():
+        plane_of_path = planes[paths.point]
+        origins = points[paths.point] + rays.offset * plane_of_path
+        directions, lengths = unit_vectors((paths.source - origins).T)
+        is_above_plane = (directions.T * plane_of_path).sum(1) > 0
+        hits_nothing = rays.first_hit(origins, directions.T, lengths) == NO_FACE
+        is_unblocked = is_above_plane & hits_nothing
+    return LightPaths(
+        point=paths.point[is_unblocked],
+        function=paths.function[is_unblocked],
+        source=paths.source[is_unblocked],
+        irradiance=paths.irradiance[is_unblocked],
+    )
+
+
+class LocalLightView:
+    """A view of one mesh that is rendered many times under lamps and projectors.
+
+    The light and the albedo may change between the renders. All computations run
+    on the CPU, because rays are cast there. For lights that stay in place, rays
+    are cast once. For lamps that move, rays are cast in every render. Derivatives
+    hold fixed which lamps, and which pixels of a projected pattern, light a
+    sample.
+
+    Args:
+        rays: Rays among the faces of the mesh.
+        mesh: Mesh that the view shows, with V vertices.
+        fragments: Samples of the view that show the mesh.
+        settings: Settings of the image.
+        vertices: Vertex positions to use instead of `mesh.vertices`,
+            shape (V, 3). None uses `mesh.vertices`.
+        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
+            of the mesh.
+    """
+
+    def __init__(
+        self,
+        rays: Rays,
+        mesh: Mesh,
+        fragments: Fragments,
+        settings: ImageSettings,
+        vertices: Tensor | None = None,
+        gloss: Gloss | None = None,
+    ):
+        """Compute the points and normals at the samples. Rays are cast in the first render."""
+        self._rays = rays
+        vertices = None if vertices is None else vertices.cpu()
+        self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
+        # Reading these properties computes them now, and not in the first render.
+        self._points = self._surface.points
+        self._normals = self._surface.normals
+        self._planes = self._surface.planes
+        # For each light that stays in place, its paths to samples that no face blocks.
+        self._fixed_paths: dict[LocalBasis, LightPaths] = {}
+
+    def radiance(
+        self,
+        basis: LocalBasis,
+        albedo: Tensor,
+        light: Tensor,
+        positions: Tensor | None = None,
+        fragments: Fragments | None = None,
+    ) -> Tensor:
+        """Compute the radiance of the view under local light.
+
+        The result is differentiable with respect to all tensors and to the
+        vertices of the view.
+
+        Args:
+            basis: Basis of the local light.
+            albedo: Linear albedo at the S samples, shape (S, 3).
+            light: RGB coefficients of the K basis functions, shape (K, 3).
+            positions: Positions to which the L lamps have moved, shape (L, 3).
+                None uses the positions of the basis.
+            fragments: The same samples, assigned to other pixels. None uses the
+                pixels of the view.
+
+        Returns:
+            Radiance of the P pixels, times the fraction of each pixel that the mesh
+            covers, in the dtype and on the device of the light, shape (3, P).
+        """
+        fragments = None if fragments is None else fragments.to("cpu")
+        if basis.is_movable and positions is not None:
+            paths = self._find_paths(basis, positions.cpu().double())
+        else:
+            if basis not in self._fixed_paths:
+                self._fixed_paths[basis] = self._find_paths(basis, None)
+            paths = self._fixed_paths[basis]
+        radiance = local_radiance(
+            self._surface, albedo.cpu().double(), paths, light.cpu().double(), fragments
+        )
+        return radiance.to(light)
+
+    def _find_paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
+        """Find the paths from a local light to the samples of the view that no face blocks.
+
+        Args:
+            basis: Basis of the local light.
+            positions: Positions of the L lamps, float64, shape (L, 3). None uses
+                the positions of the basis.
+
+        Returns:
+            Paths that no face blocks.
+        """
+        return unoccluded(self._rays, basis, self._points, self._normals, self._planes, positions)

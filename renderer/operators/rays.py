@@ -1,0 +1,389 @@
+"""Surface points at the samples of a view, and rays from these points among the faces of a mesh.
+
+The library Embree casts the rays (Wald et al. 2014). All pixels use the same
+directions, and each pixel divides the directions among its samples. No two
+samples of a pixel share a direction, and each sample has at least
+`DIRECTIONS_PER_SAMPLE` of them. The image therefore converges as the number of
+samples grows. Pixels that can see no other surface, such as all pixels of a
+convex mesh, cast no rays.
+
+Shapes use these letters: a mesh has V vertices and F faces. A view has S
+covered samples in P pixels, and these samples show G of the F faces.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.light.harmonics import cache_tensors
+from renderer.mesh import Mesh
+from renderer.normals import face_normals
+from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
+from renderer.surface.shading import normals_in_sight, smooth_normals
+from renderer.vectors import unit
+from renderer.visibility.fragments import Fragments
+
+# Smallest number of ray directions of a pixel, which cover the whole sphere. A pixel of a flat
+# surface casts rays in about half of them, because the surface blocks the other half.
+DIRECTIONS = 512
+# Smallest number of ray directions of each sample of a pixel.
+DIRECTIONS_PER_SAMPLE = 32
+# Rays start at this distance above the surface, as a fraction of the largest vertex
+# coordinate. Otherwise, a ray could hit the surface on which it starts, because Embree
+# computes in float32.
+OFFSET = 1e-5
+# Faces are compared with vertices to find the pixels that need rays. This is the largest
+# number of comparisons, which takes about a second. With more, all pixels cast rays.
+MAX_COMPARISONS = 2**30
+# The plane of a face may block light that would reach an interpolated normal (smooth
+# shading). This is ignored if at most this fraction of uniform environment light is blocked.
+MAX_IGNORED_LIGHT = 1 / 1024
+# Number of pairs of a pixel and a ray direction that `Rays.hits` processes at
+# once. It limits the memory.
+BLOCK = 2**17
+# Stands for the index of the face that a ray hits if it hits no face.
+NO_FACE = -1
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points, normals and gloss at the S samples of a view that show the mesh.
+
+    Each property is computed when it is first read. Points and normals are
+    float64, and differentiable with respect to `moved`.
+
+    Attributes:
+        mesh: Mesh that the view shows, with V vertices.
+        fragments: Samples of the view that show the mesh.
+        settings: Settings of the image. `settings.normals` chooses smooth or
+            flat normals.
+        moved: Vertex positions to use instead of `mesh.vertices`, shape (V, 3).
+            None uses `mesh.vertices`.
+        given_gloss: Specular material (gloss) to use instead of the material of
+            the mesh. None uses the material of the mesh.
+    """
+
+    mesh: Mesh
+    fragments: Fragments
+    settings: ImageSettings
+    moved: Tensor | None = None
+    given_gloss: Gloss | None = None
+
+    @cached_property
+    def vertices(self) -> Tensor:
+        """Positions of the V vertices in world axes, float64, shape (V, 3)."""
+        if self.moved is None:
+            return torch.from_numpy(self.mesh.vertices)
+        return self.moved.double()
+
+    @cached_property
+    def planes(self) -> Tensor:
+        """Unit normal of the face that each of the S samples shows, shape (S, 3).
+
+        The normal points to the side of the face that the camera sees.
+        """
+        sample_to_seen_face = self.fragments.sample_to_seen_face
+        return self.face_planes[sample_to_seen_face]
+
+    @cached_property
+    def face_planes(self) -> Tensor:
+        """Unit normal of each of the G faces that samples show, shape (G, 3).
+
+        The normal points to the side of the face that the camera sees.
+        """
+        return face_normals(self.vertices, self.fragments.corners) * self.fragments.facing
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """Unit normal with which each of the S samples is shaded, shape (S, 3).
+
+        This is the normal of the face with flat normals, and the interpolated
+        vertex normal with smooth normals.
+        """
+        if self.settings.normals == "flat":
+            return self.planes
+        if self.moved is None:
+            # The mesh caches these normals, so all its views share them.
+            corner_normals = torch.from_numpy(self.mesh.corner_normals)[self.fragments.faces]
+        else:
+            faces = torch.from_numpy(self.mesh.faces)
+            normal_ids = torch.from_numpy(self.mesh.normal_ids)
+            corner_normals = normals_in_sight(self.fragments, self.vertices, faces, normal_ids)
+        # The function `unit` takes vectors with their components along the first axis.
+        return unit(smooth_normals(self.fragments, corner_normals).T).T
+
+    @cached_property
+    def points(self) -> Tensor:
+        """Position in world axes of each of the S samples, shape (S, 3)."""
+        # Axes: seen face, corner, coordinate.
+        corner_positions = self.vertices[self.fragments.corners]
+        return self.fragments.interpolate(corner_positions)
+
+    @cached_property
+    def gloss(self) -> SampleGloss | None:
+        """Specular material (gloss) at the samples, or None for a matte surface."""
+        return sample_gloss(self.mesh, self.fragments, self.given_gloss)
+
+    @cached_property
+    def toward(self) -> Tensor:
+        """Unit vectors from the S samples to the camera, shape (S, 3).
+
+        Without perspective, all samples have the same vector, and the shape is
+        (1, 3).
+        """
+        return toward_camera(self.fragments, self.vertices)
+
+
+class RayHits(NamedTuple):
+    """First faces that rays from B pixels of a view hit in D directions.
+
+    Attributes:
+        pixels: Index of each pixel in `Fragments.pixels`, shape (B,).
+        sample_of_ray: Index of the sample from which each ray starts,
+            shape (B, D).
+        weight: Weight of the radiance from each direction in the irradiance that
+            the mesh blocks, shape (B, D). It is 0 if the sky is visible in the
+            direction. Otherwise, it is the solid angle of the direction, times the
+            cosine to the shading normal, times the number n of samples of the
+            pixel, because each sample casts only D / n of the rays.
+        face_of_ray: Index in the mesh of the first face that each ray hits, or
+            `NO_FACE`, shape (B, D). No ray is cast in directions below the plane
+            of the face on which the sample lies. They have `NO_FACE`, and a
+            positive weight if the angle to the shading normal is less than 90°.
+    """
+
+    pixels: Tensor
+    sample_of_ray: Tensor
+    weight: Tensor
+    face_of_ray: Tensor
+
+
+class Rays:
+    """Casts rays from the surface of a mesh, and finds the faces of this mesh that they hit.
+
+    The first ray raises `InputError` if Embree is not installed.
+
+    Args:
+        mesh: Mesh whose faces the rays hit.
+    """
+
+    def __init__(self, mesh: Mesh):
+        self._mesh = mesh
+
+    @cached_property
+    def offset(self) -> float:
+        """Distance above the surface at which rays start, in world units."""
+        largest_coordinate = float(np.abs(self._mesh.vertices).max())
+        return OFFSET * largest_coordinate
+
+    def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
+        """Cast rays in D directions from all pixels that may see another face of the mesh.
+
+        Each ray starts at one sample of its pixel. The face of this sample
+        blocks all light from below its plane, as if the mesh were the surface of a
+        solid.
+
+        Args:
+            surface: Points and normals at the S samples of the view.
+            directions: Unit vectors that divide the sphere equally, from the
+                function `sphere`, shape (D, 3).
+
+        Yields:
+            Hits of the next block of pixels.
+        """
+        fragments = surface.fragments
+        pixels = self._pixels_to_cast(surface)
+        if not len(pixels):
+            return
+        plane_normals = surface.planes
+        # Number of samples of each pixel. The samples of a pixel follow each other.
+        sample_count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
+        first_sample = sample_count.cumsum(0) - sample_count
+        solid_angle = 4 * math.pi / len(directions)
+        pixels_per_block = max(1, BLOCK // len(directions))
+        for block in pixels.split(pixels_per_block):
+            # Number of samples of each pixel of the block, with an axis of size 1 for the ray
+            # directions.
+            samples_in_pixel = sample_count[block, None]
+            # Each ray of a pixel starts at one of its samples. Shuffled numbers spread the
+            # directions over the samples. Adding the index of the pixel makes neighboring
+            # pixels use different samples for the same direction.
+            rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
+            sample_of_ray = first_sample[block, None] + rank_in_pixel
+            cosine = _dot(surface.normals[sample_of_ray], directions).clamp(min=0)
+            height = _dot(plane_normals[sample_of_ray], directions)
+            # Pairs of a pixel and a direction that need a ray: the direction is above the
+            # face, and in front of the shading normal.
+            cast = torch.nonzero((cosine > 0) & (height > 0), as_tuple=True)
+            start_sample = sample_of_ray[cast]
+            _, cast_direction = cast
+            origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
+            hit_face = self.first_hit(origins, directions[cast_direction])
+            face_of_ray = torch.full_like(sample_of_ray, NO_FACE).index_put_(cast, hit_face)
+            # The sky is not visible in directions below the plane of the face (height < 0).
+            is_sky = (face_of_ray == NO_FACE) & (height >= 0)
+            weight = (cosine * samples_in_pixel * solid_angle).masked_fill(is_sky, 0)
+            yield RayHits(
+                pixels=block, sample_of_ray=sample_of_ray, weight=weight, face_of_ray=face_of_ray
+            )
+
+    @cached_property
+    def _scene(self) -> Any:
+        """Embree scene with all faces of the mesh, in which rays are cast.
+
+        Raises:
+            InputError: If Embree is not installed.
+        """
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise InputError(
+                "shadows need the package embreex, which is not installed: "
+                "pip install embreex, or set shadows=false and use no lamps and no projectors"
+            ) from error
+        scene = EmbreeScene(robust=True)
+        vertices = self._mesh.vertices.astype(np.float32)
+        # The constructor of `TriangleMesh` adds the triangles to the scene.
+        TriangleMesh(scene, vertices, self._mesh.faces.astype(np.int32))
+        return scene
+
+    @cached_property
+    def _outermost(self) -> Tensor:
+        """Positions of the H vertices on the convex hull of the mesh, float64, shape (H, 3).
+
+        If all vertices lie in a plane, there is no hull, and all vertices are
+        returned.
+        """
+        # Only imported when it is needed, because the import takes long.
+        from scipy.spatial import ConvexHull, QhullError
+
+        vertices = self._mesh.vertices[np.unique(self._mesh.faces)]
+        with suppress(QhullError):
+            vertices = vertices[ConvexHull(vertices).vertices]
+        return torch.from_numpy(vertices).double()
+
+    def _pixels_to_cast(self, surface: Surface) -> Tensor:
+        """Find the pixels for which the mesh may block light.
+
+        A pixel is returned if one of its samples fulfills one of two conditions.
+        First, a vertex of the mesh lies above the plane of the face on which the
+        sample lies. Second, the shading normal differs from the normal of the face
+        by an angle a, so that the plane of the face blocks the fraction
+        (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
+
+        Args:
+            surface: Points and normals at the S samples of the view.
+
+        Returns:
+            Indices in `Fragments.pixels`, ascending. These are all pixels if the
+            test would need more than `MAX_COMPARISONS` comparisons and would take
+            longer than the rays.
+        """
+        fragments = surface.fragments
+        plane_normals = surface.face_planes
+        hull_vertices = self._outermost
+        if len(plane_normals) * len(hull_vertices) > MAX_COMPARISONS:
+            return torch.arange(len(fragments.pixels))
+        # The normals are processed in blocks to limit the memory.
+        blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
+        # Largest coordinate of a hull vertex along the normal of each seen face.
+        highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
+        first_corner = surface.vertices[fragments.corners[:, 0]]
+        height_of_face = (plane_normals * first_corner).sum(1)
+        is_below_a_vertex = highest - height_of_face > self.offset
+        cosine_of_normals = (surface.normals * surface.planes).sum(1)
+        blocks_light = cosine_of_normals < 1 - 2 * MAX_IGNORED_LIGHT
+        sample_to_seen_face = fragments.sample_to_seen_face
+        casts_rays = is_below_a_vertex[sample_to_seen_face] | blocks_light
+        sample_to_pixel = fragments.sample_to_pixel
+        return sample_to_pixel[casts_rays].unique()
+
+    def first_hit(
+        self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None
+    ) -> Tensor:
+        """Find the first face that each of N rays hits.
+
+        Args:
+            origins: Starts of the rays in world axes, shape (N, 3).
+            directions: Unit directions of the rays, shape (N, 3).
+            lengths: Lengths of the rays in world units, shape (N,). None for
+                infinite rays.
+
+        Returns:
+            Index in the mesh of the face that each ray hits, or `NO_FACE`,
+            int64, shape (N,).
+        """
+        rays = [origins, directions] if lengths is None else [origins, directions, lengths]
+        faces = self._scene.run(
+            *(np.ascontiguousarray(array.numpy(), np.float32) for array in rays)
+        )
+        return torch.from_numpy(faces).long()
+
+
+def _dot(vectors: Tensor, directions: Tensor) -> Tensor:
+    """Compute scalar products of vectors, one for each pixel and direction, with directions.
+
+    Args:
+        vectors: A vector for each pixel and direction, shape (B, D, 3).
+        directions: The same directions for all pixels, shape (D, 3).
+
+    Returns:
+        Scalar products, shape (B, D).
+    """
+    return torch.einsum("bdi,di->bd", vectors, directions)
+
+
+def directions_of_pixel(samples: int) -> Tensor:
+    """Compute the directions of the rays of a pixel, which its samples divide among themselves.
+
+    Args:
+        samples: Number of samples along one side of a pixel.
+
+    Returns:
+        Unit vectors, float64, shape (D, 3).
+    """
+    return sphere(max(DIRECTIONS, DIRECTIONS_PER_SAMPLE * samples**2))
+
+
+@cache_tensors
+def sphere(count: int) -> Tensor:
+    """Compute directions that divide the sphere equally (spherical Fibonacci lattice).
+
+    Args:
+        count: Number of directions.
+
+    Returns:
+        Unit vectors, float64, shape (count, 3).
+    """
+    index = torch.arange(count, dtype=torch.float64)
+    golden_angle = math.pi * (3 - math.sqrt(5))
+    z = 1 - (2 * index + 1) / count
+    azimuth = golden_angle * index
+    radius = (1 - z**2).sqrt()
+    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
+
+
+@cache_tensors
+def _shuffled(count: int) -> Tensor:
+    """Return a random permutation of 0 to count - 1, which is the same in every call.
+
+    The directions of `sphere` are sorted by z. In this shuffled order, each sample
+    of a pixel gets ray directions from all over the sphere.
+
+    Args:
+        count: Number of ray directions.
+
+    Returns:
+        The permutation, int64, shape (count,).
+    """
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))

@@ -1,0 +1,532 @@
+"""Shadows and bounces of environment light, by precomputed radiance transfer.
+
+The source is Sloan, Kautz and Snyder 2002. The transfer of a pixel is its
+radiance per unit of each SH coefficient of the light. The transfer has three
+parts:
+
+- the transfer under an open sky, which has a closed form;
+- minus the light from the directions that the mesh blocks;
+- plus the light that the surfaces in these directions reflect.
+
+The reflected light is found by radiosity (Goral et al. 1984), for each
+coefficient of the light. The surface is divided into N patches. Patch i with
+albedo ρ_i sends the radiance B_i per unit of each of the K coefficients:
+
+    B_i = ρ_i / π (S_i + Σ_j F_ij B_j).
+
+S_i is the irradiance of patch i from the part of the sky that the patch sees.
+F_ij is the irradiance of patch i per unit radiance of patch j: the solid angle
+of patch j times the cosine, found by rays. S and F depend on the shape alone,
+so B is linear in the light. One bounce is B = ρ S / π. Each further bounce
+inserts B on the right-hand side. A pixel receives Σ_j F_pixel,j B_j.
+
+A patch consists of sides of faces. Small faces share a patch if they lie in one
+cell of a grid and face the same way. Large faces are first divided into pieces.
+S and F of a patch are computed like those of a pixel that shows only this
+patch, with the rays of `renderer.operators.rays`.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix, vstack
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.light.basis import Basis, Harmonics
+from renderer.mesh import Mesh, refine
+from renderer.operators import rays
+from renderer.operators.rays import RayHits, Rays, Surface, sphere
+from renderer.settings import ImageSettings
+from renderer.surface.albedo import surface_albedo
+from renderer.surface.gloss import SampleGloss, at_samples
+from renderer.visibility.fragments import Fragments
+
+# Number of ray directions from each patch. They cover the whole sphere.
+PATCH_DIRECTIONS = 2**9
+# Approximate number of patches of the surface of a mesh, between which light bounces.
+PATCHES = 2**11
+# Image positions (x, y) of the corners of a triangle around the image center. In the
+# artificial view `Patches.view`, each piece of the mesh covers this triangle. A sample at
+# the image center then shows the center of the piece.
+AROUND_CENTER = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]
+# Values of `Fragments.facing` for the front and the back of a face.
+FRONT = 1.0
+BACK = -1.0
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Division of the surface of a mesh into N patches.
+
+    The large faces of the mesh are first divided, which gives a mesh of F small
+    faces, called pieces. A patch is a group of sides of pieces. A closed mesh
+    has S = F sides, because only the fronts of its faces can be seen. Any other
+    mesh has S = 2 F sides, the fronts and the backs.
+
+    Attributes:
+        pieces: Mesh of the F pieces.
+        view: Artificial view that has one pixel for each patch, and one sample
+            for each side of a piece. The sample shows the center of the piece
+            and belongs to the pixel of its patch.
+        fractions: Area of the piece that each sample shows, divided by the area
+            of its patch, shape (S, 1).
+        patch_of_side: Index of the patch of the front (row 0) and of the back
+            (row 1) of each piece, int64, shape (2, F). Both rows are equal for
+            a closed mesh.
+    """
+
+    pieces: Mesh
+    view: Fragments
+    fractions: Tensor
+    patch_of_side: Tensor
+
+    @staticmethod
+    def from_mesh(mesh: Mesh) -> "Patches":
+        """Divide the surface of a mesh into patches of about the same area.
+
+        The faces are first divided into small faces, called pieces. A patch is a
+        group of neighboring pieces. The fronts and the backs of the same pieces are
+        different patches. The backs of a closed mesh are left out.
+
+        Args:
+            mesh: Mesh to divide.
+
+        Returns:
+            The patches of the mesh.
+        """
+        patch_area = float(mesh.face_areas().sum()) / PATCHES
+        pieces = refine(mesh, patch_area)
+        piece_count = len(pieces.faces)
+        sides = [FRONT] if pieces.closed else [FRONT, BACK]
+        # One entry for each side: the fronts of all small faces (pieces), then all backs.
+        facing = np.repeat(sides, piece_count)[:, None]
+        piece_of_side = np.tile(np.arange(piece_count), len(sides))
+        cell_width = math.sqrt(patch_area)
+        patch_of_side = _group_sides(pieces, piece_of_side, facing, cell_width)
+        # Each side becomes a sample. Sort them by patch, because `Fragments` needs the
+        # samples of a pixel (here, a patch) next to each other.
+        sample_to_side = np.argsort(patch_of_side, kind="stable")
+        sample_to_patch = torch.from_numpy(patch_of_side[sample_to_side])
+        sample_to_piece = torch.from_numpy(piece_of_side[sample_to_side])
+        areas = torch.from_numpy(pieces.face_areas())[sample_to_piece]
+        patch_count = int(sample_to_patch[-1]) + 1
+        patch_areas = areas.new_zeros(patch_count).index_add_(0, sample_to_patch, areas)
+        view = Fragments(
+            size=1,
+            samples=1,
+            pixels=torch.arange(patch_count),
+            coverage=torch.ones_like(patch_areas),
+            faces=sample_to_piece,
+            corners=torch.from_numpy(pieces.faces)[sample_to_piece],
+            facing=torch.from_numpy(facing[sample_to_side]),
+            outlines=areas.new_tensor(AROUND_CENTER).expand(len(sample_to_piece), 3, 2),
+            sample_to_pixel=sample_to_patch,
+            # The tensor `faces` has one entry for each sample, so sample i shows entry i.
+            sample_to_seen_face=torch.arange(len(sample_to_piece)),
+            # The artificial image has a single sample position, where all samples lie.
+            sample_numbers=torch.zeros_like(sample_to_piece),
+        )
+        smallest = torch.finfo(areas.dtype).tiny
+        fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
+        # One row for the fronts of all faces, one for their backs. A closed mesh has no row
+        # for backs, because rays never hit them. `expand` then repeats the first row.
+        patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
+        return Patches(
+            pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
+        )
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Average values over each of the N patches.
+
+        A patch is a group of sides (fronts or backs) of pieces, the small faces of
+        the mesh.
+
+        Args:
+            values: D values for each of S sides, in the order of the samples of `view`,
+                shape (S, D).
+
+        Returns:
+            Means that are weighted with the areas of the pieces, shape (N, D).
+        """
+        patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
+        return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
+
+    def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
+        """Add up the weights of the rays from a pixel that hit the same patch.
+
+        A patch is a group of pieces, the small faces of the mesh `pieces`.
+
+        Args:
+            hits: Pieces that rays from B pixels hit in D directions, as indices
+                into `pieces`.
+            directions: Unit directions of the rays, shape (D, 3).
+            weights: Weight of each ray, shape (B, D).
+
+        Returns:
+            Sum of the weights for each pixel and each of the N patches, as a sparse
+            matrix, shape (B, N).
+        """
+        is_hit = hits.face_of_ray != rays.NO_FACE
+        # Pixel and direction of each ray that hits a face and has a nonzero weight.
+        pixel, direction = torch.nonzero(weights * is_hit, as_tuple=True)
+        piece = hits.face_of_ray[pixel, direction]
+        # A ray hits the back of a face if it goes in the direction of the outer normal.
+        is_back = (self._normals[piece] * directions[direction]).sum(1) > 0
+        patch = self.patch_of_side[is_back.long(), piece]
+        # `csr_matrix` adds up entries with the same pixel and patch.
+        entries = (weights[pixel, direction].numpy(), (pixel.numpy(), patch.numpy()))
+        return csr_matrix(entries, (len(weights), len(self.view.pixels)))
+
+    @cached_property
+    def _normals(self) -> Tensor:
+        """Unit normals of the F pieces, shape (F, 3)."""
+        return torch.from_numpy(self.pieces.face_normals())
+
+
+def _group_sides(
+    pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell_width: float
+) -> np.ndarray:
+    """Group the S sides (fronts and backs) of the faces of a mesh into patches.
+
+    The faces of the mesh are small. They are called pieces. Two sides belong to
+    the same patch if the centers of their pieces lie in the same cell of a cubic
+    grid, if the normals are equal after each component is rounded to -1, 0 or 1,
+    and if both sides are fronts or both are backs.
+
+    Args:
+        pieces: Mesh of the pieces.
+        piece_of_side: Index of the piece of each side, shape (S,).
+        facing: `FRONT` or `BACK` for each side, shape (S, 1).
+        cell_width: Width of a cell of the grid in world units.
+
+    Returns:
+        Index of the patch of each side, shape (S,).
+    """
+    centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
+    normals = pieces.face_normals()[piece_of_side]
+    # Columns: three numbers of the grid cell, three of the rounded normal, front or back.
+    # Sides with equal rows belong to the same patch.
+    keys = np.hstack([np.floor(centers / cell_width), np.rint(normals), facing])
+    _, patch_of_side = np.unique(keys, axis=0, return_inverse=True)
+    # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
+    return patch_of_side.ravel()
+
+
+class Transport:
+    """Computes how shadows and bounced light change the images of a mesh.
+
+    The mesh casts shadows on itself, and light bounces between its faces. The
+    change of an image is linear in the light, so it is computed for each of the K
+    SH coefficients of environment light.
+
+    Attributes:
+        has_colored_light: True if bounced light is colored. The change then differs
+            between the three color channels.
+        rays: Rays among the faces of the mesh.
+
+    Args:
+        mesh: Mesh that casts shadows on itself.
+        settings: Settings of the image, with the number of bounces.
+        albedo_scale: Factor for the albedo of the surfaces that light bounces
+            off.
+        basis: SH basis of the environment light.
+    """
+
+    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
+        """Divide the mesh into patches, and compute the light that they send, if light bounces."""
+        # Only bounces need patches. Rays then hit the small faces (pieces) of which the patches
+        # consist.
+        self._patches = Patches.from_mesh(mesh) if settings.bounces else None
+        self.rays = Rays(self._patches.pieces if self._patches else mesh)
+        self._directions = rays.directions_of_pixel(settings.samples)
+        # Radiance of the sky: one row for each ray direction, one column for each SH
+        # coefficient.
+        self._sky = basis.radiance(self._directions)
+        self.has_colored_light = False
+        if self._patches:
+            # Radiance that the patches send, with the axes: patch, SH coefficient, color. The
+            # last axis has the size 1 if the three colors are equal.
+            self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
+            self.has_colored_light = self._sent.shape[2] > 1
+
+    def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
+        """Compute how shadows and bounces change the transfer matrix of a view.
+
+        Args:
+            surface: Points, normals and gloss at the S samples of the view.
+            albedo: Linear albedo at the samples, shape (S, C) for C color channels.
+                C is 3 if `has_colored_light` is true, and 1 or 3 otherwise.
+
+        Returns:
+            Change of the radiance of the P pixels per unit of each of the K
+            coefficients, times the fraction of the pixel that the mesh covers,
+            float64, shape (C, K, P). None if no surface blocks light.
+        """
+        change = None
+        fragments = surface.fragments
+        gloss = surface.gloss
+        # Albedo divided by the number of samples of a pixel: one row for each channel, one
+        # column for each sample.
+        albedo_by_channel = albedo.T / fragments.samples**2
+        diffuse_albedo = albedo_by_channel
+        if gloss is not None:
+            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(
+                surface.normals, surface.toward
+            )
+        for hits in self.rays.hits(surface, self._directions):
+            if not hits.weight.any():
+                continue
+            if change is None:
+                shape = (len(albedo_by_channel), self._sky.shape[1], len(fragments.pixels))
+                change = self._sky.new_zeros(shape)
+            sample_of_ray = hits.sample_of_ray
+            if gloss is not None:
+                # Two specular reflectances along each ray: one that is later multiplied by
+                # the albedo, because metals color reflections, and one that is white. Axes
+                # of both: pixel, direction.
+                metallic, white = self._reflect_rays(gloss, surface, sample_of_ray)
+                cosine = self._cosines(surface, sample_of_ray)
+                # Fraction of the light that passes the coat to the diffuse layer below it.
+                transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
+            for channel, channel_change in enumerate(change):
+                # Reflected radiance per irradiance, for light along each ray.
+                reflectance = diffuse_albedo[channel][sample_of_ray]
+                if gloss is not None:
+                    colored = albedo_by_channel[channel][sample_of_ray] * metallic
+                    specular = colored + white / fragments.samples**2
+                    reflectance = reflectance * transmittance + specular
+                blocked = hits.weight * reflectance
+                # Subtract the light of the sky that the mesh blocks: one row for each SH
+                # coefficient, one column for each pixel.
+                channel_change[:, hits.pixels] = -(blocked @ self._sky).T
+                if self._patches:
+                    received = self._received(self._patches, hits, blocked, channel)
+                    channel_change[:, hits.pixels] += received
+        return change
+
+    def _received(self, patches: Patches, hits: RayHits, blocked: Tensor, channel: int) -> Tensor:
+        """Compute the light that B pixels receive from patches and reflect, in one color channel.
+
+        A patch is a group of small faces (pieces) of the mesh.
+
+        Args:
+            patches: The N patches of the mesh.
+            hits: Pieces that rays from the pixels hit in D directions.
+            blocked: Reflected radiance of each pixel per unit radiance that arrives
+                from each direction, shape (B, D). It is 0 in directions of the sky.
+            channel: Index of the color channel.
+
+        Returns:
+            Radiance of the pixels per unit of each of the K coefficients of the
+            light, shape (K, B).
+        """
+        # Radiance that the patches send: one row for each patch, one column for each SH
+        # coefficient.
+        sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
+        received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
+        return torch.from_numpy(received).T
+
+    def _cosines(self, surface: Surface, sample_of_ray: Tensor) -> Tensor:
+        """Compute the cosine between each ray and the shading normal at its start.
+
+        Args:
+            surface: Normals at the samples of the view.
+            sample_of_ray: Sample from which the ray of each of B pixels starts
+                in each of D directions, shape (B, D).
+
+        Returns:
+            Cosines, shape (B, D).
+        """
+        normals = surface.normals[sample_of_ray]
+        return torch.einsum("bdi,di->bd", normals, self._directions)
+
+    def _reflect_rays(
+        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the specular reflectance of B pixels for light along their rays.
+
+        The specular reflection may be narrower than the angle between two of the
+        D ray directions. The reflectances of a pixel are therefore scaled so that
+        their sum over the directions is exact for uniform light.
+
+        Args:
+            gloss: Gloss at the samples of the view.
+            surface: Normals at the samples of the view.
+            sample_of_ray: Sample from which each ray starts, shape (B, D).
+
+        Returns:
+            A tuple of
+            - the reflected radiance per irradiance that is multiplied by the
+              albedo, because metals color reflections, shape (B, D);
+            - the reflected radiance per irradiance that has the color of the
+              light, shape (B, D).
+        """
+        to_camera = at_samples(surface.toward, sample_of_ray)
+        normals = surface.normals[sample_of_ray]
+        colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, self._directions)
+        cosine = self._cosines(surface, sample_of_ray).clamp(min=0)
+        # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
+        # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
+        sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
+        exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
+        if exact_colored is not None:
+            exact = exact + exact_colored
+        smallest = torch.finfo(sampled.dtype).tiny
+        scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
+        return colored * scale, white * scale
+
+    def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
+        """Compute how shadows and bounces change the radiance of a view under one light.
+
+        The result is differentiable with respect to the light, but not with
+        respect to the albedo.
+
+        Args:
+            surface: Points, normals and gloss at the S samples of the view.
+            albedo: Linear albedo at the samples, shape (S, 3).
+            light: SH coefficients, shape (K, 3).
+
+        Returns:
+            Change of the radiance of the P pixels, times the fraction of each pixel
+            that the mesh covers, in the dtype of the light, shape (3, P).
+        """
+        with torch.no_grad():
+            change = self.change(surface, albedo.detach().cpu().double())
+        if change is None:
+            return light.new_zeros(3, len(surface.fragments.pixels))
+        # Sum over the coefficients k of the light, for each channel c and pixel p.
+        return torch.einsum("ckp,kc->cp", change.to(light), light)
+
+
+def build_transport(
+    mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis
+) -> Transport | None:
+    """Prepare the computation of shadows and bounces of environment light.
+
+    The shadows of lamps and projectors are not included. They are computed in
+    `renderer.operators.lamp_paths`.
+
+    Args:
+        mesh: Mesh that casts shadows on itself.
+        settings: Settings of the image.
+        albedo_scale: Factor for the albedo of the surfaces that light bounces
+            off.
+        basis: Basis of the light.
+
+    Returns:
+        Object that computes them for a view. None if the settings turn off shadows
+        and bounces, or if the basis has no environment light.
+
+    Raises:
+        InputError: If the basis has local lights and `settings.bounces` is not
+            0.
+    """
+    if basis.local_lights and settings.bounces:
+        raise InputError(
+            f"bounces={settings.bounces} is not possible with {basis}, because only environment "
+            "light can bounce: set bounces=0, and shadows=true if you want shadows"
+        )
+    environment = basis.environment
+    if environment is None or not settings.global_illumination:
+        return None
+    return Transport(mesh, settings, albedo_scale, environment.basis)
+
+
+def _radiosity(
+    patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
+) -> Tensor:
+    """Compute the radiance that N patches send after `settings.bounces` bounces (radiosity).
+
+    After one bounce, patch i with albedo ρ_i sends the radiance
+    B_i = ρ_i / π S_i, where S_i is its irradiance from the sky. After each further
+    bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij is the irradiance of patch i
+    per unit radiance of patch j.
+
+    Args:
+        patches: Patches of the mesh.
+        rays: Rays among the small faces (pieces) of the patches.
+        settings: Settings of the image, with the number of bounces.
+        albedo_scale: Factor for the albedo of the mesh.
+        basis: SH basis of the environment light, with K coefficients.
+
+    Returns:
+        Radiance per unit of each coefficient, shape (N, K, 3), or (N, K, 1) if
+        all patches are gray.
+    """
+    sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
+    # Mean albedo: one row for each patch, one column for each color.
+    patch_albedo = patches.mean(sample_albedo) * albedo_scale
+    has_colors = bool((patch_albedo != patch_albedo[:, :1]).any())
+    channel_count = 3 if has_colors else 1
+    # Sent radiance per irradiance ρ_i / π. Axes: patch, one of size 1, color.
+    reflectance = patch_albedo[:, None, :channel_count] / math.pi
+    links = _PatchLinks.trace(patches, rays, basis)
+    sent = links.from_sky * reflectance
+    for _ in range(settings.bounces - 1):
+        # Irradiance from other patches. Axes: patch that sees others, SH coefficient, color.
+        from_patches = torch.from_numpy(links.factors @ sent.flatten(1).numpy())
+        from_patches = from_patches.view(-1, *sent.shape[1:])
+        from_sky = links.from_sky.expand_as(sent)
+        sent = from_sky.index_add(0, links.receiving, from_patches) * reflectance
+    return sent
+
+
+@dataclass(frozen=True)
+class _PatchLinks:
+    """How strongly the sky and other patches light each of N patches.
+
+    Attributes:
+        from_sky: Irradiance from the visible part of the sky, per unit of each of
+            the K SH coefficients, shape (N, K, 1).
+        receiving: Indices of the M patches that see other patches, shape (M,).
+        factors: Irradiance of each of these M patches per unit radiance of each
+            of the N patches, as a sparse matrix, shape (M, N).
+    """
+
+    from_sky: Tensor
+    receiving: Tensor
+    factors: csr_matrix
+
+    @staticmethod
+    def trace(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
+        """Cast rays from all patches to find which parts of the sky and which patches they see.
+
+        Args:
+            patches: The N patches.
+            rays: Rays among the small faces (pieces) of the patches.
+            basis: SH basis of the environment light.
+
+        Returns:
+            Irradiance of the patches from the sky and from each other.
+        """
+        surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
+        # One row for each patch, one column for each SH coefficient: the irradiance from the
+        # whole sky. The loop below subtracts the directions that the mesh blocks.
+        from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
+        from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
+        directions = sphere(PATCH_DIRECTIONS)
+        sky_radiance = basis.radiance(directions)
+        receiving = []
+        factors = []
+        for hits in rays.hits(surface, directions):
+            # A patch consists of several small faces (pieces). The weight of a ray contains
+            # the area of the piece from which it starts, divided by the area of the patch.
+            weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
+            from_sky[hits.pixels] -= weights @ sky_radiance
+            receiving.append(hits.pixels)
+            factors.append(patches.weights_by_patch(hits, directions, weights))
+        if not factors:
+            return _PatchLinks(
+                from_sky=from_sky[..., None],
+                receiving=torch.arange(0),
+                factors=csr_matrix((0, len(from_sky))),
+            )
+        return _PatchLinks(
+            from_sky=from_sky[..., None],
+            receiving=torch.cat(receiving),
+            factors=vstack(factors, format="csr"),
+        )

@@ -1,1 +1,0 @@
-"""Reflection of light by surfaces: diffuse shading, gloss and its lobes."""

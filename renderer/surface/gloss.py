@@ -1,0 +1,513 @@
+"""Gloss (specular reflection) of surfaces, with the metallic-roughness material of glTF 2.0.
+
+A surface has an albedo ρ, a roughness, a metallic fraction m (`metallic`), and a
+specular factor s (`specular_factor`, glTF's `specularFactor`). It reflects light
+specularly in two ways. A dielectric reflects (1 - m) s times a reflection that
+has the color of the light, called white here. A metal reflects m times
+Schlick's approximation with F0 = ρ and F90 = 1. The part with F0 is multiplied
+by the albedo, and is called colored here. The part with F90 is white. The
+reflected radiance per irradiance is
+
+    ρ (diffuse + colored) + white.
+
+A dielectric surface has a diffuse layer below a dielectric layer, which is
+called coat here. The unit vectors n, l and v are the normal, the direction to
+the light and the direction to the camera. E(μ) is the fraction of a light beam
+that the coat reflects, if μ is the cosine between the normal and the beam
+(`coat_albedo`). E_avg = 2 ∫ E(μ) μ dμ is its mean. Then
+
+    diffuse = (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
+
+(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). This
+model is reciprocal. With ρ = 1, a dielectric reflects each beam entirely: the
+coat reflects s E(n·l), and the diffuse layer reflects 1 - s E(n·l).
+Environment light with the coefficients U_lm has the irradiance
+Σ (A_l - s B_l) U_lm Y_lm(n) below the coat, with A_l from `lambertian_factors`
+and B_l from `coat_irradiance_factors`.
+
+Shapes use these letters: a view has S covered samples of a mesh with F faces. K
+is the number of SH coefficients of environment light, (degree + 1)².
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError, require_bounded
+from renderer.light.harmonics import bands, lambertian_factors
+from renderer.mesh import Mesh, require_mesh
+from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
+from renderer.settings import MIN_ROUGHNESS
+from renderer.surface.albedo import Texture, sample_textures
+from renderer.surface.lobes import (
+    ViewFrame,
+    coat_albedo,
+    coat_irradiance_factors,
+    coat_mean,
+    lobe_functions,
+    roughness_polynomials,
+)
+from renderer.validation import as_tensor, require_flag
+from renderer.vectors import unit
+from renderer.visibility.fragments import Fragments
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+# Attributes of `Gloss`, in the order of the columns of the array `Mesh.gloss`.
+_NAMES = ("roughness", "metallic", "specular_factor")
+# `smallest_roughness` ignores this percentage of the texels of a texture, namely those
+# with the smallest roughness.
+_IGNORED_PERCENT = 1
+# The only SH coefficient of uniform light with irradiance 1. Its radiance is 1 / π, and
+# the coefficient is √(4π) times the radiance.
+_UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Gloss:
+    """Specular reflection (gloss) of a surface, as in the material model of glTF.
+
+    Roughness, metallic and specular factor are each a number in [0, 1] for the
+    whole mesh, a tensor of shape (), or a tensor of shape (F,) with a number for
+    each of the F faces.
+
+    Attributes:
+        roughness: Roughness as in glTF. Values below 0.2 are shaded as 0.2.
+        metallic: Fraction of the surface that is metal.
+        specular_factor: Factor for the specular reflection of the part that is not
+            metal (`specularFactor` of the glTF extension KHR_materials_specular).
+        textured: True multiplies roughness and metallic by the gloss textures of
+            the mesh. False ignores these textures.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> varnished = nb.Gloss(roughness=0.3).on(nb.solid("orange"))
+        >>> varnished.gloss.shape == varnished.faces.shape
+        True
+    """
+
+    roughness: float | Float[Tensor, ...] = 0.5
+    metallic: float | Float[Tensor, ...] = 0.0
+    specular_factor: float | Float[Tensor, ...] = 1.0
+    textured: bool = field(default=False, kw_only=True)
+
+    def on(self, mesh: Mesh) -> Mesh:
+        """Return a copy of a mesh with this gloss instead of its own.
+
+        Args:
+            mesh: Mesh with F faces.
+
+        Raises:
+            InputError: If a value of the gloss is NaN, not in [0, 1], or has a
+                shape other than (), (1,) or (F,).
+        """
+        require_mesh("mesh", mesh)
+        face_count = len(mesh.faces)
+        columns = []
+        for values in self.checked(face_count):
+            columns.append(values.detach().cpu().expand(face_count))
+        textures = mesh.gloss_textures if self.textured else ()
+        by_face = torch.stack(columns, dim=1).float().numpy()
+        return replace(mesh, gloss=by_face, gloss_textures=textures)
+
+    def checked(self, faces: int) -> list[Tensor]:
+        """Check roughness, metallic and specular factor, and convert them to tensors.
+
+        Args:
+            faces: Number F of faces of the mesh that gets this gloss.
+
+        Returns:
+            Tensors of roughness, metallic and specular factor. Each has the shape
+            (1,) or (F,).
+
+        Raises:
+            InputError: If a value of the gloss is NaN, not in [0, 1], or has a
+                shape other than (), (1,) or (F,).
+        """
+        require_flag("textured", self.textured)
+        checked = []
+        for name in _NAMES:
+            given = getattr(self, name)
+            values = as_tensor(f"gloss: {name}", given)
+            if isinstance(given, int | float):
+                # `as_tensor` would round a Python number to float32.
+                values = torch.tensor(float(given), dtype=torch.float64)
+            require_bounded(**{name: values})
+            has_right_shape = values.shape in ((), (1,), (faces,))
+            if not has_right_shape or not (values.min() >= 0 and values.max() <= 1):
+                raise InputError(
+                    f"gloss: {name} has shape {tuple(values.shape)} or values outside [0, 1]: "
+                    f"give one number, or {faces} numbers (one per face), in [0, 1]"
+                )
+            checked.append(values.reshape(-1))
+        return checked
+
+
+class SampleGloss(NamedTuple):
+    """Gloss at the S covered samples of a view.
+
+    Each tensor has the shape (S,), or (1,) if all samples have the same value.
+
+    Attributes:
+        roughness: Roughness in [0.2, 1].
+        metallic: Fraction of the surface that is metal, in [0, 1].
+        specular_factor: Factor for the specular reflection of the dielectric,
+            in [0, 1].
+    """
+
+    roughness: Tensor
+    metallic: Tensor
+    specular_factor: Tensor
+
+    @property
+    def has_metal(self) -> bool:
+        """Whether a sample is partly metal, or the gradient of `metallic` is needed."""
+        return self.metallic.requires_grad or bool(self.metallic.any())
+
+    def at(self, samples: Tensor | slice) -> SampleGloss:
+        """Return the gloss of some of the samples.
+
+        Args:
+            samples: Indices of the samples, any shape, or a slice.
+        """
+        return SampleGloss(*(at_samples(values, samples) for values in self))
+
+    def to(self, like: Tensor) -> SampleGloss:
+        """Return a copy in the dtype and on the device of another tensor.
+
+        Args:
+            like: Tensor with the dtype and the device.
+        """
+        return SampleGloss(*(values.to(like) for values in self))
+
+    def lobes(self, cosine: Tensor, degree: int) -> tuple[Tensor | None, Tensor]:
+        """Compute the specular lobes of S samples for environment light.
+
+        A lobe is the specular reflectance as a function of the direction to the
+        light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, the values
+        of `renderer.surface.lobes.lobe_functions`.
+
+        Args:
+            cosine: Cosine n·v between the normal n and the direction v to the
+                camera, shape (S,).
+            degree: Degree of the light.
+
+        Returns:
+            A tuple of
+
+            - the lobe of the reflection that is multiplied by the albedo,
+              shape (M, S), or None if no sample is metallic;
+            - the lobe of the reflection with the color of the light,
+              shape (M, S).
+        """
+        terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
+        dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
+        white = (1 - self.metallic) * self.specular_factor * dielectric
+        if not metal_terms:
+            return None, white
+        schlick, edge = metal_terms
+        # A metal reflects the fraction albedo · SCHLICK + EDGE. The color of the light stays
+        # unchanged in the second term.
+        return self.metallic * schlick, white + self.metallic * edge
+
+    def reflect_uniform_light(
+        self, normals: Tensor, toward: Tensor
+    ) -> tuple[Tensor | None, Tensor]:
+        """Compute the specular radiance of S samples under uniform light of irradiance 1.
+
+        Args:
+            normals: Unit normals, shape (S, 3).
+            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
+
+        Returns:
+            A tuple of
+
+            - the radiance that is multiplied by the albedo, shape (S,), or None
+              if no sample is metallic;
+            - the radiance with the color of the light, shape (S,).
+        """
+        cosine = (normals * toward).sum(1).clamp(0, 1)
+        colored, white = self.lobes(cosine, degree=0)
+        white_radiance = white[0] * _UNIFORM_COEFFICIENT
+        if colored is None:
+            return None, white_radiance
+        return colored[0] * _UNIFORM_COEFFICIENT, white_radiance
+
+    def coat_transmittance(self, cosine: Tensor) -> Tensor:
+        """Compute the fraction of a light beam that passes the dielectric coat.
+
+        The coat is a transparent layer on a diffuse layer. The fraction is
+        1 - s E(μ). E(μ) is the fraction that a coat with the specular factor s = 1
+        reflects (`coat_albedo`). The result is differentiable with respect to the
+        cosine and to the gloss.
+
+        Args:
+            cosine: Cosine μ between the normal and the beam, any shape. Negative
+                cosines count as 0.
+
+        Returns:
+            Fractions in [0, 1], in the shape of `cosine`.
+        """
+        return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
+
+    def factors_below_coat(self, degree: int) -> Tensor:
+        """Compute the factor of each SH coefficient in the irradiance below the dielectric coat.
+
+        The irradiance is Σ_lm (A_l - s B_l) U_lm Y_lm(n), with the coefficients
+        U_lm of the light, the harmonics Y_lm, the normal n and the specular
+        factor s. A_l is the factor without a coat (`lambertian_factors`), and
+        B_l the factor of the light that the coat reflects (`coat_irradiance_factors`). The
+        result is differentiable with respect to the gloss.
+
+        Args:
+            degree: Degree of the light, at most `harmonics.DIFFUSE_DEGREE`.
+
+        Returns:
+            Factor A_l - s B_l of each of the K coefficients, shape (K, S), or
+            (K, 1) if all samples have the same gloss.
+        """
+        # Factors B_l of the light that the coat reflects: one row for each degree l, one column
+        # for each sample.
+        coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ roughness_polynomials(
+            self.roughness
+        )
+        # Factors A_l without a coat, one for each SH coefficient of the light.
+        uncoated_factors = lambertian_factors(degree).to(self.roughness)
+        return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
+
+    def diffuse_factor(self, normals: Tensor, toward: Tensor) -> Tensor:
+        """Compute the factor by which metal and coat reduce the diffuse radiance at S samples.
+
+        The diffuse radiance is this factor times the albedo times the irradiance
+        below the coat. The factor is (1 - m) (1 - s E(n·v)) / (1 - s E_avg), with
+        the metallic fraction m and the specular factor s. E is the fraction of
+        light that the coat reflects (`coat_albedo`), and E_avg its mean
+        (`coat_mean`). The result is differentiable with respect to the vectors and
+        the gloss.
+
+        Args:
+            normals: Unit normals n, shape (S, 3).
+            toward: Unit vectors v to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
+
+        Returns:
+            Factors, shape (S,).
+        """
+        transmittance = self.coat_transmittance((normals * toward).sum(1))
+        mean_transmittance = 1 - self.specular_factor * coat_mean(self.roughness)
+        return (1 - self.metallic) * transmittance / mean_transmittance
+
+    def specular_transfer(
+        self, normals: Tensor, toward: Tensor, degree: int
+    ) -> tuple[Tensor | None, Tensor, ViewFrame]:
+        """Compute the specular radiance of S samples from each spherical harmonic.
+
+        The environment light has K = (degree + 1)² SH coefficients in axes that
+        face the camera. The result is differentiable with respect to the vectors
+        and the gloss.
+
+        Args:
+            normals: Unit normals, shape (S, 3).
+            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
+            degree: Degree of the light.
+
+        Returns:
+            A tuple of
+
+            - the radiance of metals per unit of each coefficient, which must be
+              multiplied by the albedo, shape (K, S), or None if no sample is
+              metallic;
+            - all other specular radiance per unit of each coefficient,
+              shape (K, S);
+            - the axes that face the camera. `ViewFrame.to_world` converts the
+              first two results to world axes, and `ViewFrame.from_world` converts
+              a light to the axes that face the camera.
+        """
+        frame = ViewFrame.from_directions(normals, toward)
+        colored_lobe, white_lobe = self.lobes(frame.cosine, degree)
+        colored_transfer = None if colored_lobe is None else frame.harmonics(colored_lobe)
+        return colored_transfer, frame.harmonics(white_lobe), frame
+
+    def reflect_beams(
+        self, normals: Tensor, toward: Tensor, directions: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the specular radiance per irradiance for light from single directions.
+
+        The result is differentiable with respect to the vectors and the gloss.
+
+        Args:
+            normals: Unit normals, shape (..., 3).
+            toward: Unit vectors to the camera, shape (..., 3).
+            directions: Unit vectors to the light, shape (..., 3).
+
+        Returns:
+            A tuple of
+
+            - the radiance per irradiance that is multiplied by the albedo,
+              shape (...);
+            - the radiance per irradiance with the color of the light,
+              shape (...).
+        """
+        schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
+        white = self.metallic * edge + (1 - self.metallic) * self.specular_factor * dielectric
+        return self.metallic * schlick, white
+
+
+def smallest_roughness(mesh: Mesh) -> float:
+    """Return the smallest roughness of all faces of a mesh that reflect specularly.
+
+    In each texture of the roughness, the 1% of the texels with the smallest
+    roughness do not count.
+
+    Args:
+        mesh: Mesh whose faces are examined.
+
+    Returns:
+        Roughness in [0, 1]. It is 1 for a matte mesh.
+    """
+    if mesh.gloss is None:
+        return 1.0
+    # The first channel of a gloss texture is a factor for the roughness.
+    roughness_factors = [
+        np.percentile(texture[..., 0], _IGNORED_PERCENT) / 255 for texture in mesh.gloss_textures
+    ]
+    # Faces without a texture have the texture index -1, which selects this last factor.
+    roughness_factors.append(1.0)
+    factor_of_face = np.take(roughness_factors, mesh.texture_ids if mesh.gloss_textures else -1)
+    roughness_of_face = mesh.gloss[:, 0] * factor_of_face
+    # Columns 1 and 2 are metallic and specular factor. If both are 0, a face is matte.
+    has_gloss = mesh.gloss[:, 1:].any(1)
+    return float(roughness_of_face.min(initial=1, where=has_gloss))
+
+
+def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
+    """Select the values of some samples. A single value counts for all samples.
+
+    Args:
+        values: Values of all S samples, shape (S, ...), or one value that all
+            samples share, shape (1, ...).
+        samples: Indices of samples, any shape, or a slice.
+
+    Returns:
+        Values of the selected samples. A shared value is returned as it is, in
+        the shape (1, ...).
+    """
+    return values if len(values) == 1 else values[samples]
+
+
+def sample_gloss(
+    mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
+) -> SampleGloss | None:
+    """Look up the specular material (gloss) at the samples of a view that show the mesh.
+
+    The result is differentiable with respect to `gloss`. A warning is issued if
+    a roughness is raised to its minimum 0.2.
+
+    Args:
+        mesh: Mesh that the view shows, with F faces.
+        fragments: The S samples of the view that show the mesh.
+        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
+            of the mesh.
+
+    Returns:
+        Gloss at the samples, float64, or None for a matte surface.
+
+    Raises:
+        InputError: If a value of the gloss is NaN, not in [0, 1], or has a shape
+            other than (), (1,) or (F,).
+    """
+    # A given gloss uses the textures of the mesh only if its field `textured` is True.
+    gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
+    if gloss is None:
+        gloss = _gloss_of_mesh(mesh)
+    if gloss is None:
+        return None
+    columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
+    roughness, metallic, specular_factor = (_at_faces(column, fragments) for column in columns)
+    if gloss_textures:
+        textures = []
+        for eight_bit_texture in gloss_textures:
+            factors = torch.from_numpy(eight_bit_texture).to(fragments.coverage) / 255
+            textures.append(Texture.from_values(factors))
+        # The two channels of a texture are factors for the roughness and for metallic.
+        roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)
+        roughness = roughness * roughness_factor
+        metallic = metallic * metallic_factor
+    if (roughness < MIN_ROUGHNESS).any():
+        warnings.warn(
+            f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}, "
+            "the smallest roughness that light of degree 40 shows.",
+            stacklevel=2,
+        )
+    return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, specular_factor)
+
+
+def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
+    """Convert the array `Mesh.gloss` to a `Gloss`.
+
+    Args:
+        mesh: Mesh with F faces. `Mesh.gloss` has one row for each face, with its
+            roughness, metallic and specular factor. It is None for a matte mesh.
+
+    Returns:
+        Gloss with tensors of shape (F,), or (1,) if all faces have the same
+        gloss. None for a matte mesh.
+    """
+    if mesh.gloss is None:
+        return None
+    has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
+    rows = mesh.gloss[:1] if has_one_gloss else mesh.gloss
+    roughness, metallic, specular_factor = torch.from_numpy(rows).unbind(1)
+    return Gloss(roughness, metallic, specular_factor)
+
+
+def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
+    """Look up the value of the face that each sample shows.
+
+    Args:
+        face_values: A value for each of the F faces of the mesh, shape (F,), or
+            one value that all faces share, shape (1,).
+        fragments: The S samples of the view that show the mesh.
+
+    Returns:
+        Values at the samples, shape (S,). A shared value is returned as it is,
+        shape (1,).
+    """
+    if len(face_values) == 1:
+        return face_values
+    seen_face_values = face_values.index_select(0, fragments.faces)
+    return seen_face_values.index_select(0, fragments.sample_to_seen_face)
+
+
+def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
+    """Compute unit vectors from the S samples of a view to the camera.
+
+    The vectors are differentiable with respect to the vertices.
+
+    Args:
+        fragments: Samples of the view that show the mesh.
+        vertices: Vertex positions in world axes, shape (V, 3).
+
+    Returns:
+        Unit vectors in world axes, in the dtype of `vertices`, shape (S, 3).
+        Without perspective, all samples share one vector, and the shape is
+        (1, 3).
+    """
+    eye = fragments.eye.to(vertices)
+    # `eye` is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with
+    # the direction to an orthographic camera.
+    has_perspective = bool(eye[3])
+    if not has_perspective:
+        return eye[None, :3]
+    points = fragments.interpolate(vertices[fragments.corners])
+    return unit((eye[:3] - points).T).T

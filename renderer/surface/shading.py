@@ -1,0 +1,632 @@
+"""Shading of the surface samples of a view, differentiable in vertices, light and albedo.
+
+The radiance of a pixel is the mean (box filter) over its s² samples i, with
+albedo ρ_i and unit normal n_i:
+
+    L = 1/s² Σ_i ρ_i E(n_i),    E(n) = Σ_lm A_l U_lm Y_lm(n),
+
+with the harmonics Y_lm, the coefficients U_lm of the light, and the factors
+A_l = π, 2π/3, π/4, 0, −π/24, 0, π/64, ... E is the irradiance of a diffuse
+surface (Ramamoorthi and Hanrahan 2001; the paper's appendix B.2).
+
+On the sphere, the bands of even degree from 2 on are together one homogeneous
+polynomial p of degree d. By Euler's theorem, its value follows from its gradient:
+p(n) = n · ∇p(n) / d. One product of monomials with the coefficients of the
+gradient therefore gives both E and ∇E. The component of ∇E that is tangent to the
+sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative with respect to the normal
+(the paper's appendix D).
+
+Visibility and texture coordinates are fixed (the paper's Section 3 and appendix
+B.3). The derivative with respect to the vertices contains how normals turn, but
+not how silhouette edges move. For derivatives with respect to the light alone,
+`renderer.operators.apply` is faster.
+
+Shapes use these letters: a view has S covered samples in P pixels, which show G
+of the F faces of a mesh with V vertices. K is the number of SH coefficients of
+the light, (degree + 1)².
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from renderer.errors import require_bounded
+from renderer.light import harmonics
+from renderer.normals import SPARSE_VERTEX_RATIO, area_vectors, vertex_normals
+from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
+from renderer.surface.lobes import coat_irradiance_factors, roughness_polynomials
+from renderer.vectors import unit, unit_vectors
+from renderer.visibility.fragments import Fragments
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+# Number of normals whose irradiance is computed at once. Their intermediate values fit
+# into the cache of the processor.
+BLOCK = 2**14
+# Number of color channels.
+COLORS = 3
+
+
+def radiance(
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    light: Float[Tensor, "coefficients 3"],
+    albedo: Float[Tensor, "S 3"],
+    normals: Float[Tensor, "G 3 3"] | None = None,
+) -> Float[Tensor, "3 P"]:
+    """Compute the linear radiance of the P covered pixels of a matte surface.
+
+    The result is differentiable with respect to the vertices, the light and the
+    albedo.
+
+    Args:
+        fragments: The S samples of the view that show the mesh.
+        vertices: Vertex positions in world axes, shape (V, 3).
+        light: SH coefficients of any degree, shape (K, 3).
+        albedo: Linear albedo at the samples (see `renderer.surface.albedo`),
+            shape (S, 3).
+        normals: Normals at the corners of the G seen faces for smooth shading,
+            from `normals_in_sight`, shape (G, 3, 3). None for flat shading with
+            the normals of the faces.
+
+    Returns:
+        Radiance, times the fraction of each pixel that the surface covers, in the
+        dtype of `vertices`, shape (3, P).
+
+    Raises:
+        InputError: If an argument holds NaN.
+    """
+    # Only the albedo is checked here. `area_vectors` checks the vertices, and `irradiance`
+    # checks the light.
+    require_bounded(albedo=albedo)
+    # Float16 would lose too much precision.
+    wide = torch.promote_types(vertices.dtype, torch.float32)
+    albedo = albedo.to(wide)
+    if normals is None:
+        # All samples of a face in a pixel have the same irradiance. They are merged: the
+        # weight of a pair of face and pixel is their mean albedo times their share of the
+        # samples of the pixel.
+        pixel, seen_face, weights = fragments.merge(albedo)
+        face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
+        incoming = irradiance(face_normals, light, wide).index_select(1, seen_face)
+    else:
+        pixel = fragments.sample_to_pixel
+        weights = albedo / fragments.samples**2
+        shading_normals = smooth_normals(fragments, normals.to(wide))
+        incoming = irradiance(shading_normals.T, light, wide)
+    reflected = incoming * weights.T
+    # Each column of `reflected` is a pixel already if a pixel has one sample.
+    if fragments.samples > 1:
+        zeros = reflected.new_zeros(COLORS, len(fragments.pixels))
+        reflected = zeros.index_add(1, pixel, reflected)
+    return reflected.to(vertices.dtype)
+
+
+def glossy_radiance(
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    light: Float[Tensor, "coefficients 3"],
+    albedo: Float[Tensor, "S 3"],
+    normals: Float[Tensor, "G 3 3"] | None,
+    gloss: SampleGloss,
+) -> Float[Tensor, "3 P"]:
+    """Compute the linear radiance of the P covered pixels of a glossy surface.
+
+    The result is differentiable with respect to the vertices, the light, the
+    albedo and the gloss.
+
+    Args:
+        fragments: The S samples of the view that show the mesh.
+        vertices: Vertex positions in world axes, shape (V, 3).
+        light: SH coefficients of any degree, shape (K, 3).
+        albedo: Linear albedo at the samples, shape (S, 3).
+        normals: Normals at the corners of the seen faces for smooth shading,
+            shape (G, 3, 3), or None for flat shading (see `radiance`).
+        gloss: Gloss at the samples (see `renderer.surface.gloss`).
+
+    Returns:
+        Radiance, times the fraction of each pixel that the surface covers, in the
+        dtype of `vertices`, shape (3, P).
+
+    Raises:
+        InputError: If an argument holds NaN.
+    """
+    wide = torch.promote_types(vertices.dtype, torch.float32)
+    # The functions `unit` and `area_vectors` have the three components along the first
+    # axis, but `shading_normals` has them along the second axis.
+    if normals is None:
+        face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
+        shading_normals = unit(face_normals).T[fragments.sample_to_seen_face].to(wide)
+    else:
+        shading_normals = unit(smooth_normals(fragments, normals.to(wide)).T).T
+    to_camera = toward_camera(fragments, vertices.to(wide))
+    albedo = albedo.to(wide)
+    light = light.to(wide)
+    gloss = gloss.to(shading_normals)
+    # Albedo of the diffuse layer below the transparent coat, as the camera sees it.
+    diffuse_albedo = albedo * gloss.diffuse_factor(shading_normals, to_camera)[:, None]
+    specular_blocks = []
+    for first in range(0, len(shading_normals), BLOCK):
+        block = slice(first, first + BLOCK)
+        reflected = _lobe_radiance(
+            shading_normals[block],
+            at_samples(to_camera, block),
+            light,
+            albedo[block],
+            gloss.at(block),
+        )
+        coat_irradiance = _coat_irradiance(shading_normals[block].T, light, gloss.at(block))
+        # `radiance` below lets all light reach the diffuse layer. Subtract the diffuse
+        # reflection of the light that the coat reflects and that does not reach it.
+        specular_blocks.append(reflected - diffuse_albedo[block].T * coat_irradiance)
+    # The empty first tensor gives the result the shape (3, 0) if there are no samples.
+    specular = torch.cat([light.new_zeros(COLORS, 0), *specular_blocks], dim=1)
+    specular = specular / fragments.samples**2
+    diffuse = radiance(fragments, vertices, light, diffuse_albedo, normals)
+    zeros = specular.new_zeros(COLORS, len(fragments.pixels))
+    return diffuse + zeros.index_add(1, fragments.sample_to_pixel, specular).to(diffuse)
+
+
+def _lobe_radiance(
+    normals: Tensor, to_camera: Tensor, light: Tensor, albedo: Tensor, gloss: SampleGloss
+) -> Tensor:
+    """Compute the radiance of specular reflection at S samples under environment light.
+
+    Args:
+        normals: Unit normals, shape (S, 3).
+        to_camera: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
+            samples share one vector.
+        light: SH coefficients, shape (K, 3).
+        albedo: Linear albedo, shape (S, 3).
+        gloss: Gloss at the samples.
+
+    Returns:
+        Radiance, shape (3, S).
+    """
+    degree = harmonics.degree_of(light)
+    # `colored` and `white` have one row for each SH coefficient, one column for each sample.
+    # The reflection of metals (colored) is multiplied by the albedo. All other specular
+    # reflection (white) has the color of the light.
+    colored, white, frame = gloss.specular_transfer(normals, to_camera, degree)
+    light_in_frame = frame.from_world(light).T
+    reflected = light_in_frame @ white
+    if colored is not None:
+        reflected = reflected + albedo.T * (light_in_frame @ colored)
+    return reflected
+
+
+def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
+    """Compute the irradiance that the dielectric coat reflects at S samples.
+
+    The coat is a transparent layer on a diffuse layer. The reflected irradiance
+    does not reach the diffuse layer.
+
+    Args:
+        normals: Unit normals, shape (3, S).
+        light: SH coefficients of environment light, shape (K, 3).
+        gloss: Gloss at the samples.
+
+    Returns:
+        Irradiance, shape (3, S).
+    """
+    degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
+    # Coefficients of higher degrees are ignored, because they hardly change the irradiance.
+    light = light[: (degree + 1) ** 2]
+    # The coat multiplies each coefficient of the light by a factor, which is a sum over R
+    # polynomials of the roughness. One row for each coefficient, one column for each
+    # polynomial.
+    factor_coefficients = coat_irradiance_factors(degree).to(light)[harmonics.bands(degree)]
+    # One row for each polynomial, one column for each sample (or one for all samples).
+    polynomials = roughness_polynomials(gloss.roughness)
+    if len(gloss.roughness) == 1:
+        reflected_light = (factor_coefficients @ polynomials) * light
+        return gloss.specular_factor * _HarmonicSum.apply(normals, reflected_light)
+    # Light times the factors of one polynomial: one row for each SH coefficient, one column
+    # for each pair of polynomial and color.
+    lights = (factor_coefficients[..., None] * light[:, None]).flatten(1)
+    # Irradiance with the axes: polynomial, color, sample.
+    irradiances = _HarmonicSum.apply(normals, lights).unflatten(0, (-1, COLORS))
+    return gloss.specular_factor * (irradiances * polynomials[:, None]).sum(0)
+
+
+class _HarmonicSum(torch.autograd.Function):
+    """Sum Σ_k c_k Y_k(n) of spherical harmonics, for C channels at N unit normals.
+
+    On the sphere, the harmonics of all even degrees together are one homogeneous
+    polynomial, and so are those of all odd degrees. If p is a homogeneous
+    polynomial of degree d, its value follows from its gradient:
+    p(n) = n · ∇p(n) / d. The gradient is also needed for the derivative with
+    respect to the normal, so only the gradient is evaluated.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
+        """Compute the sum Σ_k c_k Y_k(n) for each channel and each normal n.
+
+        Args:
+            ctx: Context of autograd.
+            normals: Unit normals, shape (3, N).
+            coefficients: Coefficients c_k of the K harmonics, shape (K, C).
+
+        Returns:
+            Sums, shape (C, N).
+        """
+        degree = math.isqrt(len(coefficients)) - 1
+        # The harmonic of degree 0 has the constant value 1 / √(4π).
+        value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
+        gradient = normals.new_zeros(3, coefficients.shape[1], 1)
+        # The harmonics with the parity of `degree` are one homogeneous polynomial of this
+        # degree. All others are one polynomial of degree `degree` - 1.
+        for power in range(max(degree - 1, 1), degree + 1):
+            # Gradient of each harmonic, with the axes: direction of the derivative,
+            # monomial, harmonic.
+            harmonic_gradients = _gradients(power).to(coefficients)[..., : len(coefficients)]
+            # Gradient of the sum, with the axes: direction of the derivative, monomial,
+            # channel.
+            in_monomials = harmonic_gradients @ coefficients[: harmonic_gradients.shape[2]]
+            # Gradient at the normals, with the axes: direction, channel, normal.
+            polynomial_gradient = in_monomials.mT @ harmonics.monomials(normals, power - 1)
+            value = value + (polynomial_gradient * normals[:, None]).sum(0) / power
+            gradient = gradient + polynomial_gradient
+        ctx.save_for_backward(normals, gradient)
+        ctx.degree = degree
+        return value.expand(-1, normals.shape[1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Compute the gradients with respect to the normals and the coefficients.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient with respect to the sums, shape (C, N).
+
+        Returns:
+            A tuple of
+            - the gradient with respect to the normals, shape (3, N);
+            - the gradient with respect to the coefficients, shape (K, C).
+            A gradient that is not needed is None.
+        """
+        normals, gradient = ctx.saved_tensors
+        normal_gradient = None
+        coefficient_gradient = None
+        if ctx.needs_input_grad[0]:
+            normal_gradient = (gradient * upstream).sum(1)
+        if ctx.needs_input_grad[1]:
+            # One tensor for each of the K harmonics, with its values at the normals.
+            values = harmonics.evaluate_harmonics(normals, range((ctx.degree + 1) ** 2))
+            coefficient_gradient = torch.stack(values) @ upstream.T
+        return normal_gradient, coefficient_gradient
+
+
+def irradiance(
+    normals: Float[Tensor, "3 N"], light: Float[Tensor, "coefficients 3"], dtype: torch.dtype
+) -> Float[Tensor, "3 N"]:
+    """Compute the irradiance of environment light on surfaces with N normals.
+
+    The result is differentiable with respect to the normals and the light. The
+    irradiance is the function R in appendix B.2 of Liu et al. 2019. Appendix D has
+    its derivative. Both are evaluated as polynomials of the normal.
+
+    Args:
+        normals: Finite normals of any length, shape (3, N). They are divided by
+            their lengths in their own dtype.
+        light: SH coefficients, shape (K, 3).
+        dtype: Data type of all other computations, float32 or float64.
+
+    Returns:
+        Irradiance in three color channels, shape (3, N). Some coefficients do not
+        change the irradiance (odd degrees from 3 on). Their gradient is exactly 0.
+
+    Raises:
+        InputError: If the light holds NaN, or if its shape is not
+            ((degree + 1)², 3).
+    """
+    require_bounded(light=light)
+    # `degree_of` raises InputError if K is not (degree + 1)².
+    harmonics.degree_of(light)
+    return _Irradiance.apply(normals, light.to(dtype))
+
+
+class _Irradiance(torch.autograd.Function):
+    """Irradiance of environment light, differentiable in the normals and the light.
+
+    The forward pass first computes the gradient of the irradiance with respect to
+    the normal, and from it the irradiance. The backward pass uses the gradient.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
+        """Compute the irradiance at N normals.
+
+        Args:
+            ctx: Context of autograd.
+            normals: Normals of any length, shape (3, N).
+            light: SH coefficients, shape (K, 3).
+
+        Returns:
+            Irradiance in three color channels, shape (3, N).
+        """
+        directions, lengths = unit_vectors(normals)
+        directions = directions.to(light.dtype)
+        polynomial = _IrradiancePolynomial(light)
+        # Each pair has the irradiance of a block of normals, and its gradient.
+        pairs = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
+        value = torch.cat([block_value for block_value, _ in pairs], dim=-1)
+        gradient = torch.cat([block_gradient for _, block_gradient in pairs], dim=-1)
+        # Deleting the list releases the memory of the blocks.
+        del pairs
+        zero_normals = torch.nonzero(lengths == 0).squeeze(1)
+        if len(zero_normals):
+            degree = math.isqrt(len(light)) - 1
+            # The polynomial is the irradiance only for unit normals. For normals of length
+            # 0, the harmonics are evaluated instead.
+            nonzero, irradiance_per_unit = _diffuse_basis(directions[:, zero_normals], degree)
+            value[:, zero_normals] = light[nonzero].T @ irradiance_per_unit
+        ctx.save_for_backward(directions, lengths, gradient if ctx.needs_input_grad[0] else None)
+        ctx.light_shape = light.shape
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Compute the gradients with respect to the normals and the light.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient with respect to the irradiance, shape (3, N).
+
+        Returns:
+            A tuple of
+            - the gradient with respect to the normals, shape (3, N);
+            - the gradient with respect to the SH coefficients, shape (K, 3).
+            A gradient that is not needed is None.
+        """
+        # The gradient of the irradiance has the axes: direction, color, normal.
+        directions, lengths, color_gradients = ctx.saved_tensors
+        normal_gradient = None
+        light_gradient = None
+        if ctx.needs_input_grad[0]:
+            # Add up red, green and blue. The additions are in place to save memory.
+            gradient = color_gradients[:, 0] * upstream[0]
+            gradient.addcmul_(color_gradients[:, 1], upstream[1])
+            gradient.addcmul_(color_gradients[:, 2], upstream[2])
+            # The length of a normal does not change the irradiance, so the component of
+            # the gradient along the normal is removed.
+            tangential = gradient - directions * (directions * gradient).sum(0)
+            # A normal of length 0 gets the gradient 0.
+            normal_gradient = tangential / lengths.masked_fill(lengths == 0, torch.inf)
+        if ctx.needs_input_grad[1]:
+            degree = math.isqrt(ctx.light_shape[0]) - 1
+            light_gradient = directions.new_zeros(ctx.light_shape)
+            blocks = zip(directions.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True)
+            for block_directions, block_upstream in blocks:
+                nonzero, irradiance_per_unit = _diffuse_basis(block_directions, degree)
+                light_gradient[nonzero] += irradiance_per_unit @ block_upstream.T
+        return normal_gradient, light_gradient
+
+
+class _IrradiancePolynomial:
+    """Irradiance under one light, as a polynomial of the unit normal n.
+
+    The irradiance is c + a · n + p(n). The constant c comes from the harmonics of
+    degree 0, and the linear function a · n from those of degree 1. On the unit
+    sphere, the harmonics of the even degrees from 2 on are together one
+    homogeneous polynomial p(n) of degree d. Its gradient ∇p is a sum over the J
+    monomials of degree d - 1. All other degrees do not change the irradiance.
+
+    Attributes:
+        degree: Degree d of p.
+        even_gradient: Coefficients of ∇p in the monomials, with one row for each
+            of 3 directions of the derivative and 3 colors, shape (9, J).
+        linear_gradient: The vector a, with one row for each of 3 directions and 3
+            colors, shape (9, 1).
+        constant: The constant c for 3 colors, shape (3, 1).
+    """
+
+    def __init__(self, light: Tensor):
+        """Compute the coefficients of the irradiance c + a · n + p(n).
+
+        Args:
+            light: SH coefficients, shape (K, 3).
+        """
+        light_degree = math.isqrt(len(light)) - 1
+        matrices = _gradient_of_light(light_degree, light.dtype, light.device)
+        # Gradients with the axes: direction of the derivative, coefficient (those of ∇p
+        # first, then the one of a), color.
+        gradients = matrices @ light[: matrices.shape[2]]
+        # One row for each direction and color, one column for each coefficient.
+        gradients_by_row = gradients.mT.flatten(0, 1)
+        self.degree = _even_degree(light_degree)
+        self.even_gradient = gradients_by_row[:, :-1]
+        self.linear_gradient = gradients_by_row[:, -1:]
+        # For degree 0, the irradiance is π U_0 Y_0 with the coefficient U_0 of the light
+        # and the harmonic Y_0 = 1 / √(4π).
+        self.constant = light[:1].T * math.sqrt(math.pi / 4)
+
+    def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the irradiance and its gradient at N unit normals n.
+
+        The irradiance is c + a · n + p(n), with the constant c, the vector a and the
+        polynomial p of this object.
+
+        Args:
+            directions: Unit normals n, shape (3, N).
+
+        Returns:
+            A tuple of
+            - the irradiance, shape (3 colors, N);
+            - the gradient a + ∇p(n), shape (3 components, 3 colors, N). Only its
+              component tangential to the sphere is the derivative of the
+              irradiance. Its component along n has no meaning.
+        """
+        # A tensor of monomials with a name would stay in memory until the function
+        # returns.
+        gradient = torch.addmm(
+            self.linear_gradient,
+            self.even_gradient,
+            harmonics.monomials(directions, self.degree - 1),
+        ).unflatten(0, (3, COLORS))
+        # Because p(n) = n · ∇p(n) / d, the irradiance is the sum of two terms: first
+        # c + (1 - 1/d) a · n, and then n · (a + ∇p(n)) / d, which the loop adds.
+        linear = self.linear_gradient.view(3, COLORS).T
+        value = torch.addmm(self.constant, linear, directions, alpha=1 - 1 / self.degree)
+        for gradient_component, normal_component in zip(gradient, directions, strict=True):
+            value.addcmul_(gradient_component, normal_component, value=1 / self.degree)
+        return value, gradient
+
+
+@harmonics.cache_tensors
+def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Compute the matrices that map SH coefficients of a light to the gradient of irradiance.
+
+    The irradiance is a polynomial c + a · n + p(n) of the normal n. The constant c
+    comes from the harmonic of degree 0, the vector a from those of degree 1, and
+    the homogeneous polynomial p from those of even degree from 2 on. The gradient
+    is therefore a + ∇p(n).
+
+    Args:
+        degree: Degree of the light.
+        dtype: Data type of the result.
+        device: Device of the result.
+
+    Returns:
+        One matrix for each of the 3 components of the gradient, with one column
+        for each SH coefficient up to the degree of p. The last row gives the
+        component of a. The other rows give the coefficients of the component of
+        ∇p, one for each monomial. Shape (3, monomials + 1, coefficients).
+    """
+    even_degree = _even_degree(degree)
+    coefficient_count = (even_degree + 1) ** 2
+    # Gradients of the 4 harmonics up to degree 1, and zeros for all other harmonics.
+    linear_gradients = F.pad(_gradients(1), (0, coefficient_count - 4))
+    # Axes: component of the gradient, monomial (the constant 1 last), harmonic.
+    gradients = torch.cat([_gradients(even_degree), linear_gradients], dim=1)
+    irradiance_gradients = gradients * harmonics.lambertian_factors(even_degree)
+    return irradiance_gradients[..., : (degree + 1) ** 2].to(device, dtype)
+
+
+def _even_degree(degree: int) -> int:
+    """Return the degree of the polynomial of all harmonics with an even degree from 2 on.
+
+    Harmonics above `harmonics.DIFFUSE_DEGREE` are ignored, because they hardly
+    change the irradiance of a diffuse surface.
+
+    Args:
+        degree: Degree of the light.
+
+    Returns:
+        Largest even degree of a harmonic, at least 2.
+    """
+    highest = min(degree, harmonics.DIFFUSE_DEGREE)
+    return max(highest - highest % 2, 2)
+
+
+@harmonics.cache_tensors
+def _gradients(degree: int) -> Tensor:
+    """Compute the gradients of spherical harmonics that are extended to homogeneous polynomials.
+
+    The harmonic Y_k of degree l, with l of the same parity as `degree`, equals the
+    homogeneous polynomial |n|^degree Y_k(n / |n|) on the unit sphere (see
+    `harmonics.homogeneous_gradients`). Its gradient is a sum of monomials of
+    degree `degree` - 1.
+
+    Args:
+        degree: Degree of the polynomials.
+
+    Returns:
+        Coefficients of the gradients,
+        shape (3 components, monomials, (degree + 1)²), with one column for each
+        harmonic. Columns are zero for l = 0 and for l of the other parity.
+    """
+    band = harmonics.bands(degree)
+    # Each gradient as a sum of harmonics below `degree`. Axes: component of the gradient,
+    # harmonic in the sum, harmonic Y_k.
+    in_harmonics = harmonics.homogeneous_gradients(degree)[:, : degree**2]
+    # The same gradients as sums of monomials.
+    in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
+    has_same_parity = band % 2 == degree % 2
+    return in_monomials * ((band > 0) & has_same_parity)
+
+
+def _diffuse_basis(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
+    """Compute the irradiance of N diffuse surfaces from each spherical harmonic.
+
+    Args:
+        directions: Unit or zero normals of the surfaces, shape (3, N).
+        degree: Degree of the light.
+
+    Returns:
+        A tuple of
+        - the ascending indices of the M harmonics that change the irradiance;
+        - the irradiance if the coefficient of one of these harmonics is 1 and
+          all others are 0, shape (M, N).
+    """
+    nonzero = harmonics.nonzero_coefficients(degree).tolist()
+    factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
+    return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
+
+
+def normals_in_sight(
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    normal_ids: Int[Tensor, "F 3"],
+) -> Float[Tensor, "G 3 3"]:
+    """Compute the normals at the corners of the G faces that a view shows.
+
+    Args:
+        fragments: Samples of the view that show the mesh. Their faces are seen.
+        vertices: Vertex positions in world axes, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        normal_ids: Index of the normal of each corner (see `Mesh.normal_ids`),
+            shape (F, 3).
+
+    Returns:
+        Unit normals, float32 or float64, shape (G, 3, 3).
+    """
+    # All first corners of the seen faces, then all second and third corners.
+    seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
+    count = int(normal_ids.max()) + 1
+    is_seen = torch.zeros(count, dtype=torch.bool, device=faces.device)
+    is_seen[seen_ids] = True
+    # A normal is an average over all faces that share it, so these are all needed.
+    first, second, third = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).T
+    is_needed = first | second | third
+    needed_faces = faces[is_needed]
+    needed_ids = normal_ids[is_needed]
+    vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
+    if count < SPARSE_VERTEX_RATIO * needed_faces.numel():
+        normals = vertex_normals(vertices, needed_faces, needed_ids, count)
+    else:
+        # If few of the normals are needed, it is faster to renumber and compute only these.
+        used_ids, renumbered_ids = needed_ids.unique(return_inverse=True)
+        normals = vertex_normals(vertices, needed_faces, renumbered_ids, len(used_ids))
+        seen_ids = torch.searchsorted(used_ids, seen_ids)
+    return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
+
+
+def smooth_normals(
+    fragments: Fragments, corner_normals: Float[Tensor, "G 3 3"]
+) -> Float[Tensor, "S 3"]:
+    """Interpolate the normals at corners to the samples of a view.
+
+    The normals of faces that are seen from behind are reversed, so that they
+    point to the side of the camera.
+
+    Args:
+        fragments: The S samples of the view that show the mesh.
+        corner_normals: Normals at the corners of the G seen faces,
+            shape (G, 3, 3).
+
+    Returns:
+        Interpolated normals, which are not of unit length, shape (S, 3).
+    """
+    return fragments.interpolate(corner_normals * fragments.facing[:, :, None].to(corner_normals))

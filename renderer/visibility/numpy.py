@@ -1,0 +1,408 @@
+"""NumPy rasterizer with fixed-point corners and exact integer arithmetic, as on GPUs.
+
+Corners (x, y) are integers in 1/256 of a sample. In the row y = 256 r, an edge
+from (x₀, y₀) to (x₁, y₁) begins at the column
+
+    ⌈(x₀ + (y - y₀) (x₁ - x₀) / (y₁ - y₀)) / 256⌉.
+
+This quotient of integers is exact, and both faces of the edge share it. Each
+sample therefore belongs to one of the two faces (the top-left rule). In a row,
+a face covers the samples between its two columns. The depth of a face is the
+plane z = z_a + (x - x_a) ∂z/∂x + (y - y_a) ∂z/∂y, rounded to 24 bits. Each
+sample keeps the smallest of its keys,
+
+    key = depth · 2³² + face.
+
+The lower half of the key is then the nearest face, and the one with the lower
+index if depths are equal.
+
+Only covered samples are computed: triangles are split into rows, and rows into
+samples. This happens in blocks that stay in the cache of the processor. The
+longest axis is the last axis of every array. An array of triangles has shape
+(2, 3, T), for x and y, three corners and T triangles. x points to the right and
+y down.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+# Positions in the image are integers. Their unit, the subsample, is the distance of two
+# neighboring samples divided by SUBSAMPLES.
+SUBSAMPLE_BITS = 8
+SUBSAMPLES = 2**SUBSAMPLE_BITS
+# Depth of the far plane. Depths are integers with 24 bits. Surfaces at the far plane
+# are not drawn.
+FAR = 2**24 - 1
+# A key is an integer with the depth of a face at a sample in its high bits, and the index
+# of the face in its low bits. This is the number of low bits.
+FACE_BITS = 32
+# Key of samples without a face: a depth just in front of the far plane, and the face index
+# -1 in the low bits.
+EMPTY_KEY = (FAR << FACE_BITS) - 1
+# Number of faces that are drawn at once. Their arrays fit into the cache of the processor.
+FACES_PER_BLOCK = 2**14
+# Approximate length of the arrays that `_expand` returns. They fit into the cache of the
+# processor.
+ENTRIES_PER_BLOCK = 2**13
+
+
+def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """Find the nearest face at each sample of each view.
+
+    The docstring of the package `renderer.visibility.rasterizer` defines the
+    coordinates and the rounding.
+
+    Args:
+        points: The V vertices, projected to each of N views, finite, float64,
+            shape (N, V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: True leaves out faces that are clockwise in the image.
+
+    Returns:
+        Index of the nearest face at each sample, or -1 without a face, int32,
+        shape (N, R, R).
+    """
+    ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
+    for view, view_ids in zip(points, ids, strict=True):
+        # The conversion to int32 keeps the low 32 bits of each key, the face index.
+        view_ids[:] = _keys(view, faces, resolution, closed).reshape(view_ids.shape)
+    return ids
+
+
+class _TriangleRows(NamedTuple):
+    """Rows of the image in which T triangles may cover samples.
+
+    Attributes:
+        triangle_index: Index of each triangle among all triangles of a block,
+            shape (T,).
+        first_row: First row in which each triangle can cover samples,
+            shape (T,).
+        row_count: Number of rows in which each triangle can cover samples,
+            shape (T,).
+    """
+
+    triangle_index: np.ndarray
+    first_row: np.ndarray
+    row_count: np.ndarray
+
+
+def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """Compute the smallest key of each sample of one view.
+
+    Each face has one key at a sample that it covers: its depth, and in the low
+    FACE_BITS bits its index. The smallest key therefore belongs to the nearest
+    face.
+
+    Args:
+        points: Projected vertices, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: True leaves out faces that are clockwise in the image.
+
+    Returns:
+        Keys in row-major order, int64, shape (R²,).
+    """
+    positions, depths = to_fixed_point(points, resolution)
+    keys = np.full(resolution * resolution, EMPTY_KEY)
+    for begin in range(0, len(faces), FACES_PER_BLOCK):
+        block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
+        rows = _cull(positions.take(block, axis=1), resolution, closed)
+        # Sort the corners of each face, so that two faces with the same corners in another
+        # order get exactly the same depth.
+        corners = _sort(block.take(rows.triangle_index, axis=1))
+        face_ids = rows.triangle_index + begin
+        _draw(
+            keys, positions.take(corners, axis=1), depths.take(corners), rows, face_ids, resolution
+        )
+    return keys
+
+
+def _draw(
+    keys: np.ndarray,
+    triangles: np.ndarray,
+    depths: np.ndarray,
+    rows: _TriangleRows,
+    face_ids: np.ndarray,
+    resolution: int,
+) -> None:
+    """Draw T triangles: lower the keys of the samples at which a triangle is nearest so far.
+
+    A key is an integer. Its high bits are the depth of the nearest face at a
+    sample, and its low FACE_BITS bits are the index of this face.
+
+    Args:
+        keys: Smallest key of each sample so far, changed in place, shape (R²,).
+        triangles: Positions (x, y) of the three corners in subsamples,
+            shape (2, 3, T).
+        depths: Depths of the corners, shape (3, T).
+        rows: Rows in which the triangles may cover samples.
+        face_ids: Index of the face of each triangle, shape (T,).
+        resolution: Number R of samples per side.
+    """
+    edges = _edges(triangles)
+    planes = _planes(triangles, depths)
+    # One entry for each pair of a triangle and a row of samples that it may cover.
+    for triangle, row in _expand(rows.row_count):
+        row += rows.first_row.take(triangle)
+        left, right = _crossings(edges, triangle, row, resolution)
+        # Position and depth of the first corner, and slopes of the depth.
+        x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
+        depth_at_row = depth + (row - y) * slope_y
+        # Columns from the first corner to the first covered sample.
+        first_offset = left - x
+        first_sample = row * resolution + left
+        face = face_ids.take(triangle)
+        # One entry for each covered sample: the index of its pair of triangle and row, and
+        # the number of steps from the first covered sample of the row.
+        for pair, step in _expand(right - left):
+            offset = first_offset.take(pair) + step
+            exact_depth = depth_at_row.take(pair) + slope_x.take(pair) * offset
+            rounded = np.rint(exact_depth).astype(np.int64)
+            # Depths in front of the near plane are negative. As unsigned integers, they are
+            # larger than FAR, so they become FAR and are not drawn.
+            clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
+            sample_keys = (clipped << FACE_BITS) | face.take(pair)
+            np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
+
+
+def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Convert projected points to integer positions and to depths from 0 to FAR.
+
+    The unit of the positions is a subsample, 1/256 of the distance of two samples.
+    As on GPUs, positions in samples are computed with one multiplication and one
+    addition, rounded to float32, and then rounded to subsamples.
+
+    Args:
+        points: Projected points (x, y, depth), with the image in [-1, 1] and the
+            near plane at the depth -1, shape (V, 3).
+        resolution: Number of samples per side of the image.
+
+    Returns:
+        A tuple of
+        - x to the right and y down from the center of the first sample, in
+          subsamples, int64, shape (2, V);
+        - depths, float64, shape (V,).
+    """
+    half = resolution / 2
+    # Positions from the top left corner of the image, in samples. The product with a
+    # float64 array is float64, so that only the conversion to float32 below rounds.
+    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
+    window += half
+    snapped = window.astype(np.float32)
+    snapped *= SUBSAMPLES
+    positions = np.rint(snapped, out=snapped).astype(np.int64)
+    # Measure from the center of the first sample instead of its corner.
+    positions -= SUBSAMPLES // 2
+    depths = points[:, 2] + 1
+    depths /= 2
+    depths *= FAR
+    return positions, depths
+
+
+def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _TriangleRows:
+    """Find the triangles that can cover samples, and their rows.
+
+    By the top-left rule, a sample on an edge belongs to the triangle to the
+    right of the edge or, if the edge is horizontal, to the triangle below it.
+    A triangle therefore covers only samples whose x and y are at least its
+    smallest x and y, and less than its largest x and y.
+
+    Args:
+        triangles: Positions (x, y) of the three corners of F triangles in
+            subsamples, shape (2, 3, F).
+        resolution: Number of samples per side.
+        closed: True leaves out triangles that are clockwise in the image.
+
+    Returns:
+        Triangles that may cover samples.
+    """
+    areas = _doubled_areas(triangles)
+    # First column and first row of samples in the bounding box of each triangle, as the
+    # two rows of this array.
+    first = _next_sample(triangles.min(axis=1)).clip(0, None)
+    counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
+    # y points down, so triangles that are counter-clockwise in the image have negative
+    # areas.
+    is_facing = areas < 0 if closed else areas != 0
+    index = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
+    return _TriangleRows(
+        triangle_index=index,
+        first_row=first[1].take(index),
+        row_count=counts[1].take(index),
+    )
+
+
+def _doubled_areas(triangles: np.ndarray) -> np.ndarray:
+    """Compute twice the signed areas of F triangles.
+
+    Args:
+        triangles: Positions (x, y) of the three corners, with y pointing down,
+            shape (2, 3, F).
+
+    Returns:
+        Areas, shape (F,). They are negative for triangles that are
+        counter-clockwise in the image.
+    """
+    (ax, bx, cx), (ay, by, cy) = triangles
+    return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+
+
+def _next_sample(positions: np.ndarray) -> np.ndarray:
+    """Round positions in subsamples up to whole samples.
+
+    Args:
+        positions: Coordinates x or y in subsamples (1/256 of a sample), any shape.
+
+    Returns:
+        First column (for x) or row (for y) of samples at or after each position,
+        same shape.
+    """
+    return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
+
+
+def _sort(corners: np.ndarray) -> np.ndarray:
+    """Sort the three values of each column of an array, several times faster than np.sort.
+
+    Args:
+        corners: Integers, shape (3, T).
+
+    Returns:
+        The smallest, the middle and the largest value of each column,
+        shape (3, T).
+    """
+    least = corners.min(axis=0)
+    greatest = corners.max(axis=0)
+    return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
+
+
+class _EdgeLines(NamedTuple):
+    """Lines through the three edges of T triangles.
+
+    The corners are called top, middle and bottom by their position in the image.
+    The first edge leads from the top to the bottom corner, the second one from the
+    top to the middle corner, and the third one from the middle to the bottom
+    corner. A row of samples crosses an edge at the column
+    -(slope · row + constant) / height.
+
+    Attributes:
+        coefficients: Slope, constant and height of the edges, with the axes:
+            coefficient, edge, triangle. The shape is (3, 3, T).
+        middle_row: First row of samples at or below the middle corner,
+            shape (T,).
+    """
+
+    coefficients: np.ndarray
+    middle_row: np.ndarray
+
+
+def _edges(triangles: np.ndarray) -> _EdgeLines:
+    """Compute the lines through the edges of T triangles.
+
+    Args:
+        triangles: Positions (x, y) of the three corners in subsamples (1/256 of a
+            sample), shape (2, 3, T).
+
+    Returns:
+        Lines of the edges.
+    """
+    x, y = triangles
+    # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
+    # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
+    # right again.
+    downward = _sort((y << 32) + x)
+    # Each integer is 2³² y + x. Take x, which may be negative, from the low 32 bits.
+    x = ((downward + 2**31) & (2**32 - 1)) - 2**31
+    y = (downward - x) >> 32
+    # Indices of the sorted corners (0 top, 1 middle, 2 bottom) at both ends of the edges.
+    start = [0, 0, 1]
+    end = [2, 1, 2]
+    dx = x[end] - x[start]
+    dy = y[end] - y[start]
+    slope = -SUBSAMPLES * dx
+    constant = y[start] * dx - x[start] * dy
+    height = SUBSAMPLES * dy
+    return _EdgeLines(np.stack([slope, constant, height]), middle_row=_next_sample(y[1]))
+
+
+def _crossings(
+    edges: _EdgeLines, triangle: np.ndarray, row: np.ndarray, resolution: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row.
+
+    Args:
+        edges: Lines of the edges of T triangles.
+        triangle: Index of the triangle of each pair, shape (N,).
+        row: Row of each pair, shape (N,).
+        resolution: Number of samples per side.
+
+    Returns:
+        The first covered column, and the first column after the covered columns,
+        shape (N,) each.
+    """
+    is_below_middle = row >= edges.middle_row.take(triangle)
+    triangle_count = len(edges.middle_row)
+    # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
+    # edge 2 below the middle corner. Edge e of triangle t has the number e · T + t.
+    short_edge = triangle + (1 + is_below_middle) * triangle_count
+    crossed_edges = np.stack([triangle, short_edge])
+    slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed_edges, axis=1)
+    # Each row crosses an edge at the column -(slope · row + constant) / height. The first
+    # column after it is this number, rounded up. The operator // rounds down, but the minus
+    # sign before it makes the result round up.
+    columns = (-((slope * row + constant) // height)).clip(0, resolution)
+    return np.minimum(*columns), np.maximum(*columns)
+
+
+def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Compute the depth of T triangles as a linear function of column and row.
+
+    Args:
+        triangles: Positions (x, y) of the three corners in subsamples,
+            shape (2, 3, T).
+        depths: Depths of the corners, shape (3, T).
+
+    Returns:
+        Five rows: the column, the row and the depth of the first corner, and the
+        slopes of the depth per column and per row, shape (5, T).
+    """
+    (ax, bx, cx), (ay, by, cy) = triangles
+    depth_a, depth_b, depth_c = depths
+    to_b = depth_b - depth_a
+    to_c = depth_c - depth_a
+    scale = SUBSAMPLES / _doubled_areas(triangles)
+    slope_x = (to_b * (cy - ay) - to_c * (by - ay)) * scale
+    slope_y = (to_c * (bx - ax) - to_b * (cx - ax)) * scale
+    return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
+
+
+def _expand(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Repeat the index of each item as often as its count, and number the repetitions.
+
+    For example, the counts 2 and 3 give the indices 0, 0, 1, 1, 1 and the numbers
+    0, 1, 0, 1, 2. The result comes in blocks of about ENTRIES_PER_BLOCK entries.
+    All entries of an item are in the same block.
+
+    Args:
+        counts: Count of each item, shape (N,).
+
+    Yields:
+        For a block of B entries, the indices and the numbers, shape (B,) each.
+    """
+    # Number of entries of all items up to each item, with and without the item itself.
+    entries_with_item = np.cumsum(counts)
+    entries_before_item = entries_with_item - counts
+    first_item = 0
+    entries_before_block = 0
+    while first_item < len(counts):
+        # The block has at least one item, even if the item has too many entries.
+        largest_total = entries_before_block + ENTRIES_PER_BLOCK
+        next_item = int(np.searchsorted(entries_with_item, largest_total, side="right"))
+        next_item = max(first_item + 1, next_item)
+        item = np.repeat(np.arange(first_item, next_item), counts[first_item:next_item])
+        entry = np.arange(entries_before_block, entries_before_block + len(item))
+        yield item, entry - entries_before_item.take(item)
+        first_item = next_item
+        entries_before_block = int(entries_with_item[next_item - 1])

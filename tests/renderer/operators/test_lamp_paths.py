@@ -1,0 +1,357 @@
+"""Lamps and projectors on convex and concave meshes, against Mitsuba and in closed form."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from oracles import draw, draw_uniform, mesh_of
+from torch import Tensor
+
+from renderer import mitsuba_scene
+from renderer.camera import OrthographicCamera
+from renderer.light.basis import HARMONICS, Basis, LocalBasis, SumBasis
+from renderer.light.environment import write_map
+from renderer.light.lamps import Lamps
+from renderer.light.projector import Projector
+from renderer.mesh import Mesh, concatenate
+from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
+from renderer.operators import lamp_paths
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.lamp_paths import local_radiance, unoccluded
+from renderer.operators.rays import Rays, Surface
+from renderer.settings import ImageSettings
+from renderer.surface.albedo import surface_albedo
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizer import choose
+
+CAMERA = OrthographicCamera(51.6, 22.9, 2.2)
+PROJECTOR = Projector(pixels=7, polar=28.6, azimuth=91.7, distance=3.0, fov=35.0)
+LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
+DISCS = replace(LAMPS, radius=0.3)
+TWO_DISCS = replace(DISCS, positions=LAMPS.positions[:2])
+ORANGE = (0.9, 0.5, 0.2)
+BLUE = (0.3, 0.6, 0.9)
+SIZE = 24
+SAMPLES = 16
+lamps_and_discs = pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
+
+
+def ball(subdivisions: int = 2) -> Mesh:
+    """Return a convex mesh."""
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9)
+    return mesh_of(shape, ORANGE)
+
+
+def ball_on_a_table() -> Mesh:
+    """Return a mesh that casts a shadow on itself."""
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
+    shape.apply_translation([0, 0, 0.45])
+    table = Mesh.plain(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        [[0, 1, 2], [0, 2, 3]],
+        BLUE,
+    )
+    return concatenate([mesh_of(shape, ORANGE), table])
+
+
+def operator_of(
+    mesh: Mesh,
+    basis: Basis,
+    size: int = SIZE,
+    samples: int = SAMPLES,
+) -> TransferOperator:
+    """Build the float64 operator of the camera."""
+    [operator] = build_operators(
+        mesh,
+        [CAMERA],
+        ImageSettings(size, samples),
+        choose("numpy"),
+        basis=basis,
+        dtype=torch.float64,
+    )
+    return operator
+
+
+def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
+    """Return the linear radiance of all pixels, shape (size, size, 3)."""
+    size = operator.settings.size
+    image = torch.zeros(3, size**2, dtype=torch.float64)
+    image[:, operator.pixels] = operator.radiance(light)
+    return image.view(3, size, size).permute(1, 2, 0).numpy()
+
+
+def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) -> np.ndarray:
+    """Render a mesh in local light by Mitsuba, shape (SIZE, SIZE, 3).
+
+    Each lamp is rendered alone, because Mitsuba would choose one of several
+    lamps at random.
+    """
+    pytest.importorskip("mitsuba")
+    write_map(folder / "light.exr", torch.zeros(8, 16, 3))
+    lights = [(basis, light)]
+    if isinstance(basis, Lamps):
+        lights = [
+            (replace(basis, positions=(position,)), power[None])
+            for position, power in zip(basis.positions, light, strict=True)
+        ]
+    total = torch.zeros(3, SIZE, SIZE, dtype=torch.float64)
+    for placed in lights:
+        settings = ImageSettings(SIZE)
+        write_mitsuba_scene(folder, mesh, 1.0, [CAMERA], settings, "light.exr", [placed])
+        total += render_mitsuba_scene(folder / SCENE, 1)[0, :3]
+    return total.permute(1, 2, 0).numpy()
+
+
+@pytest.mark.parametrize(
+    ("make_mesh", "basis", "sample_count"),
+    [
+        (ball, PROJECTOR, 256),
+        (ball_on_a_table, LAMPS, 256),
+        (ball_on_a_table, TWO_DISCS, 1024),
+    ],
+    ids=["projector", "lamps", "discs"],
+)
+def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypatch):
+    """The direct light of a point has noise only at edges of patterns, shadows and silhouettes.
+
+    Most pixels are therefore equal up to the float32 rays, and all pixels are
+    equal on average. Discs have little noise with 1,024 rays.
+    """
+    monkeypatch.setattr(mitsuba_scene, "SAMPLES", sample_count)
+    light = 2 * draw_uniform(basis.size, 3, seed=1)
+    found = canvas(operator_of(make_mesh(), basis), light)
+    expected = mitsuba_image(tmp_path, make_mesh(), basis, light)
+    error = np.abs(found - expected)
+    brightest = expected.max()
+    is_dark = expected.max(axis=2) == 0
+    assert brightest > 0.1
+    assert is_dark.mean() > 0.1
+    assert np.median(error[expected > 0]) < 1e-3 * brightest
+    assert np.sqrt((error**2).mean()) < 0.01 * brightest
+    assert abs((found - expected).mean()) < 2e-3 * expected.mean()
+
+
+@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS, DISCS], ids=["projector", "lamps", "discs"])
+def test_the_gradient_by_the_light_is_the_adjoint_of_the_radiance(basis):
+    """The radiance is linear in the light."""
+    operator = operator_of(ball_on_a_table(), basis, samples=2)
+    light = draw_uniform(basis.size, 3)
+    upstream = draw_uniform(3, len(operator.pixels), seed=1)
+    by_gradient = (operator.light_gradient(upstream) * light).sum()
+    by_radiance = (upstream * operator.radiance(light)).sum()
+    assert by_radiance > 0
+    torch.testing.assert_close(by_gradient, by_radiance, rtol=1e-12, atol=0)
+
+
+def test_a_screen_at_the_origin_shows_the_pattern_upright_and_with_its_brightness():
+    """The projector is at the camera, so each pixel of the white screen is one of the pattern."""
+    distance = 3.0
+    fov = 2 * math.degrees(math.atan(CAMERA.width / 2 / distance))
+    projector = Projector(4, CAMERA.polar, CAMERA.azimuth, distance, fov)
+    right, up, _ = CAMERA.axes()
+    corners = 3 * np.array([-right - up, right - up, right + up, up - right])
+    screen = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+    pattern = draw_uniform(4, 4, 3)
+    shown = canvas(operator_of(screen, projector, size=4, samples=3), pattern.flatten(0, 1))
+    np.testing.assert_allclose(shown, pattern, rtol=1e-12)
+
+
+class MovedLamps:
+    """Radiance of a mesh as a function of the positions and powers of lamps."""
+
+    def __init__(self, mesh: Mesh, basis: Lamps, size: int, samples: int) -> None:
+        settings = ImageSettings(size, samples)
+        [view] = build_fragments(
+            mesh.vertices,
+            mesh.faces,
+            [CAMERA],
+            settings,
+            choose("numpy"),
+            closed=mesh.closed,
+        )
+        self.basis = basis
+        self.rays = Rays(mesh)
+        self.surface = Surface(mesh, view, settings)
+        self.albedo = surface_albedo(mesh, view, settings.encoding)
+
+    def __call__(self, positions: Tensor, powers: Tensor) -> Tensor:
+        """Return the radiance (3, P) under lamps at positions (L, 3) with powers (L, 3)."""
+        surface = self.surface
+        paths = unoccluded(
+            self.rays,
+            self.basis,
+            surface.points,
+            surface.normals,
+            surface.planes,
+            positions,
+        )
+        return local_radiance(surface, self.albedo, paths, powers)
+
+
+@lamps_and_discs
+def test_moved_lamps_give_the_radiance_and_shadows_of_lamps_at_these_positions(
+    basis,
+):
+    positions = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
+    powers = draw_uniform(2, 3)
+    moved = MovedLamps(ball_on_a_table(), basis, SIZE, 4)
+    operator = operator_of(ball_on_a_table(), basis.moved(positions), samples=4)
+    found = moved(positions, powers)
+    torch.testing.assert_close(found, operator.radiance(powers), rtol=1e-12, atol=1e-14)
+    one_lamp = moved(positions[:1], powers[:1])
+    assert (one_lamp == 0).any()
+    assert one_lamp.max() > 0.02
+
+
+@lamps_and_discs
+def test_derivatives_by_positions_and_powers_are_finite_differences_without_shadows(
+    basis,
+):
+    positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
+    powers = draw_uniform(3, 3).requires_grad_()
+    image = MovedLamps(ball(1), basis, 6, 2)
+    assert torch.autograd.gradcheck(image, (positions, powers), eps=1e-7, fast_mode=True)
+
+
+class LitSurface:
+    """Radiance of a ball as a function of its vertices and its albedo, at fixed visibility."""
+
+    def __init__(self, basis: LocalBasis, normals: str) -> None:
+        self.basis = basis
+        self.mesh = ball(0)
+        self.settings = ImageSettings(4, 2, normals=normals)
+        [self.view] = build_fragments(
+            self.mesh.vertices,
+            self.mesh.faces,
+            [CAMERA],
+            self.settings,
+            choose("numpy"),
+            closed=True,
+        )
+        self.rays = Rays(self.mesh)
+        self.light = draw_uniform(basis.size, 3)
+
+    def inputs(self) -> tuple[Tensor, Tensor]:
+        """Return vertices (V, 3) and the albedo (S, 3) at the samples."""
+        vertices = torch.from_numpy(self.mesh.vertices)
+        albedo = surface_albedo(self.mesh, self.view, self.settings.encoding)
+        return vertices.requires_grad_(), albedo.contiguous().requires_grad_()
+
+    def __call__(self, vertices: Tensor, albedo: Tensor) -> Tensor:
+        surface = Surface(self.mesh, self.view, self.settings, vertices)
+        paths = unoccluded(
+            self.rays,
+            self.basis,
+            surface.points,
+            surface.normals,
+            surface.planes,
+        )
+        return local_radiance(surface, albedo, paths, self.light)
+
+
+@pytest.mark.parametrize(
+    ("basis", "normals"),
+    [(PROJECTOR, "flat"), (LAMPS, "smooth"), (DISCS, "flat")],
+    ids=["projector", "lamps", "discs"],
+)
+def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normals):
+    image = LitSurface(basis, normals)
+    vertices, albedo = image.inputs()
+    assert torch.autograd.gradcheck(image, (vertices, albedo), eps=1e-7, fast_mode=True)
+    [gradient] = torch.autograd.grad(image(vertices, albedo).sum(), vertices)
+    assert gradient.abs().max() > 1e-3
+
+
+def irradiance_of_lamp(
+    position: list[float],
+    radius: float,
+    points: Tensor,
+    normals: Tensor,
+) -> Tensor:
+    """Compute the irradiance (N,) of a lamp of power 1 without occlusion."""
+    paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
+    total = torch.zeros(len(points), dtype=torch.float64)
+    return total.index_add(0, paths.point, paths.irradiance)
+
+
+def random_surfaces() -> tuple[Tensor, Tensor]:
+    """Draw points (500, 3) and unit normals (500, 3)."""
+    return draw(500, 3), torch.nn.functional.normalize(draw(500, 3, seed=1))
+
+
+POSITION = [0.5, -0.3, 0.8]
+
+
+def test_a_lamp_without_radius_lights_by_the_cosine_over_the_squared_distance():
+    points, normals = random_surfaces()
+    to_lamp = torch.tensor(POSITION, dtype=torch.float64) - points
+    distance = to_lamp.norm(dim=1)
+    cosine = ((to_lamp * normals).sum(1) / distance).clamp(min=0)
+    found = irradiance_of_lamp(POSITION, 0.0, points, normals)
+    torch.testing.assert_close(found, cosine / distance**2, rtol=1e-12, atol=1e-14)
+
+
+def test_a_small_disc_is_a_point_times_the_cosine_to_its_axis_and_dark_behind():
+    """A disc faces the origin."""
+    points, normals = random_surfaces()
+    position = torch.tensor(POSITION, dtype=torch.float64)
+    to_lamp = position - points
+    axis = position / position.norm()
+    cosine = (to_lamp @ axis / to_lamp.norm(dim=1)).clamp(min=0)
+    assert 50 < (cosine == 0).sum() < 450
+    expected = irradiance_of_lamp(POSITION, 0.0, points, normals) * cosine
+    found = irradiance_of_lamp(POSITION, 1e-7, points, normals)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_surface_behind_a_lamp_casts_no_shadow():
+    """The lamp is between two screens. The camera sees the lower one past the upper one."""
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    upper_square = 0.2 * square + [0, 0, 1.0]
+    faces = [[0, 1, 2], [0, 2, 3]]
+    screens = concatenate([Mesh.plain(square, faces), Mesh.plain(upper_square, faces)])
+    lamp = Lamps(((0.0, 0.0, 0.5),))
+    power = torch.ones(1, 3, dtype=torch.float64)
+    shown = canvas(operator_of(screens, lamp, size=5, samples=1), power)
+    # Directly below the lamp, the irradiance is 1 / 0.5². It is less elsewhere.
+    assert shown.max() == pytest.approx(4.0, rel=0.2)
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
+@pytest.mark.parametrize("make_mesh", [ball, ball_on_a_table], ids=["one color", "two colors"])
+def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
+    monkeypatch,
+    batch,
+    make_mesh,
+):
+    basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
+    mesh = make_mesh()
+    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
+    sparse = operator_of(mesh, basis, samples=2)
+    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
+    dense = operator_of(mesh, basis, samples=2)
+    assert sparse.sparse is not None
+    assert dense.sparse is None
+
+    lights = draw_uniform(*batch, basis.size, 3)
+    found = sparse.radiance(lights)
+    torch.testing.assert_close(found, dense.radiance(lights), rtol=1e-13, atol=1e-13)
+    upstream = draw(*batch, 3, len(sparse.pixels))
+    gradient = sparse.light_gradient(upstream)
+    expected = dense.light_gradient(upstream)
+    torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(
+    monkeypatch,
+):
+    basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
+    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
+    sparse = operator_of(ball(), basis, samples=2)
+    assert len(sparse.nonzero) == len(HARMONICS.nonzero)
+    dense_count = Projector(16).size * len(sparse.pixels)
+    assert 50 * len(sparse.sparse.function) < dense_count

@@ -1,0 +1,247 @@
+"""Many views in one call, compared with the single views."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+import torch
+from oracles import draw
+from torch import Tensor
+
+import renderer
+from renderer.camera import orbit_cameras
+from renderer.errors import InputError
+from renderer.light.basis import HARMONICS, Basis, SumBasis
+from renderer.light.projector import Projector
+from renderer.mesh import Mesh
+from renderer.operators.apply import build_operators
+from renderer.operators.stack import TransferOperators
+from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss
+from renderer.visibility.rasterizer import choose
+
+VIEW_COUNT = 5
+SIZE = 8
+CAMERAS = orbit_cameras(VIEW_COUNT, 2.2)
+PEAR = renderer.solid("pear")
+# The operators of a mesh with one color have one channel.
+PLAIN = Mesh.plain(PEAR.vertices, PEAR.faces, (0.8, 0.4, 0.1))
+
+
+def operators_of(
+    mesh: Mesh = PEAR,
+    basis: Basis = HARMONICS,
+    dtype: torch.dtype = torch.float64,
+    size: int = SIZE,
+    gloss: Gloss | None = None,
+    encoding: str = "linear",
+) -> TransferOperators:
+    """Build the operators of all cameras."""
+    settings = ImageSettings(size, 2, encoding)
+    operators = build_operators(
+        mesh,
+        CAMERAS,
+        settings,
+        choose("numpy"),
+        basis=basis,
+        dtype=dtype,
+        gloss=gloss,
+    )
+    return TransferOperators(operators)
+
+
+SCENES: dict[str, Callable[[], TransferOperators]] = {
+    "colors": operators_of,
+    "sRGB": partial(operators_of, encoding="srgb"),
+    "one color": partial(operators_of, PLAIN),
+    "gloss": partial(operators_of, PLAIN, gloss=Gloss(0.5), encoding="srgb"),
+    "projector": partial(operators_of, basis=SumBasis((HARMONICS, Projector(16)))),
+    "float32": partial(operators_of, dtype=torch.float32),
+}
+
+
+@cache
+def scene_operators(scene: str) -> TransferOperators:
+    """Build the operators of a scene once."""
+    return SCENES[scene]()
+
+
+@dataclass(frozen=True)
+class Call:
+    """Arguments of `TransferOperators.image`.
+
+    Attributes:
+        batch: Shape of the lights before the coefficients.
+        per_view: Whether the first axis of the lights is that of the views.
+        background: Kind of the background: "gray", "image", "image of view" or
+            "all images".
+    """
+
+    batch: tuple[int, ...]
+    per_view: bool
+    background: str
+
+    def lights(self, count: int) -> Tensor:
+        """Draw lights with a number of coefficients, shape (*batch, count, 3)."""
+        return 0.3 * draw(*self.batch, count, 3)
+
+    def backgrounds(self) -> tuple[float | Tensor, list[float | Tensor]]:
+        """Return the background of the call, and that of each view."""
+        images = draw(VIEW_COUNT, 2, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
+        if self.background == "gray":
+            return 0.2, [0.2] * VIEW_COUNT
+        if self.background == "image":
+            return images[0, 0], [images[0, 0]] * VIEW_COUNT
+        given = images[:, :1] if self.background == "image of view" else images
+        return given, list(given)
+
+
+CALLS = [
+    Call((), False, "gray"),
+    Call((2,), False, "image of view"),
+    Call((VIEW_COUNT,), True, "image"),
+    Call((VIEW_COUNT, 2), True, "all images"),
+]
+
+
+@pytest.mark.parametrize("call", CALLS, ids=str)
+@pytest.mark.parametrize("scene", SCENES)
+def test_all_views_in_one_call_are_the_single_views(scene, call):
+    operators = scene_operators(scene)
+    tolerance = 1e-5 if scene == "float32" else 1e-12
+    lights = call.lights(operators[0].basis.size)
+    background, background_of_view = call.backgrounds()
+
+    variable = lights.clone().requires_grad_()
+    found = operators.image(variable, background, light_per_view=call.per_view)
+    single = lights.clone().requires_grad_()
+    light_of_view = single if call.per_view else single.expand(VIEW_COUNT, *single.shape)
+    images = []
+    for operator, light, behind in zip(
+        operators,
+        light_of_view,
+        background_of_view,
+        strict=True,
+    ):
+        images.append(operator.image(light, behind))
+    expected = torch.stack(images)
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
+
+    upstream = draw(*found.shape, seed=1)
+    [gradient] = torch.autograd.grad(found, variable, upstream)
+    [expected_gradient] = torch.autograd.grad(expected, single, upstream)
+    torch.testing.assert_close(gradient, expected_gradient, rtol=tolerance, atol=100 * tolerance)
+
+
+@pytest.mark.parametrize("call", CALLS, ids=str)
+def test_images_and_gradients_without_autograd_are_those_of_autograd(call):
+    operators = scene_operators("sRGB")
+    lights = call.lights(49).requires_grad_()
+    background, _ = call.backgrounds()
+    options = {"background": background, "light_per_view": call.per_view}
+    expected = operators.image(lights, **options)
+    upstream = draw(*expected.shape, seed=1)
+    [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
+    image, gradient = operators.image_and_gradient(lights.detach(), lambda _: upstream, **options)
+    assert torch.equal(image, expected)
+    assert torch.equal(gradient, expected_gradient)
+
+
+@pytest.mark.parametrize("size", [SIZE, 100])
+def test_large_images_are_those_of_the_single_views(size):
+    """Large images are computed in a loop over the views."""
+    operators = operators_of(size=size)[:2]
+    lights = 0.3 * draw(2, 49, 3)
+    expected = torch.stack([operator.image(lights, 0.25) for operator in operators])
+    assert torch.equal(operators.image(lights, 0.25), expected)
+
+
+@pytest.mark.parametrize("size", [SIZE, 100])
+def test_images_are_differentiable_in_the_background(size):
+    """The corner is background in all four images of two views and two lights."""
+    operators = operators_of(size=size)[:2]
+    lights = 0.3 * draw(2, 49, 3)
+    background = torch.full((3, size, size), 0.25, dtype=torch.float64, requires_grad=True)
+    images = operators.image(lights, background)
+    torch.testing.assert_close(images, operators.image(lights, 0.25), rtol=0, atol=1e-12)
+    [gradient] = torch.autograd.grad(images.sum(), background)
+    assert gradient[0, 0, 0] == 4
+
+
+def test_operators_are_a_sequence():
+    operators = renderer.precompute_transfer(PEAR, CAMERAS, 8, rasterizer="numpy")
+    first, *others = operators
+    assert len(operators) == VIEW_COUNT
+    assert operators[0] is first
+    assert operators[-1] is others[-1]
+    assert isinstance(operators[1:], TransferOperators)
+    assert list(operators[1:]) == others
+    assert operators + others == [*operators, *others]
+
+
+def test_a_stack_of_one_operator_gives_its_image():
+    [first, *_] = scene_operators("float32")
+    light = renderer.load_light("grace")
+    assert torch.equal(TransferOperators([first]).image(light)[0], first.image(light))
+
+
+def test_operators_are_moved_to_a_device():
+    operators = scene_operators("float32").to("cpu")
+    images = operators.image(renderer.load_light("grace"))
+    assert images.shape == (VIEW_COUNT, 3, SIZE, SIZE)
+
+
+def test_views_without_the_mesh_show_the_background_and_have_no_gradient():
+    far_away = replace(PEAR, vertices=PEAR.vertices + np.array([20, 0, 0]))
+    operators = operators_of(far_away)
+    assert len(operators[0].pixels) == 0
+    light = draw(49, 3).requires_grad_()
+    image = operators.image(light, 0.25)[0]
+    assert (image == 0.25).all()
+    [gradient] = torch.autograd.grad(image.sum(), light)
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize(
+    ("shape", "per_view"),
+    [((9, 3), False), ((49, 3), True), ((3, 49, 3), True)],
+)
+def test_lights_of_another_shape_are_refused(shape, per_view):
+    with pytest.raises(InputError, match=r"^lights"):
+        scene_operators("colors").image(draw(*shape), light_per_view=per_view)
+
+
+def test_lights_with_nan_are_refused():
+    with pytest.raises(InputError, match=r"^lights"):
+        scene_operators("colors").image(draw(49, 3) * torch.nan)
+
+
+def test_a_background_of_another_shape_is_refused():
+    with pytest.raises(InputError, match=r"^background"):
+        scene_operators("colors").image(draw(49, 3), torch.zeros(4, 3, SIZE, SIZE))
+
+
+def test_a_gradient_of_another_shape_is_refused():
+    with pytest.raises(InputError, match=r"^loss_gradient"):
+        scene_operators("colors").image_and_gradient(draw(49, 3), lambda images: images[0])
+
+
+def test_no_operators_and_operators_of_different_sizes_are_refused():
+    with pytest.raises(InputError, match=r"^operators"):
+        TransferOperators([])
+    with pytest.raises(InputError, match=r"^operators"):
+        TransferOperators([*scene_operators("colors"), *operators_of(size=4)])
+
+
+def test_views_that_are_first_rendered_in_inference_mode_have_gradients_later():
+    operators = operators_of(PLAIN)
+    light = draw(49, 3)
+    with torch.inference_mode():
+        expected = operators.image(light)
+    light.requires_grad_()
+    images = operators.image(light)
+    assert torch.equal(images, expected)
+    images.sum().backward()
+    assert light.grad.any()

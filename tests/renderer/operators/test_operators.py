@@ -1,0 +1,367 @@
+"""Operators of single views, compared with plain operations and central differences."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from oracles import draw, mesh_of, patchwork
+from torch import Tensor
+
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.errors import InputError
+from renderer.image import decode, encode
+from renderer.light.basis import HARMONICS, SumBasis
+from renderer.light.harmonics import nonzero_coefficients
+from renderer.light.projector import Projector
+from renderer.mesh import Mesh
+from renderer.operators import distinct_pixels, lamp_paths
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.settings import ENCODINGS, ImageSettings
+from renderer.surface.gloss import Gloss
+from renderer.visibility.rasterizer import choose
+
+EPS = torch.finfo(torch.float64).eps
+# The image of this camera has +y to the right and -x up, from -1 to 1.
+ABOVE = OrthographicCamera(0, 0, 2.0)
+[IN_FRONT] = orbit_cameras(1, 2.2)
+SIZE = 6
+
+
+def operator_of(
+    mesh: Mesh,
+    camera: Camera,
+    settings: ImageSettings,
+    dtype: torch.dtype = torch.float32,
+) -> TransferOperator:
+    """Build the operator of one view."""
+    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
+    return operator
+
+
+def square(half: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
+    """Return a square that faces up, with a given half of its width."""
+    corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]])
+
+
+def test_the_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
+    """The half-width of 5/8 is that of two pixels and a half."""
+    operator = operator_of(square(5 / 8), ABOVE, ImageSettings(size=8, samples=4))
+    along = [0, 0.5, 1, 1, 1, 1, 0.5, 0]
+    coverage = torch.zeros(64)
+    coverage[operator.pixels] = operator.coverage
+    np.testing.assert_array_equal(coverage.view(8, 8), np.outer(along, along))
+
+
+def test_a_mesh_at_the_upper_right_is_in_the_last_pixel_of_the_first_row():
+    """From the +x side at the polar angle 90°, z is up and y is to the right."""
+    corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
+    mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+    camera = OrthographicCamera(90.0, 0, 2.0)
+    assert operator_of(mesh, camera, ImageSettings(4, 2)).pixels.tolist() == [3]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A mesh whose operator has one or three channels."""
+
+    mesh: Mesh
+    samples: int
+    channels: int
+    size: int = SIZE
+
+    def operator(self, encoding: str = "linear") -> TransferOperator:
+        settings = ImageSettings(self.size, self.samples, encoding)
+        return operator_of(self.mesh, IN_FRONT, settings, torch.float64)
+
+
+COARSE_BALL = trimesh.creation.icosphere(subdivisions=1)
+FINE_BALL = trimesh.creation.icosphere(subdivisions=2)
+ICOSAHEDRON = trimesh.creation.icosphere(subdivisions=0)
+DENTED = patchwork(FINE_BALL.vertices, FINE_BALL.faces)
+LAYOUTS = {
+    "one color": Layout(mesh_of(COARSE_BALL, (0.8, 0.4, 0.1)), 3, 1),
+    "one sample per pixel": Layout(DENTED, 1, 1),
+    "mixed albedos": Layout(DENTED, 3, 3),
+    "outside of the image": Layout(square(0.1, center=(20, 0, 0)), 2, 1),
+    "equal pixels": Layout(mesh_of(ICOSAHEDRON, (0.8, 0.4, 0.1)), 2, 1, size=96),
+}
+all_layouts = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+
+@all_layouts
+def test_the_transfer_has_one_channel_if_each_pixel_has_one_albedo(layout):
+    operator = layout.operator()
+    assert operator.transfer.shape == (
+        layout.channels,
+        31,
+        len(operator.pixels),
+    )
+    assert operator.transfer.dtype == torch.float64
+
+
+@all_layouts
+@pytest.mark.parametrize("batch", [(0,), (1,), (2, 3)], ids=str)
+def test_the_radiance_of_a_batch_is_that_of_its_lights(layout, batch):
+    operator = layout.operator()
+    lights = draw(*batch, 49, 3)
+    found = operator.radiance(lights)
+    assert found.shape == (*batch, 3, len(operator.pixels))
+    pairs = zip(lights.flatten(0, -3), found.flatten(0, -3), strict=True)
+    for light, radiance in pairs:
+        torch.testing.assert_close(radiance, operator.radiance(light), rtol=0, atol=64 * EPS)
+
+
+def multiply(operator: TransferOperator, lights: Tensor) -> Tensor:
+    """Multiply lights (..., coefficients, 3) with the whole transfer, shape (..., 3, P)."""
+    reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
+    return torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
+
+
+@all_layouts
+def test_the_radiance_is_the_product_of_light_and_transfer(layout):
+    operator = layout.operator()
+    light = draw(49, 3)
+    expected = multiply(operator, light)
+    torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=64 * EPS)
+
+
+def test_most_pixels_of_large_faces_are_multiplied_once():
+    """A face that fills pixels has one of them. All other pixels show several faces or an edge."""
+    operator = LAYOUTS["equal pixels"].operator()
+    columns = operator.transfer[0].T
+    distinct_columns = len(columns.unique(dim=0))
+    mixed_count = int((operator.coverage < 1).sum())
+    multiplied_count = operator.distinct_transfer.shape[-1]
+    assert distinct_columns <= multiplied_count < len(operator.pixels) / 4
+    assert mixed_count < multiplied_count
+
+
+def test_an_operator_on_another_device_has_the_transfer_of_all_pixels():
+    operator = LAYOUTS["equal pixels"].operator()
+    moved = operator.to("meta")
+    assert moved.distinct is None
+    assert moved.distinct_transfer.shape == operator.transfer.shape
+
+
+def test_equal_pixels_change_no_transfer(monkeypatch):
+    operator = LAYOUTS["equal pixels"].operator()
+    monkeypatch.setattr(distinct_pixels, "FEWEST_COPIES", 10**9)
+    expected = LAYOUTS["equal pixels"].operator()
+    assert expected.distinct is None
+    assert torch.equal(operator.transfer, expected.transfer)
+    assert torch.equal(operator.by_channel, expected.by_channel)
+
+
+def test_pixels_of_one_face_with_several_colors_are_not_equal():
+    mesh = patchwork(ICOSAHEDRON.vertices, ICOSAHEDRON.faces)
+    operator = operator_of(mesh, IN_FRONT, ImageSettings(128, 1), torch.float64)
+    light = draw(49, 3)
+    expected = multiply(operator, light)
+    torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=64 * EPS)
+
+
+PINK = mesh_of(ICOSAHEDRON, (0.8, 0.4, 0.4))
+DENTED_PINK = Mesh.plain(DENTED.vertices, DENTED.faces, (0.8, 0.4, 0.4))
+CLOSE_UP = PerspectiveCamera(70.0, 0.0, 2.2, distance=3.0)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "changed", "basis"),
+    [
+        (PINK, {"normals": "smooth"}, HARMONICS),
+        (DENTED_PINK, {"shadows": True}, HARMONICS),
+        (Gloss(roughness=0.5).on(PINK), {}, HARMONICS),
+        (PINK, {}, SumBasis((HARMONICS, Projector(4, 28.6, 91.7, 3.0, 45.8)))),
+    ],
+    ids=["smooth normals", "shadows", "gloss", "projector"],
+)
+def test_pixels_of_one_face_under_other_light_are_not_equal(monkeypatch, mesh, changed, basis):
+    # The rows of the projector are dense, and stand in the transfer.
+    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
+    settings = ImageSettings(96, 1, **changed)
+    [operator] = build_operators(mesh, [CLOSE_UP], settings, choose("numpy"), basis=basis)
+    light = draw(basis.size, 3).float()
+    expected = multiply(operator, light)
+    torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=1e-4)
+
+
+@all_layouts
+def test_the_gradient_by_the_light_is_a_central_difference(layout):
+    """Radiance is linear, so a step of any length gives the derivative up to rounding."""
+    operator = layout.operator()
+    light = draw(49, 3).requires_grad_()
+    step = draw(49, 3, seed=2)
+    upstream = draw(3, len(operator.pixels), seed=1)
+    [gradient] = torch.autograd.grad(operator.radiance(light), light, upstream)
+    assert torch.equal(operator.light_gradient(upstream), gradient)
+    with torch.no_grad():
+        change = (operator.radiance(light + step) - operator.radiance(light - step)) / 2
+    expected = float((change * upstream).sum())
+    assert float((gradient * step).sum()) == pytest.approx(expected, abs=1e-11)
+
+
+@all_layouts
+def test_the_bands_that_no_diffuse_surface_reflects_have_no_gradient(layout):
+    """These are the bands 3 and 5, with 18 coefficients."""
+    operator = layout.operator()
+    gradient = operator.light_gradient(draw(3, len(operator.pixels)))
+    is_reflected = torch.zeros(49, dtype=torch.bool)
+    is_reflected[nonzero_coefficients(6)] = True
+    assert (~is_reflected).sum() == 18
+    assert not gradient[~is_reflected].any()
+    is_visible = len(operator.pixels) > 0
+    assert bool(gradient[is_reflected].all()) == is_visible
+
+
+@pytest.mark.parametrize("shape", [(36, 3), (49, 1), (49,), (2, 31, 3), (0, 3)])
+def test_lights_of_another_shape_are_refused(shape):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 1))
+    with pytest.raises(InputError, match=r"^lights"):
+        operator.radiance(torch.zeros(shape))
+
+
+def background_of(kind: str, batch: tuple[int, ...], size: int = SIZE) -> float | Tensor:
+    """Return a background for a batch of lights."""
+    images = draw(*batch, 3, size, size, seed=3).abs().clamp(max=1)
+    if kind == "gray":
+        return 0.3
+    if kind == "color":
+        return torch.tensor([0.1, 0.5, 0.9])
+    if kind == "image":
+        return images.flatten(0, -4)[0] if batch else images
+    return images
+
+
+def compose(operator: TransferOperator, lights: Tensor, background: float | Tensor) -> Tensor:
+    """Compute images (..., 3, size, size) by plain operations that autograd differentiates."""
+    size = operator.settings.size
+    encoding = operator.settings.encoding
+    behind = torch.as_tensor(background).to(lights)
+    if behind.ndim < 2:
+        behind = behind.view(-1, 1, 1)
+    behind = behind.expand(*lights.shape[:-2], 3, size, size).flatten(-2)
+    uncovered = 1 - operator.coverage.to(lights)
+    background_radiance = uncovered * decode(behind[..., operator.pixels], encoding)
+    values = multiply(operator, lights) + background_radiance
+    images = behind.clone()
+    images[..., operator.pixels] = encode(values.clamp(0, 1), encoding)
+    return images.unflatten(-1, (size, size))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("kind", ["gray", "color", "image", "images"])
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
+@all_layouts
+def test_an_image_and_its_gradient_are_those_of_plain_operations(layout, batch, kind, encoding):
+    """At least a tenth of the values of visible meshes is clamped."""
+    operator = layout.operator(encoding)
+    lights = draw(*batch, 49, 3).requires_grad_()
+    upstream = draw(*batch, 3, layout.size, layout.size, seed=1)
+    background = background_of(kind, batch, layout.size)
+    expected = compose(operator, lights, background)
+    is_clamped = (expected == 0) | (expected == 1)
+    assert is_clamped.float().mean() > 0.1 or not len(operator.pixels)
+    image = operator.image(lights, background)
+    torch.testing.assert_close(image, expected, rtol=0, atol=64 * EPS)
+    [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
+    [gradient] = torch.autograd.grad(image, lights, upstream)
+    torch.testing.assert_close(gradient, expected_gradient, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
+@all_layouts
+def test_the_gradient_without_autograd_is_that_of_autograd(layout, batch):
+    operator = layout.operator("srgb")
+    lights = draw(*batch, 49, 3).requires_grad_()
+    upstream = draw(*batch, 3, layout.size, layout.size, seed=1)
+    expected = operator.image(lights, 0.3)
+    [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
+    image, gradient = operator.image_and_gradient(lights, lambda _: upstream, 0.3)
+    assert torch.equal(image, expected)
+    assert torch.equal(gradient, expected_gradient)
+    assert not gradient.requires_grad
+
+
+def test_an_image_is_differentiable_in_its_background():
+    operator = operator_of(DENTED, IN_FRONT, ImageSettings(SIZE, 3, "srgb"))
+    light = draw(49, 3).requires_grad_()
+    background = background_of("image", ()).requires_grad_()
+    found = operator.image(light, background)
+    expected = compose(operator, light, background)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    inputs = (light, background)
+    gradients = torch.autograd.grad(found.sum(), inputs)
+    expected_gradients = torch.autograd.grad(expected.sum(), inputs)
+    torch.testing.assert_close(gradients, expected_gradients, rtol=1e-6, atol=1e-6)
+
+
+DARK = torch.zeros(49, 3)
+
+
+@pytest.mark.parametrize("gray", [0.2, 0.7])
+def test_an_image_shows_the_current_values_of_a_background(gray):
+    """The memory of the tensor holds other values than in the call before."""
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    memory = np.full((3, SIZE, SIZE), 0.5, dtype=np.float32)
+    background = torch.from_numpy(memory)
+    operator.image(DARK, background)
+    memory[...] = gray
+    assert operator.image(DARK, background)[0, 0, 0] == np.float32(gray)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_image_has_the_number_type_of_the_light(dtype):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    image = operator.image(DARK.to(dtype), 0.75)
+    assert image.dtype == dtype
+    assert image[0, 0, 0] == 0.75
+
+
+def test_a_change_of_an_image_does_not_change_the_next_one():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    operator.image(DARK, 0.25).zero_()
+    assert operator.image(DARK, 0.25)[0, 0, 0] == 0.25
+
+
+def test_the_gradient_of_a_loss_without_autograd_is_that_of_autograd():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    light = (0.1 * draw(49, 3).float()).requires_grad_()
+    target = torch.full((3, 4, 4), 0.4)
+    image = operator.image(light)
+    [expected] = torch.autograd.grad((image - target).square().sum(), light)
+    _, gradient = operator.image_and_gradient(light, lambda shown: 2 * (shown - target))
+    assert torch.equal(gradient, expected)
+
+
+@pytest.mark.parametrize(
+    ("loss_gradient", "argument"),
+    [
+        (lambda image: image[0], "loss_gradient"),
+        (lambda image: image * torch.nan, "image_gradient"),
+    ],
+    ids=["another shape", "NaN"],
+)
+def test_an_invalid_gradient_of_a_loss_is_refused(loss_gradient, argument):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    with pytest.raises(InputError, match=f"^{argument}"):
+        operator.image_and_gradient(0.1 * draw(49, 3).float(), loss_gradient)
+
+
+def test_an_infinite_gradient_of_an_image_is_refused():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    light = (0.1 * draw(49, 3).float()).requires_grad_()
+    image = operator.image(light)
+    with pytest.raises(InputError, match=r"^image_gradient"):
+        torch.autograd.grad(image, light, torch.full_like(image, torch.inf))
+
+
+def test_second_derivatives_are_refused_instead_of_wrong():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    light = (0.1 * draw(49, 3)).requires_grad_()
+    loss = operator.image(light).square().sum()
+    [gradient] = torch.autograd.grad(loss, light, create_graph=True)
+    with pytest.raises(RuntimeError):
+        gradient.sum().backward()

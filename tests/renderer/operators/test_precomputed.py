@@ -1,0 +1,334 @@
+"""Shadows that a mesh casts on itself, against closed forms.
+
+See test_accuracy.py for a ray caster in wider numbers, and test_mitsuba.py for
+path-traced images.
+"""
+
+import math
+import sys
+from dataclasses import replace
+
+import hard_meshes as hard
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import trimesh
+from oracles import mesh_of, scipy_basis
+from torch import Tensor
+
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.errors import InputError
+from renderer.light.harmonics import nonzero_coefficients
+from renderer.light.presets import ambient, load_light
+from renderer.mesh import Mesh
+from renderer.operators import rays
+from renderer.operators import shadows as precomputed
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.rendering import precompute_transfer, render
+from renderer.settings import ImageSettings
+from renderer.visibility.rasterizer import choose
+
+ABOVE = OrthographicCamera(0, 0, 2.0)
+EPS32 = torch.finfo(torch.float32).eps
+# Root mean square error of a shadowed pixel with 512 directions, relative to
+# the brightest pixel.
+QUADRATURE_ERROR = 0.015
+
+
+def operator_of(
+    mesh: Mesh,
+    camera: Camera = ABOVE,
+    size: int = 6,
+    samples: int = 1,
+    shadows: bool = True,
+    bounces: int = 0,
+    normals: str = "flat",
+) -> TransferOperator:
+    """Build the float64 operator of one view."""
+    settings = ImageSettings(
+        size,
+        samples,
+        normals=normals,
+        shadows=shadows,
+        bounces=bounces,
+    )
+    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=torch.float64)
+    return operator
+
+
+def all_rows(operator: TransferOperator) -> Tensor:
+    """Return the radiance per unit of each coefficient, shape (3, 49, P)."""
+    nonzero_rows = operator.transfer * operator.albedo[:, None]
+    rows = nonzero_rows.new_zeros(3, 49, nonzero_rows.shape[2])
+    rows[:, operator.nonzero] = nonzero_rows.expand(3, -1, -1)
+    return rows
+
+
+def sky_fraction(operator: TransferOperator) -> Tensor:
+    """Return the radiance of a white mesh under a uniform sky, relative to an open sky, (3, P)."""
+    sky = ambient(torch.ones(3, dtype=torch.float64))
+    return operator.radiance(sky) / operator.coverage / math.pi
+
+
+def dented(seed: int = 0) -> Mesh:
+    """Return a closed ball with dents that see their own other side."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    vertex_count = len(ball.vertices)
+    radii = np.random.default_rng(seed).uniform(0.5, 1.0, (vertex_count, 1))
+    colors = np.random.default_rng(seed).uniform(0.1, 1, (vertex_count, 3))
+    return Mesh.plain(ball.vertices * radii, ball.faces, colors)
+
+
+def pit(depth: float) -> Mesh:
+    """Return the floor and the four walls of a square pit of width 1, seen from above."""
+    square = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
+    floor = [[x, y, 0] for x, y in square]
+    rim = [[x, y, depth] for x, y in square]
+    faces = [[0, 1, 2], [0, 2, 3]]
+    for a, b in [(0, 1), (1, 2), (2, 3), (3, 0)]:
+        faces += [[a, 4 + a, b], [b, 4 + a, 4 + b]]
+    return Mesh.plain(floor + rim, faces)
+
+
+CONVEX = {
+    "a ball": mesh_of(trimesh.creation.icosphere(subdivisions=2)),
+    "a cube": mesh_of(trimesh.creation.box()),
+    "an open square": Mesh.plain(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        [[0, 1, 2], [0, 2, 3]],
+    ),
+}
+
+
+@pytest.mark.parametrize("bounces", [0, 2])
+@pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
+def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh, bounces):
+    camera = OrthographicCamera(57.3, 17.2, 2.2)
+    direct = operator_of(mesh, camera, shadows=False)
+    shadowed = operator_of(mesh, camera, bounces=bounces)
+    assert torch.equal(shadowed.transfer, direct.transfer)
+    assert torch.equal(shadowed.nonzero, nonzero_coefficients(6))
+
+
+def octahedron() -> Mesh:
+    """Return the octahedron |x| + |y| + |z| = 1 without sharp edges."""
+    hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
+    return Mesh.plain(hull.vertices, hull.faces, crease=180)
+
+
+def points_on_octahedron(operator: TransferOperator, camera: OrthographicCamera) -> np.ndarray:
+    """Return the points (P, 3) of the octahedron at the centers of pixels, from above."""
+    size = operator.settings.size
+    row, column = np.divmod(operator.pixels.numpy(), size)
+    x = (column + 0.5) / size - 0.5
+    y = 0.5 - (row + 0.5) / size
+    right, up, back = camera.axes()
+    in_plane = camera.width * (x[:, None] * right + y[:, None] * up)
+    heights = 1 - abs(in_plane).sum(axis=1, keepdims=True)
+    return in_plane + heights * back
+
+
+def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
+    """Return directions (N, 3) and their solid angles (N,)."""
+    z, weights = np.polynomial.legendre.leggauss(128)
+    azimuth = np.arange(256) * math.pi / 128
+    radius = np.sqrt(1 - z**2)[:, None]
+    x = radius * np.cos(azimuth)
+    y = radius * np.sin(azimuth)
+    directions = np.stack(np.broadcast_arrays(x, y, z[:, None]), axis=-1)
+    return directions.reshape(-1, 3), weights.repeat(256) * math.pi / 128
+
+
+@pytest.mark.parametrize("bounces", [0, 2])
+def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive(
+    bounces,
+    monkeypatch,
+):
+    """The smooth normal of the octahedron at a point p is p / |p|.
+
+    Of a uniform sky, the face leaves (1 + cos) / 2, with the angle between the
+    normals of the face and of the point. Of any light, it leaves the integral
+    over the directions above the face.
+    """
+    monkeypatch.setattr(rays, "DIRECTIONS", 2**14)
+    camera = OrthographicCamera(0, 0, 2.1)
+    operator = operator_of(octahedron(), camera, size=8, normals="smooth", bounces=bounces)
+    points = points_on_octahedron(operator, camera)
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    face_normals = np.sign(points) / math.sqrt(3)
+    fractions = (1 + (normals * face_normals).sum(axis=1)) / 2
+    assert fractions.min() < 0.9
+    np.testing.assert_allclose(sky_fraction(operator)[0], fractions, atol=1e-3)
+
+    directions, solid_angles = sphere_quadrature()
+    is_above_face = face_normals @ directions.T > 0
+    received = (normals @ directions.T).clip(0) * is_above_face * solid_angles
+    expected = received @ scipy_basis(directions, 6)
+    np.testing.assert_allclose(all_rows(operator)[0].T, expected, atol=4e-3)
+
+
+def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(
+    monkeypatch,
+):
+    monkeypatch.setattr(rays, "MAX_COMPARISONS", 0)
+    convex = operator_of(CONVEX["a ball"])
+    assert torch.equal(convex.nonzero, nonzero_coefficients(6))
+    assert len(operator_of(dented()).nonzero) == 49
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_a_mesh_outside_of_the_image_has_no_pixels(bounces, monkeypatch):
+    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
+    camera = OrthographicCamera(0, 0, 1.0, right=20.0)
+    operator = operator_of(dented(), camera, bounces=bounces)
+    assert operator.transfer.numel() == 0
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_a_face_without_area_leaves_the_transfer_finite(bounces, monkeypatch):
+    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
+    heap = hard.heap()
+    faces = np.concatenate([heap.faces[:-1], [[0, 0, 1]]])
+    operator = operator_of(replace(heap, faces=faces), bounces=bounces)
+    assert operator.transfer.isfinite().all()
+
+
+@pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
+def test_the_sky_over_the_center_of_a_pit_has_the_configuration_factor_of_a_square(
+    depth,
+):
+    """Howell's catalog, B-3, has a square that is parallel to a surface, over its center."""
+    half_side = 0.5 / depth
+    hypotenuse = math.hypot(1, half_side)
+    expected = 4 * half_side / (math.pi * hypotenuse) * math.atan(half_side / hypotenuse)
+    camera = OrthographicCamera(0, 0, 0.01)
+    [found] = sky_fraction(operator_of(pit(depth), camera, size=1))[0].tolist()
+    assert found == pytest.approx(expected, abs=QUADRATURE_ERROR)
+
+
+def test_the_walls_of_a_pit_that_is_small_beside_the_mesh_hide_the_sky():
+    """The pit has a five hundredth of the mesh's size. The rest of the mesh is below it."""
+    scale = 1 / 500
+    whole = operator_of(pit(1.0), OrthographicCamera(0, 0, 0.01), size=1)
+    small = pit(1.0)
+    far_below = np.array([[0.0, 0.0, -1.0], [0.1, 0.0, -1.0], [0.0, 0.1, -1.0]])
+    vertices = np.concatenate([scale * small.vertices, far_below])
+    far_face = len(small.vertices) + np.arange(3)
+    mesh = Mesh.plain(vertices, np.concatenate([small.faces, far_face[None]]))
+    scaled = operator_of(mesh, OrthographicCamera(0, 0, 0.01 * scale), size=1)
+    torch.testing.assert_close(sky_fraction(scaled), sky_fraction(whole), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("albedo", [0.2, 0.5, 0.8])
+def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(albedo, monkeypatch):
+    """Each point of a sphere sees equal areas of it by the same share (integrating sphere).
+
+    Each bounce is therefore uniform. It has the albedo times the wall's share of
+    the area times the light of the bounce before.
+    """
+    monkeypatch.setattr(precomputed, "PATCHES", 2**9)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    heights = ball.vertices[ball.faces].mean(axis=1)[:, 2]
+    inside_out = ball.faces[heights < 0.6][:, ::-1]
+    mesh = Mesh.plain(ball.vertices, inside_out, (albedo, albedo, albedo))
+    direct, one_bounce, two_bounces = (
+        float(sky_fraction(operator_of(mesh, bounces=bounces)).mean()) for bounces in range(3)
+    )
+    # The hole z > 0.6 has 20% of the area.
+    expected = 0.8 * albedo * (one_bounce - direct)
+    assert two_bounces - one_bounce == pytest.approx(expected, rel=0.05)
+
+
+def test_bounces_reflect_the_scaled_albedo():
+    """Half of an albedo is the same surface as half of the scale."""
+    bright = pit(1.0)
+    dark = replace(bright, corner_colors=0.5 * bright.corner_colors)
+    light = load_light("grace").double()
+    scaled = render(bright, ABOVE, light, 6, albedo_scale=0.5, bounces=2, rasterizer="numpy")
+    expected = render(dark, ABOVE, light, 6, bounces=2, rasterizer="numpy")
+    torch.testing.assert_close(scaled, expected, rtol=0, atol=1e-6)
+
+
+WHITE_MESHES = {
+    "dented": (dented(1), 1, 1e-6),
+    "heap": (hard.heap(), 2, 1e-6),
+    "pit": (pit(3.0), 2, 0.5),
+}
+
+
+@pytest.mark.parametrize("name", WHITE_MESHES)
+def test_a_white_mesh_in_a_white_furnace_brightens_with_bounces_to_the_sky(name, monkeypatch):
+    """A white mesh absorbs no light, so it becomes as bright as the sky, in a deep pit slowly.
+
+    No pixel is darker than with fewer bounces or brighter than under an open
+    sky. The lost light is a sum over directions, and the rest a closed form.
+    """
+    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
+    mesh, samples, tolerance = WHITE_MESHES[name]
+    white = replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
+    fraction = sky_fraction(operator_of(white, size=8, samples=samples))
+    assert -QUADRATURE_ERROR <= fraction.min() < 0.96
+    for bounces in (1, 2, 100):
+        operator = operator_of(white, size=8, samples=samples, bounces=bounces)
+        brighter_fraction = sky_fraction(operator)
+        assert (brighter_fraction >= fraction - 1e-9).all()
+        assert brighter_fraction.max() <= 1 + 1e-9
+        fraction = brighter_fraction
+    torch.testing.assert_close(fraction, torch.ones_like(fraction), rtol=0, atol=tolerance)
+
+
+def test_shadows_without_embree_are_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
+    with pytest.raises(InputError, match="embreex"):
+        operator_of(dented())
+
+
+@pytest.mark.parametrize("degree", [2, 6])
+def test_render_shows_the_shadows_of_the_operators_of_moved_vertices(degree):
+    cameras = orbit_cameras(2, 2.2)
+    light = load_light("grace").double()[: (degree + 1) ** 2]
+    options = {
+        "size": 12,
+        "normals": "flat",
+        "shadows": True,
+        "rasterizer": "numpy",
+    }
+    stretched = replace(dented(), vertices=dented().vertices * [1.0, 0.5, 1.0])
+    vertices = torch.from_numpy(stretched.vertices)
+    images = render(dented(), cameras, light, vertices=vertices, **options)
+    padded_light = F.pad(light, (0, 0, 0, 49 - len(light)))
+    operators = precompute_transfer(stretched, cameras, **options)
+    expected = torch.stack([operator.image(padded_light) for operator in operators])
+    torch.testing.assert_close(images, expected, rtol=0, atol=10 * EPS32)
+
+
+def render_gradients(normals: str, shadows: bool) -> tuple[Tensor, ...]:
+    """Differentiate the sum of an image by the light and the vertices."""
+    light = ambient(torch.full((3,), 0.1).double()).requires_grad_()
+    vertices = torch.from_numpy(dented().vertices).requires_grad_()
+    image = render(
+        dented(),
+        ABOVE,
+        light,
+        vertices=vertices,
+        size=6,
+        normals=normals,
+        shadows=shadows,
+        rasterizer="numpy",
+    )
+    return torch.autograd.grad(image.sum(), (light, vertices))
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_the_gradient_by_the_light_contains_shadows(normals):
+    by_light, _ = render_gradients(normals, shadows=True)
+    operator = operator_of(dented(), samples=2, normals=normals)
+    torch.testing.assert_close(by_light, all_rows(operator).sum(2).T)
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_the_gradient_by_the_vertices_is_that_of_unshadowed_light(normals):
+    _, by_vertices = render_gradients(normals, shadows=True)
+    _, expected = render_gradients(normals, shadows=False)
+    assert torch.equal(by_vertices, expected)

@@ -1,0 +1,84 @@
+"""How pixels divide the directions of rays among their samples."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from renderer.camera import OrthographicCamera
+from renderer.light.presets import load_light
+from renderer.mesh import Mesh, concatenate, normalize
+from renderer.operators.rays import DIRECTIONS, Rays, Surface, sphere
+from renderer.rendering import render
+from renderer.settings import ImageSettings
+from renderer.solids import solid
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizer import choose
+
+ABOVE = OrthographicCamera(0, 0, 2.0)
+SIZE = 4
+SAMPLES = 8
+
+
+def starts_of_rays(sample_count: int) -> Tensor:
+    """Cast rays from a floor beside a higher square, with some samples in each pixel.
+
+    Returns:
+        The sample of its pixel from which each ray starts, counted from 0, shape
+        (pixels, DIRECTIONS).
+    """
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = [[0, 1, 2], [0, 2, 3]]
+    floor = Mesh.plain(corners, faces)
+    higher_square = Mesh.plain(corners + np.array([3, 0, 1]), faces)
+    mesh = concatenate([floor, higher_square])
+    settings = ImageSettings(SIZE, SAMPLES)
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [ABOVE], settings, choose("numpy"))
+    in_pixel = torch.arange(SAMPLES**2).repeat(SIZE**2)
+    fragments = fragments.select(torch.nonzero(in_pixel < sample_count).flatten())
+    surface = Surface(mesh, fragments, settings)
+    [hits] = Rays(mesh).hits(surface, sphere(DIRECTIONS))
+    assert hits.pixels.tolist() == list(range(SIZE**2))
+    return hits.sample_of_ray - sample_count * hits.pixels[:, None]
+
+
+@pytest.mark.parametrize("sample_count", [9, 16])
+def test_neighboring_pixels_cast_a_direction_from_all_of_their_samples(sample_count):
+    """As many pixels as a pixel has samples cast it once from each sample."""
+    starts = starts_of_rays(sample_count)[:sample_count]
+    expected = torch.arange(sample_count)[:, None].expand(-1, DIRECTIONS)
+    assert torch.equal(starts.sort(dim=0).values, expected)
+
+
+def test_each_sample_casts_rays_in_directions_all_over_the_sphere():
+    """Every 55th direction of the lattice has nearly the same azimuth.
+
+    The mean of such directions has a length of 0.75.
+    """
+    is_from_sample = starts_of_rays(55)[..., None] == torch.arange(55)
+    sums = torch.einsum("pds,di->psi", is_from_sample.double(), sphere(DIRECTIONS))
+    means = sums / is_from_sample.sum(1)[..., None]
+    assert means.norm(dim=-1).mean() < 0.4
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_shadows_converge_with_the_number_of_samples(normals):
+    """An image of 16 times as many pixels, averaged, is the reference.
+
+    Coverage converges as 1 / samples, because edges of the cup are the largest error.
+    """
+    cup = normalize(solid("cup"))
+    camera = OrthographicCamera(50.0, 30.0, 2.4)
+    light = 0.2 * load_light("grace")  # No pixel of the image is clamped.
+
+    def image(size: int, samples: int) -> Tensor:
+        options = {"normals": normals, "shadows": True, "encoding": "linear", "background": 0.0}
+        return render(cup, camera, light, size, samples=samples, **options)
+
+    expected = image(16 * 16, 2).view(3, 16, 16, 16, 16).mean((2, 4))
+    differences = [image(16, samples) - expected for samples in (4, 8, 16)]
+    errors = [float(difference.square().mean().sqrt()) for difference in differences]
+    brightness = float(expected.square().mean().sqrt())
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[2] < 0.7 * errors[1]
+    assert errors[2] < 0.01 * brightness

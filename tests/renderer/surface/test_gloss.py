@@ -1,0 +1,952 @@
+"""Gloss: lobes against quadrature, energy, images against Mitsuba, and gradients.
+
+The references are glTF's formulas of the reflectance and Kulla and Conty's
+diffuse layer ("Revisiting Physically Based Shading at Imageworks", 2017). A
+reflectance is always π f, the reflected radiance per irradiance.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.polynomial import legendre
+from oracles import draw, draw_uniform
+from torch import Tensor
+
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.errors import InputError
+from renderer.io.mitsuba_entries import environment, integrator, sensor_of
+from renderer.light.basis import (
+    Basis,
+    Harmonics,
+    LightPaths,
+    LocalBasis,
+    SplitLight,
+)
+from renderer.light.harmonics import bands, basis, lambertian_factors
+from renderer.light.highlights import AMPLITUDE, highlight_window, required_degree
+from renderer.light.lamps import Lamps
+from renderer.light.presets import load_light
+from renderer.light.projector import Projector
+from renderer.mesh import Mesh, concatenate, normalize, subdivide
+from renderer.microfacets import reflectance
+from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
+from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.lamp_paths import local_radiance
+from renderer.operators.rays import Rays
+from renderer.rendering import precompute_transfer, render
+from renderer.settings import MIN_ROUGHNESS, ImageSettings
+from renderer.shaded_view import ShadedView
+from renderer.solids import solid, sphere
+from renderer.surface.gloss import Gloss, SampleGloss
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizer import choose
+
+[CAMERA] = orbit_cameras(1, 2.2)
+[NEARBY] = orbit_cameras(1, 2.2, fov=40.0)
+DOUBLE = torch.float64
+UP = torch.tensor([[0.0, 0, 1]], dtype=DOUBLE)
+REFRACTIVE_INDEX = 1.5
+# Metallic and specular_factor of surfaces: two dielectrics, a metal, and a mixture.
+GLOSSES = [(0.0, 1.0), (0.0, 0.4), (1.0, 1.0), (0.5, 0.7)]
+
+
+def double(value: float) -> Tensor:
+    """Return a number as a float64 tensor of shape (1,)."""
+    return torch.tensor([value], dtype=DOUBLE)
+
+
+def toward(cosine: float) -> Tensor:
+    """Return the direction (1, 3) to a camera on the -x side, at a cosine from +z."""
+    return torch.tensor([[-math.sqrt(1 - cosine**2), 0, cosine]], dtype=DOUBLE)
+
+
+def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
+    """Return the direction (3,) of a polar angle and an azimuth in radians."""
+    x = math.sin(polar) * math.cos(azimuth)
+    y = math.sin(polar) * math.sin(azimuth)
+    return np.array([x, y, math.cos(polar)])
+
+
+# Reference: the reflectance of glTF.
+
+
+def schlick_fresnel(f0: float, f90: float, cosine: np.ndarray) -> np.ndarray:
+    """Evaluate Schlick's approximation between the values at normal and grazing incidence."""
+    return f0 + (f90 - f0) * (1 - cosine) ** 5
+
+
+def dielectric_fresnel(cosine: np.ndarray) -> np.ndarray:
+    """Evaluate Fresnel's equations for unpolarized light by Snell's law."""
+    n = REFRACTIVE_INDEX
+    inside = np.cos(np.arcsin(np.sqrt(1 - cosine**2) / n))
+    across = (cosine - n * inside) / (cosine + n * inside)
+    along = (n * cosine - inside) / (n * cosine + inside)
+    return (across**2 + along**2) / 2
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """A microfacet lobe by the appendix of glTF 2.0.
+
+    Attributes:
+        roughness: Roughness of the surface.
+        f0: Fresnel term at normal incidence. None for a dielectric with a
+            refractive index of 1.5, by Fresnel's equations.
+        f90: Fresnel term at grazing incidence.
+    """
+
+    roughness: float
+    f0: float | None = None
+    f90: float = 1.0
+
+    def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
+        """Evaluate the reflectance for light from unit directions.
+
+        Args:
+            cosine: Cosine of the angle between the normal +z and the camera.
+            light: Directions to the light, shape (N, 3).
+
+        Returns:
+            Reflectances, shape (N,).
+        """
+        view = toward(cosine)[0].numpy()
+        alpha = self.roughness**2
+        half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
+        n_dot_l = light[:, 2]
+        n_dot_h = half[:, 2]
+        v_dot_h = np.clip(half @ view, 0, 1)
+        distribution = alpha**2 / (np.pi * (n_dot_h**2 * (alpha**2 - 1) + 1) ** 2)
+        masking = self._masking(n_dot_l) * self._masking(np.array(cosine))
+        fresnel = self._fresnel(v_dot_h)
+        return np.pi * fresnel * distribution * masking / (4 * n_dot_l * cosine)
+
+    def _masking(self, cosine: np.ndarray) -> np.ndarray:
+        alpha_squared = self.roughness**4
+        return 2 * cosine / (cosine + np.sqrt(alpha_squared + (1 - alpha_squared) * cosine**2))
+
+    def _fresnel(self, cosine: np.ndarray) -> np.ndarray:
+        if self.f0 is None:
+            return dielectric_fresnel(cosine)
+        return schlick_fresnel(self.f0, self.f90, cosine)
+
+
+def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a quadrature over the directions above z = 0.
+
+    Args:
+        rings: Number of Gauss-Legendre nodes in z.
+
+    Returns:
+        Directions, shape (N, 3), and their solid angles, shape (N,).
+    """
+    node, weight = legendre.leggauss(rings)
+    z = (node[:, None] + 1) / 2
+    azimuth_count = 2 * rings
+    azimuth = 2 * np.pi * (np.arange(azimuth_count) + 0.5) / azimuth_count
+    solid_angles = np.repeat(weight / 2 * 2 * np.pi / azimuth_count, azimuth_count)
+    return directions_of(z, azimuth), solid_angles
+
+
+def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Return the directions (N, 3) of heights and azimuths that broadcast."""
+    radius = np.sqrt(1 - z**2)
+    x = radius * np.cos(azimuth)
+    y = radius * np.sin(azimuth)
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
+
+
+def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return a quadrature for functions that are symmetric in y.
+
+    The directions are closest together towards +x and the horizon, where the
+    lobes of grazing light are narrow.
+
+    Returns:
+        Directions with y > 0, shape (N, 3), and twice their solid angles.
+    """
+    node, weight = legendre.leggauss(100)
+    around, step = legendre.leggauss(50)
+    root = (node[:, None] + 1) / 2
+    fraction = (around + 1) / 2
+    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
+    return directions_of(root**2, math.pi * fraction**3), solid_angles.ravel()
+
+
+# Lobes
+
+
+@pytest.mark.parametrize(("roughness", "tolerance"), [(0.2, 0.004), (0.5, 0.004), (1.0, 0.003)])
+@pytest.mark.parametrize("view_count", [1, 3], ids=["one view", "three views"])
+def test_lobes_are_the_projected_reflectance_of_gltf(roughness, tolerance, view_count):
+    """The error is the L2 norm up to degree 6, relative to that of the whole lobe.
+
+    The normal is arbitrary. It is seen from one side at a time or from three at
+    once.
+    """
+    directions, solid_angles = hemisphere(int(45 / roughness))
+    turn = torch.linalg.qr(draw(3, 3)).Q
+    harmonics = basis(torch.from_numpy(directions) @ turn.T, 6)
+    cosines = [0.95, 0.6, 0.25]
+    views = torch.cat([toward(cosine) for cosine in cosines]).split(view_count)
+
+    def project(lobe: Lobe, cosine: float) -> Tensor:
+        """Project a lobe times the cosine of the light onto harmonics."""
+        values = lobe.reflectance(cosine, directions) * directions[:, 2] * solid_angles
+        return torch.from_numpy(values) @ harmonics
+
+    metal = SampleGloss(double(roughness), double(1.0), double(1.0))
+    varnish = SampleGloss(double(roughness), double(0.0), double(1.0))
+    cases = [
+        (metal, "colored", Lobe(roughness, 1, 0), Lobe(roughness, 1)),
+        (metal, "white", Lobe(roughness, 0, 1), Lobe(roughness, 0.04)),
+        (varnish, "white", Lobe(roughness), Lobe(roughness)),
+    ]
+    for gloss, part, lobe, whole_lobe in cases:
+        found = []
+        for seen in views:
+            normals = (UP @ turn.T).expand_as(seen)
+            colored, white, frame = gloss.specular_transfer(normals, seen @ turn.T, 6)
+            found.append(frame.to_world(colored if part == "colored" else white).T)
+        for cosine, row in zip(cosines, torch.cat(found), strict=True):
+            scale = project(whole_lobe, cosine).norm()
+            assert (row - project(lobe, cosine)).norm() <= tolerance * scale
+
+
+COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
+
+
+def quadrature_of_narrow_lobes(degree: int) -> Iterator[tuple[np.ndarray, Tensor]]:
+    """Yield blocks of directions (N, 3) with y > 0, and twice their weighted harmonics.
+
+    The nodes are closest together near the horizon and towards +x. There are
+    about eight in the width of the narrowest lobe. The harmonics (N, K) of order
+    m < 0 are odd in y and count as 0.
+    """
+    node, weight = legendre.leggauss(240)
+    around, step = legendre.leggauss(120)
+    fraction = (around + 1) / 2
+    azimuth = math.pi * fraction**2
+    order = torch.arange((degree + 1) ** 2) - bands(degree) * (bands(degree) + 1)
+    for root, ring in zip(np.split((node + 1) / 2, 24), np.split(weight, 24), strict=True):
+        directions = directions_of(root[:, None] ** 2, azimuth)
+        solid_angles = (ring * root)[:, None] * 2 * math.pi * fraction * step
+        values = basis(torch.from_numpy(directions), degree)
+        yield directions, values * torch.from_numpy(solid_angles).reshape(-1, 1) * (order >= 0)
+
+
+def projected(lobes: list[tuple[Lobe, float]], degree: int) -> Tensor:
+    """Project lobes, each with its cosine n·v, times the cosine of the light: (lobes, K)."""
+    total = torch.zeros(len(lobes), (degree + 1) ** 2, dtype=DOUBLE)
+    for directions, harmonics in quadrature_of_narrow_lobes(degree):
+        values = [lobe.reflectance(cosine, directions) for lobe, cosine in lobes]
+        total += torch.from_numpy(np.stack(values) * directions[:, 2]) @ harmonics
+    return total
+
+
+# Metallic and Fresnel terms of the two parts of a metal's lobe, and of a varnish.
+PARTS = {"colored": (1.0, (1, 0)), "white": (1.0, (0, 1)), "varnish": (0.0, (None, 1))}
+
+
+@pytest.mark.parametrize(
+    ("degree", "roughnesses"),
+    [
+        (39, [0.2, 0.27]),
+        pytest.param(5, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),
+        pytest.param(20, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),
+        pytest.param(40, [0.23, 0.3, 0.37, 0.5, 0.7, 0.95, 1.0], marks=pytest.mark.slow),
+    ],
+)
+def test_lobes_and_roughness_gradients_are_those_of_quadrature_in_float32(degree, roughnesses):
+    """The errors are L2 norms over all harmonics, relative to those of the whole lobe.
+
+    A metal's whole lobe has the sum of its two Fresnel terms. The derivative by
+    the roughness is a central difference of the quadrature, and its error is
+    relative to the derivative of the whole lobe.
+    """
+    step = 1e-4
+    shape = (3, len(PARTS), len(roughnesses) * len(COSINES), -1)
+    lobes = [
+        (Lobe(roughness + move, *fresnel), cosine)
+        for move in (0, step, -step)
+        for _, fresnel in PARTS.values()
+        for roughness in roughnesses
+        for cosine in COSINES
+    ]
+    expected, above, below = projected(lobes, degree).view(shape)
+    slope = (above - below) / (2 * step)
+
+    def coefficients(part: str, roughness: Tensor, cosine: float) -> Tensor:
+        """Evaluate the library's lobe (K,) in axes whose z-axis is the normal."""
+        metallic, _ = PARTS[part]
+        gloss = SampleGloss(roughness, double(metallic).float(), double(1.0).float())
+        seen = toward(cosine).float()
+        colored, white, frame = gloss.specular_transfer(UP.float(), seen, degree)
+        return frame.to_world(colored if part == "colored" else white)[:, 0]
+
+    def require_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
+        """Compare the three parts (3, K) of lobes, or of derivatives."""
+        whole = torch.stack([expected[0] + expected[1]] * 2 + [expected[2]])
+        assert ((found - expected).norm(dim=1) <= tolerance * whole.norm(dim=1)).all()
+
+    for row, (roughness, cosine) in enumerate(itertools.product(roughnesses, COSINES)):
+        pairs = [
+            torch.autograd.functional.jvp(
+                partial(coefficients, part, cosine=cosine),
+                torch.tensor([roughness], dtype=torch.float32),
+                torch.ones(1),
+            )
+            for part in PARTS
+        ]
+        values, tangents = (torch.stack(parts).double() for parts in zip(*pairs, strict=True))
+        require_close(values, expected[:, row], 0.001)
+        require_close(tangents, slope[:, row], 0.02)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.3, 0.55])
+def test_an_image_does_not_depend_on_whether_the_roughness_is_differentiable(roughness):
+    """A number and a tensor give equal images. One roughness per face differs by rounding."""
+    mesh = normalize(solid("pear"))
+    light = positive_light(20)
+    plain = render(mesh, CAMERA, light, 12, gloss=Gloss(roughness, 1.0))
+    tensor = torch.tensor(roughness, dtype=DOUBLE, requires_grad=True)
+    attacked = render(mesh, CAMERA, light, 12, gloss=Gloss(tensor, 1.0))
+    torch.testing.assert_close(attacked.detach(), plain, rtol=0, atol=1e-14)
+    by_face = torch.full((len(mesh.faces),), roughness, dtype=DOUBLE)
+    faces = render(mesh, CAMERA, light, 12, gloss=Gloss(by_face, 1.0))
+    torch.testing.assert_close(faces, plain, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("cosine", "roughness"), [(0.9, 0.2), (0.3, 0.7), (1.0, 1.0)])
+def test_the_reflectance_has_gltfs_terms_and_fresnels(cosine, roughness):
+    directions, _ = hemisphere(5)
+    found = reflectance(UP, toward(cosine), torch.from_numpy(directions), double(roughness))
+    lobes = [Lobe(roughness, 1, 0), Lobe(roughness, 0, 1), Lobe(roughness)]
+    expected = [lobe.reflectance(cosine, directions) for lobe in lobes]
+    np.testing.assert_allclose(found, np.stack(expected), rtol=1e-9, atol=1e-14)
+
+
+def zonal_amplitudes(roughness: float, degree: int, rings: int) -> np.ndarray:
+    """Project a lobe that is seen head-on onto Legendre polynomials, shape (degree + 1,)."""
+    directions, solid_angles = hemisphere(rings)
+    lobe = Lobe(roughness, 1, 0).reflectance(1.0, directions)
+    polynomials = legendre.legvander(directions[:, 2], degree)
+    return (lobe * directions[:, 2] * solid_angles) @ polynomials
+
+
+def test_a_direction_below_the_surface_passes_the_coat_like_one_at_its_horizon():
+    varnish = SampleGloss(double(0.4), double(0.0), double(1.0))
+    below = torch.tensor([-0.01, -0.5, -0.99], dtype=DOUBLE)
+    horizon = torch.zeros(3, dtype=DOUBLE)
+    torch.testing.assert_close(
+        varnish.coat_transmittance(below), varnish.coat_transmittance(horizon)
+    )
+
+
+@pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.3, 0.6])
+def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(
+    roughness,
+):
+    amplitudes = zonal_amplitudes(roughness, 45, rings=120)
+    relative = amplitudes / amplitudes[0]
+    degree = required_degree(roughness)
+    assert degree <= 40
+    assert relative[degree] > AMPLITUDE
+    assert (relative[degree + 1 :] <= AMPLITUDE).all()
+
+
+@pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.25, 0.5])
+def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
+    """The lobe is seen head-on, and has 0.7 of the squared roughness of the window's design."""
+    degree = required_degree(roughness)
+    first_of_band = torch.arange(degree + 1) ** 2
+    window = highlight_window(degree, roughness, 0.7)[first_of_band].numpy()
+    amplitudes = zonal_amplitudes(roughness * math.sqrt(0.7), degree, rings=120)
+    cosines = np.cos(np.linspace(0, math.pi, 2000))
+    series = (2 * np.arange(degree + 1) + 1) * amplitudes * window
+    radiance = legendre.legval(cosines, series)
+    assert window[0] == 1
+    assert radiance.min() >= -1e-3 * radiance.max()
+
+
+# Energy
+
+
+def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
+    """This is a white furnace for all roughness, metallic and specular_factor, from all sides."""
+    grid = torch.meshgrid(
+        torch.linspace(0, 1, 21, dtype=DOUBLE),
+        torch.linspace(MIN_ROUGHNESS, 1, 9, dtype=DOUBLE),
+        torch.linspace(0, 1, 3, dtype=DOUBLE),
+        torch.linspace(0, 1, 2, dtype=DOUBLE),
+        indexing="ij",
+    )
+    cosine, roughness, metallic, specular_factor = (values.flatten() for values in grid)
+    gloss = SampleGloss(roughness, metallic, specular_factor)
+    views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
+    normals = UP.expand_as(views)
+    colored, white, _ = gloss.specular_transfer(normals, views, 0)
+    diffuse = gloss.diffuse_factor(normals, views) * gloss.factors_below_coat(0)[0] / math.pi
+    specular = (colored + white)[0] * math.sqrt(4 * math.pi) / math.pi
+    reflected = diffuse + specular
+    assert diffuse.min() >= 0
+    assert reflected.max() <= 1 + 1e-12
+    of_dielectrics = reflected[metallic == 0]
+    torch.testing.assert_close(of_dielectrics, torch.ones_like(of_dielectrics))
+
+
+@cache
+def coat_albedo_by_quadrature(cosine: float, roughness: float) -> float:
+    """Integrate the fraction of a beam that the specular layer of a dielectric reflects."""
+    directions, solid_angles = half_hemisphere()
+    lobe = Lobe(roughness).reflectance(cosine, directions)
+    return float(lobe * directions[:, 2] @ solid_angles) / math.pi
+
+
+@dataclass(frozen=True)
+class WhiteSurface:
+    """Reference for a white surface with gloss, after Kulla and Conty (2017)."""
+
+    roughness: float
+    metallic: float
+    specular_factor: float
+
+    def transmitted(self, cosine: float) -> float:
+        """Return the fraction of a beam that passes the specular layer."""
+        return 1 - self.specular_factor * coat_albedo_by_quadrature(cosine, self.roughness)
+
+    def mean_transmitted(self) -> float:
+        """Return the fraction of diffuse light that passes the specular layer."""
+        node, weight = legendre.leggauss(12)
+        cosines = (node + 1) / 2
+        fractions = np.array([self.transmitted(cosine) for cosine in cosines])
+        return float(weight / 2 @ (2 * cosines * fractions))
+
+    def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
+        """Evaluate the reflectance (N,) for light from directions (N, 3)."""
+        heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
+        entering = np.array([self.transmitted(height) for height in heights])[ring_of_light]
+        diffuse = self.transmitted(cosine) * entering / self.mean_transmitted()
+        coat = self.specular_factor * Lobe(self.roughness).reflectance(cosine, light)
+        metal = Lobe(self.roughness, 1.0).reflectance(cosine, light)
+        return self.metallic * metal + (1 - self.metallic) * (coat + diffuse)
+
+
+# A white floor that fills the image from every side above it.
+FLOOR = Mesh.plain(
+    [[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]],
+    [[0, 1, 2], [0, 2, 3]],
+    np.ones(3),
+)
+
+
+def operators_of(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    settings: ImageSettings,
+    light_basis: Basis,
+    gloss: Gloss,
+) -> list[TransferOperator]:
+    """Build the float64 operators of views with gloss."""
+    return build_operators(
+        mesh,
+        cameras,
+        settings,
+        choose("numpy"),
+        basis=light_basis,
+        dtype=DOUBLE,
+        gloss=gloss,
+    )
+
+
+@dataclass(frozen=True)
+class FloorView:
+    """The center of the floor, seen from a polar angle and lit from another one."""
+
+    seen: float
+    lit: float
+    azimuth: float
+
+    def reflectance(self, light: LocalBasis, coefficient: float, gloss: Gloss) -> float:
+        """Measure the reflectance in a light with one coefficient for all functions."""
+        camera = OrthographicCamera(math.degrees(self.seen), 0.0, 1e-3)
+        [operator] = operators_of(FLOOR, [camera], ImageSettings(1, 1), light, gloss)
+        coefficients = UP.new_full((light.size, 3), coefficient)
+        return float(operator.radiance(coefficients)[0, 0]) / math.cos(self.lit)
+
+
+# Each pair of directions is also used the other way round, which tests reciprocity.
+FLOOR_VIEWS = [
+    FloorView(0.4, 1.0, 2.0),
+    FloorView(1.0, 0.4, 2.0),
+    FloorView(1.45, 0.6, 2.8),
+    FloorView(0.6, 1.45, 2.8),
+]
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(
+    roughness, metallic, specular_factor
+):
+    gloss = Gloss(roughness, metallic, specular_factor)
+    surface = WhiteSurface(roughness, metallic, specular_factor)
+    for view in FLOOR_VIEWS:
+        # The reference looks from -x, and the camera from +x.
+        light = unit_vector(view.lit, view.azimuth + math.pi)
+        [expected] = surface.reflectance(math.cos(view.seen), light[None])
+        lamp = Lamps((tuple(4 * unit_vector(view.lit, view.azimuth)),))
+        projector = Projector(1, math.degrees(view.lit), math.degrees(view.azimuth), 4.0)
+        # A lamp of power 16 has the irradiance 1 at a distance of 4.
+        assert view.reflectance(lamp, 16.0, gloss) == pytest.approx(expected, rel=2e-3)
+        assert view.reflectance(projector, 1.0, gloss) == pytest.approx(expected, rel=2e-3)
+
+
+def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
+    """Integrate the fraction of a beam that a white surface reflects into all directions."""
+    directions, solid_angles = half_hemisphere()
+    views = torch.from_numpy(directions)
+    count = len(views)
+    fragments = SimpleNamespace(
+        samples=1, sample_to_pixel=torch.arange(count), pixels=torch.arange(count)
+    )
+    surface: Any = SimpleNamespace(
+        gloss=gloss,
+        normals=UP.expand_as(views),
+        toward=views,
+        points=0 * views,
+        fragments=fragments,
+    )
+    paths = LightPaths(
+        point=torch.arange(count),
+        function=torch.zeros(count, dtype=torch.int64),
+        source=torch.from_numpy(beam).expand_as(views),
+        irradiance=views.new_ones(count),
+    )
+    values = local_radiance(surface, views.new_ones(count, 3), paths, views.new_ones(1, 3))
+    measure = torch.from_numpy(directions[:, 2] * solid_angles) / math.pi
+    return float(values[0] @ measure)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("polar", [0.0, 1.2, 1.5, 1.55])
+def test_a_beam_is_reflected_with_no_more_than_its_energy_and_by_varnish_with_all(roughness, polar):
+    beam = unit_vector(polar, math.pi)
+    for metallic, specular_factor in GLOSSES:
+        gloss = SampleGloss(double(roughness), double(metallic), double(specular_factor))
+        fraction = reflected_fraction(beam, gloss)
+        assert fraction <= 1 + 1e-4
+        if metallic == 0:
+            assert fraction >= 1 - 2e-3
+
+
+class FloorUnderSky:
+    """Zonal transfer of the floor, seen from the nodes of a quadrature over the hemisphere.
+
+    Attributes:
+        transfer: Radiance per unit of each zonal coefficient, shape (views, 7).
+        measure: Share of each view in the irradiance of a hemisphere, (views,).
+        harmonics: Zonal harmonics of the directions of the views, (views, 7).
+    """
+
+    ZONAL = tuple(l * (l + 1) for l in range(7))
+
+    def __init__(self, gloss: Gloss) -> None:
+        node, weight = legendre.leggauss(24)
+        cosines = torch.from_numpy((node + 1) / 2)
+        polar_angles = [math.degrees(math.acos(cosine)) for cosine in cosines]
+        cameras = [OrthographicCamera(polar, 17.2, 1.0) for polar in polar_angles]
+        operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
+        rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
+        self.transfer = torch.stack(rows)
+        # 2 cosine d(cosine) over [0, 1].
+        self.measure = torch.from_numpy(weight) * cosines
+        directions = torch.stack([0 * cosines, (1 - cosines**2).sqrt(), cosines], dim=1)
+        self.harmonics = basis(directions, 6)[:, self.ZONAL]
+
+
+@pytest.mark.parametrize("roughness", [0.2, 1.0])
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_environment_light_is_reflected_reciprocally(roughness, metallic, specular_factor):
+    """The transfer of all views, projected onto harmonics, is a symmetric matrix."""
+    floor = FloorUnderSky(Gloss(roughness, metallic, specular_factor))
+    matrix = (floor.harmonics * floor.measure[:, None]).T @ floor.transfer
+    torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=4e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 1.0])
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_environment_light_is_reflected_with_no_more_than_its_energy(
+    roughness, metallic, specular_factor
+):
+    """Varnish reflects all of the irradiance, which is A_l Y_l0 in closed form."""
+    floor = FloorUnderSky(Gloss(roughness, metallic, specular_factor))
+    reflected = floor.measure @ floor.transfer
+    irradiance = (basis(UP, 6) * lambertian_factors(6))[0, floor.ZONAL]
+    assert reflected[0] <= irradiance[0] * (1 + 1e-4)
+    if metallic == 0:
+        torch.testing.assert_close(reflected, irradiance, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("specular_factor", [0.5, 1.0])
+def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
+    specular_factor,
+):
+    """At the foot of a very high wall, half of an even sky is hidden."""
+    wall = Mesh.plain(
+        [[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]],
+        [[0, 1, 2], [0, 2, 3]],
+        np.ones(3),
+    )
+    corner = concatenate([FLOOR, wall])
+    camera = OrthographicCamera(40.1, 180.0, 1e-3)
+    settings = ImageSettings(1, 1, shadows=True)
+    gloss = Gloss(1.0, 0.0, specular_factor)
+    [operator] = operators_of(corner, [camera], settings, Harmonics(6), gloss)
+    even_sky = load_light("uniform", 6).double() * math.pi
+    found = float(operator.radiance(even_sky)[0, 0])
+
+    light, solid_angles = hemisphere(24)
+    surface = WhiteSurface(1.0, 0.0, specular_factor)
+    radiance = surface.reflectance(math.cos(math.radians(40.1)), light) * light[:, 2] * solid_angles
+    is_visible = light[:, 0] < 0
+    assert found == pytest.approx(radiance[is_visible].sum(), rel=0.02)
+
+
+# Images against Mitsuba
+
+
+def positive_light(degree: int) -> Tensor:
+    """Draw a light whose radiance is nowhere negative, with less power in higher bands."""
+    count = (degree + 1) ** 2
+    light = draw(count, 3, seed=degree) / (1 + bands(degree)[:, None])
+    light[0] = 0
+    lowest = mitsuba_map(light, 64).min()
+    mean = torch.zeros(count, 3, dtype=DOUBLE)
+    mean[0] = math.sqrt(4 * math.pi)
+    return light / (-1.1 * lowest) + mean
+
+
+def mitsuba_image(
+    mesh: Mesh,
+    surface: dict[str, Any],
+    lights: dict[str, Any],
+    sample_count: int,
+    size: int,
+    emitter_samples: int,
+) -> Tensor:
+    """Render a mesh with interpolated normals by Mitsuba, in our units.
+
+    Args:
+        mesh: The mesh.
+        surface: Mitsuba's entry of the material.
+        lights: Mitsuba's entries of the lights.
+        sample_count: Samples per pixel.
+        size: Pixels per side.
+        emitter_samples: Number of rays from a surface to lights in the scene.
+
+    Returns:
+        Image, shape (3, size, size).
+    """
+    with mitsuba() as module:
+        sampler = {"type": "multijitter", "sample_count": sample_count}
+        sensor = sensor_of(CAMERA, size) | {"sampler": sampler}
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        triangles = np.arange(len(corners)).reshape(-1, 3)
+        normals = mesh.corner_normals.reshape(-1, 3)
+        mitsuba_mesh = shape(module, surface, corners, triangles, normals)
+        scene = {
+            "type": "scene",
+            "integrator": integrator(0, emitter_samples),
+            "sensor": sensor,
+            "mesh": mitsuba_mesh,
+            **lights,
+        }
+        image = np.array(module.render(load(module, scene), spp=sample_count, seed=1))
+    return torch.from_numpy(image[..., :3]).double().permute(2, 0, 1)
+
+
+def mitsuba_radiance(mesh: Mesh, light: Tensor, surface: dict, sample_count: int) -> Tensor:
+    """Render a mesh in environment light by Mitsuba, shape (3, 16, 16)."""
+    pytest.importorskip("mitsuba")
+    with mitsuba() as module:
+        sky = environment({"bitmap": module.Bitmap(mitsuba_map(light, 256).float().numpy())})
+    image = mitsuba_image(mesh, surface, {"sky": sky}, sample_count, 16, 0)
+    return math.pi * image
+
+
+def our_radiance(mesh: Mesh, light: Tensor, gloss: Gloss, shadows: bool = False) -> Tensor:
+    """Render a mesh in environment light by an operator, shape (3, 16, 16)."""
+    settings = ImageSettings(16, 8, normals="smooth", shadows=shadows)
+    light_basis = Harmonics(math.isqrt(len(light)) - 1)
+    [operator] = operators_of(mesh, [CAMERA], settings, light_basis, gloss)
+    return canvas(operator, light)
+
+
+def canvas(operator: TransferOperator, light: Tensor) -> Tensor:
+    """Return the radiance of all pixels, shape (3, size, size)."""
+    size = operator.settings.size
+    image = light.new_zeros(3, size * size)
+    image[:, operator.pixels] = operator.radiance(light)
+    return image.unflatten(1, (size, size))
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Return the L2 norm of the error relative to that of the expected image."""
+    return float((found - expected).norm() / expected.norm())
+
+
+def rough_mirror(roughness: float) -> dict[str, Any]:
+    """Describe a metal without a Fresnel term for Mitsuba."""
+    return {
+        "type": "roughconductor",
+        "distribution": "ggx",
+        "alpha": roughness**2,
+        "material": "none",
+    }
+
+
+BALL = Mesh.plain(*sphere(4))
+EGG = normalize(replace(BALL, vertices=BALL.vertices * [1.0, 0.7, 0.8]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "roughness", "largest_error"),
+    [
+        (EGG, 0.3, 0.016),
+        pytest.param(BALL, 0.8, 0.02, marks=pytest.mark.slow),
+        pytest.param(BALL, 0.2, 0.016, marks=pytest.mark.slow),
+        pytest.param(BALL, 0.3, 0.016, marks=pytest.mark.slow),
+        pytest.param(EGG, 0.5, 0.019, marks=pytest.mark.slow),
+    ],
+)
+def test_metals_look_as_mitsubas_in_light_of_degree_6(mesh, roughness, largest_error):
+    """The error is that of the lobes, with Mitsuba's noise."""
+    light = positive_light(6)
+    found = our_radiance(mesh, light, Gloss(roughness, metallic=1.0))
+    expected = mitsuba_radiance(mesh, light, rough_mirror(roughness), 144)
+    assert relative_error(found, expected) < largest_error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mesh", "roughness", "largest_error", "largest_truncation_error"),
+    [
+        (EGG, 0.3, 0.02, 0.032),
+        (BALL, 0.8, 0.025, 0.04),
+        (BALL, 0.2, 0.02, 0.018),
+        (BALL, 0.3, 0.02, 0.035),
+        (EGG, 0.5, 0.024, 0.05),
+    ],
+)
+def test_metals_need_no_more_bands_than_the_degree_for_their_roughness(
+    mesh, roughness, largest_error, largest_truncation_error
+):
+    light = positive_light(20)
+    gloss = Gloss(roughness, metallic=1.0)
+    expected = mitsuba_radiance(mesh, light, rough_mirror(roughness), 144)
+    assert relative_error(our_radiance(mesh, light, gloss), expected) < largest_error
+    truncated_light = light[: (required_degree(roughness) + 1) ** 2]
+    truncated = our_radiance(mesh, truncated_light, gloss)
+    assert relative_error(truncated, expected) < largest_truncation_error
+
+
+@pytest.mark.parametrize("roughness", [0.4, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_the_highlight_of_varnish_over_black_looks_as_mitsubas(roughness):
+    varnish = {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": roughness**2,
+        "int_ior": REFRACTIVE_INDEX,
+        "diffuse_reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]},
+    }
+    light = positive_light(6)
+    black_ball = replace(BALL, corner_colors=0 * BALL.corner_colors)
+    found = our_radiance(black_ball, light, Gloss(roughness))
+    assert relative_error(found, mitsuba_radiance(BALL, light, varnish, 256)) < 0.04
+
+
+@pytest.mark.parametrize(("roughness", "largest_error"), [(0.25, 0.2), (0.5, 0.1)])
+def test_no_highlight_shines_through_the_wall_of_a_cup(roughness, largest_error):
+    """The rays in 512 directions leave an error. Without shadows it is much larger.
+
+    Neither image contains the reflection of the cup in itself.
+    """
+    cup = normalize(solid("cup"))
+    white_cup = replace(cup, corner_colors=np.ones_like(cup.corner_colors))
+    light = positive_light(6)
+    gloss = Gloss(roughness, metallic=1.0)
+    surface = {"type": "twosided", "material": rough_mirror(roughness)}
+    expected = mitsuba_radiance(white_cup, light, surface, 64)
+    shadowed = our_radiance(white_cup, light, gloss, shadows=True)
+    assert relative_error(shadowed, expected) < largest_error
+    unshadowed = our_radiance(white_cup, light, gloss)
+    assert relative_error(unshadowed, expected) > 2 * largest_error
+
+
+def test_the_highlight_of_a_lamp_is_mitsubas():
+    """A point light has no noise except at the edges of pixels."""
+    pytest.importorskip("mitsuba")
+    size = 24
+    lamp = Lamps(((2.0, 1.0, 2.5),), power=1.0)
+    settings = ImageSettings(size, 4, normals="smooth")
+    [operator] = operators_of(EGG, [CAMERA], settings, lamp, Gloss(0.4, metallic=1.0))
+    found = canvas(operator, UP.new_ones(1, 3))
+    point_light = {
+        "type": "point",
+        "position": list(lamp.positions[0]),
+        "intensity": {"type": "rgb", "value": [math.pi] * 3},
+    }
+    expected = mitsuba_image(EGG, rough_mirror(0.4), {"lamp": point_light}, 64, size, 1)
+    assert relative_error(found, expected) < 0.02
+
+
+# Gradients and consistency
+
+
+class GlossyView:
+    """Weighted sum of the radiance of a glossy apple, as a function of all parameters."""
+
+    LAMP = Lamps(((1.5, 0.4, 1.2),), radius=0.0)
+
+    def __init__(self, normals: str, camera: Camera) -> None:
+        self.mesh = normalize(solid("apple"))
+        self.settings = ImageSettings(12, 2, normals=normals)
+        self.rays = Rays(self.mesh)
+        [self.view] = build_fragments(
+            self.mesh.vertices,
+            self.mesh.faces,
+            [camera],
+            self.settings,
+            choose("numpy"),
+        )
+        self.upstream = 0.3 + 0.5 * draw_uniform(3, len(self.view.pixels), seed=9)
+
+    def start(self) -> dict[str, Tensor]:
+        """Return a value of each parameter."""
+        face_count = len(self.mesh.faces)
+        sample_count = len(self.view.sample_to_seen_face)
+        shapes = {
+            "lamp": (1, 3),
+            "albedo": (sample_count, 3),
+            "roughness": (face_count,),
+            "metallic": (face_count,),
+            "specular_factor": (face_count,),
+        }
+        uniform = {}
+        for seed, (name, size) in enumerate(shapes.items()):
+            uniform[name] = 0.3 + 0.5 * draw_uniform(*size, seed=seed)
+        vertices = torch.from_numpy(self.mesh.vertices)
+        return {
+            "environment": positive_light(6),
+            "vertices": vertices,
+            **uniform,
+        }
+
+    def total(self, values: dict[str, Tensor]) -> Tensor:
+        """Return the weighted sum of the radiance at fixed visibility."""
+        view = ShadedView(
+            self.mesh,
+            self.view,
+            self.settings,
+            values["vertices"],
+            values["albedo"],
+            SplitLight(values["environment"], [(self.LAMP, values["lamp"])]),
+            self.rays,
+            gloss=Gloss(values["roughness"], values["metallic"], values["specular_factor"]),
+        )
+        return (view.radiance() * self.upstream).sum()
+
+
+@pytest.mark.parametrize("normals", ["smooth", "flat"])
+@pytest.mark.parametrize("camera", [CAMERA, NEARBY], ids=["orthographic", "perspective"])
+def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
+    """Each parameter is moved along a random direction.
+
+    The rounding error of the differences of total radiances is about 3e-14.
+    """
+    view = GlossyView(normals, camera)
+    start = view.start()
+    variables = {name: value.clone().requires_grad_() for name, value in start.items()}
+    gradients = torch.autograd.grad(view.total(variables), list(variables.values()))
+    for seed, (name, gradient) in enumerate(zip(start, gradients, strict=True)):
+        direction = draw(*gradient.shape, seed=seed)
+        step = 2e-6 * direction / direction.abs().max()
+        above = view.total({**start, name: start[name] + step})
+        below = view.total({**start, name: start[name] - step})
+        expected = float(above - below) / 2
+        found = float((gradient * step).sum())
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-13), name
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}],
+    ids=str,
+)
+def test_an_operator_gives_the_images_of_render(options):
+    mesh = normalize(solid("cup"))
+    light = positive_light(6).float()
+    face_count = len(mesh.faces)
+    roughness = MIN_ROUGHNESS + 0.8 * draw_uniform(face_count).float()
+    gloss = Gloss(roughness, 0.3, draw_uniform(face_count, seed=1).float())
+    cameras = [CAMERA, NEARBY]
+    images = render(mesh, cameras, light, 12, gloss=gloss, **options)
+    operators = precompute_transfer(gloss.on(mesh), cameras, 12, **options)
+    found = torch.stack([operator.image(light) for operator in operators])
+    torch.testing.assert_close(found, images, rtol=0, atol=2e-6)
+
+
+def test_a_roughness_below_the_minimum_is_raised_to_it_with_a_warning():
+    mesh = solid("pear")
+    light = positive_light(6)
+    with pytest.warns(UserWarning):
+        mirror = render(mesh, CAMERA, light, 8, gloss=Gloss(0.0))
+    assert torch.equal(mirror, render(mesh, CAMERA, light, 8, gloss=Gloss(MIN_ROUGHNESS)))
+
+
+@pytest.mark.parametrize(
+    ("gloss", "argument"),
+    [
+        (Gloss(1.5), "roughness"),
+        (Gloss(math.nan), "roughness"),
+        (Gloss(0.5, -0.1), "metallic"),
+        (Gloss(0.5, specular_factor=torch.ones(3)), "specular_factor"),
+    ],
+)
+def test_gloss_out_of_range_is_refused(gloss, argument):
+    with pytest.raises(InputError, match=argument):
+        render(solid("pear"), CAMERA, positive_light(6), 8, gloss=gloss)
+
+
+def test_the_parts_of_a_joined_mesh_keep_their_gloss():
+    """A mesh without gloss is rough, without metal and without a specular layer."""
+    pear = Gloss(0.3).on(solid("pear"))
+    gloss = concatenate([pear, solid("table")]).gloss
+    pear_gloss, table_gloss = np.split(gloss, [len(pear.faces)])
+    expected_gloss = np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1))
+    np.testing.assert_array_equal(pear_gloss, expected_gloss)
+    np.testing.assert_array_equal(table_gloss, np.tile([1, 0, 0], (len(table_gloss), 1)))
+
+
+def test_a_subdivided_face_keeps_its_gloss():
+    mesh = solid("pear")
+    face_count = len(mesh.faces)
+    glossy = Gloss(torch.linspace(0.3, 1, face_count)).on(mesh)
+    finer = subdivide(glossy, len(mesh.vertices))
+    np.testing.assert_array_equal(finer.gloss, glossy.gloss.repeat(4, axis=0))
+
+
+def test_a_matte_part_of_a_glossy_mesh_is_rendered_as_a_matte_mesh():
+    light = positive_light(6)
+    mesh = concatenate([solid("pear"), solid("table")])
+    matte = np.tile(np.float32([1, 0, 0]), (len(mesh.faces), 1))
+    found = render(replace(mesh, gloss=matte), CAMERA, light, 16)
+    torch.testing.assert_close(found, render(mesh, CAMERA, light, 16), rtol=0, atol=1e-12)

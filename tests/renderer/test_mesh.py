@@ -1,0 +1,256 @@
+"""Meshes: areas, closedness, normalization and subdivision, against closed forms and trimesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
+from oracles import corners_of, mesh_of
+
+from renderer.errors import InputError
+from renderer.mesh import (
+    Mesh,
+    concatenate,
+    normalize,
+    refine,
+    subdivide,
+)
+from renderer.solids import solid
+
+EPS32 = np.finfo(np.float32).eps
+
+
+def test_the_normals_of_a_box_point_outward_and_its_areas_are_right():
+    half_sides = [0.5, 1, 1.5]
+    mesh = mesh_of(trimesh.creation.box((1, 2, 3)))
+    centers = corners_of(mesh).mean(axis=1) / half_sides
+    # Only the coordinate across a face is at a side of the box.
+    outward = np.where(np.abs(centers) > 0.9, np.sign(centers), 0)
+    assert_array_equal(mesh.face_normals(), outward)
+    assert_array_equal(np.sort(mesh.face_areas()), np.repeat([1, 1.5, 3], 4))
+
+
+def test_faces_without_area_have_a_zero_normal():
+    mesh = Mesh.plain([[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2], [0, 0, 1], [1, 1, 1]])
+    assert_array_equal(mesh.face_normals(), np.zeros((3, 3)))
+    assert_array_equal(mesh.face_areas(), np.zeros(3))
+
+
+BOX = trimesh.creation.box()
+BOX_MESH = mesh_of(BOX)
+INSIDE_OUT = Mesh.plain(BOX.vertices, BOX.faces[:, ::-1])
+
+
+def moved_box(offset: float, scale: float = 1.0, faces: np.ndarray = BOX.faces) -> Mesh:
+    """Return the box, scaled about its center and moved along the diagonal."""
+    return Mesh.plain(scale * BOX.vertices + offset, faces)
+
+
+def weld(mesh: Mesh) -> Mesh:
+    """Merge vertices at the same position."""
+    vertices, ids = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return Mesh.plain(vertices, ids.reshape(-1)[mesh.faces])
+
+
+def with_faces(*faces: np.ndarray) -> Mesh:
+    """Return the vertices of the box with other faces."""
+    return Mesh.plain(BOX.vertices, np.concatenate(faces))
+
+
+# A quarter of the box, moved by 5/8, touches the large one with a corner.
+TOUCHING = moved_box(5 / 8, 1 / 4)
+TOUCHING_INSIDE_OUT = moved_box(5 / 8, 1 / 4, INSIDE_OUT.faces)
+CLOSED_MESHES = {
+    "box": BOX_MESH,
+    "two boxes": concatenate([BOX_MESH, moved_box(3, 1 / 4)]),
+    "overlapping boxes": concatenate([BOX_MESH, moved_box(0.5)]),
+    "boxes with a common corner": weld(concatenate([BOX_MESH, TOUCHING])),
+}
+OPEN_MESHES = {
+    "inside out": INSIDE_OUT,
+    "mirrored": Mesh.plain(-BOX.vertices, BOX.faces),
+    "a missing face": with_faces(BOX.faces[1:]),
+    "a reversed face": with_faces(BOX.faces[:1, ::-1], BOX.faces[1:]),
+    "every face twice": with_faces(BOX.faces, BOX.faces),
+    "a face without area": with_faces(BOX.faces, [[0, 0, 1]]),
+    "a sheet with two sides": with_faces([[0, 1, 2], [0, 2, 1]]),
+    "one of two boxes inside out": concatenate([BOX_MESH, moved_box(3, 1 / 4, INSIDE_OUT.faces)]),
+    "a hollow box": concatenate([BOX_MESH, moved_box(0, 1 / 4, INSIDE_OUT.faces)]),
+    "a touching box inside out": weld(concatenate([BOX_MESH, TOUCHING_INSIDE_OUT])),
+}
+
+
+@pytest.mark.parametrize("name", CLOSED_MESHES)
+def test_a_mesh_is_closed_if_none_of_its_faces_is_visible_from_behind(name):
+    assert CLOSED_MESHES[name].closed is True
+
+
+@pytest.mark.parametrize("name", OPEN_MESHES)
+def test_a_mesh_is_open_if_a_face_may_be_visible_from_behind(name):
+    assert OPEN_MESHES[name].closed is False
+
+
+def test_a_normalized_mesh_is_centered_at_its_centroid_and_fits_the_unit_cube():
+    """The tolerance is half of float32's spacing below 1.
+
+    The centroid of trimesh is also the mean of the faces, weighted by area.
+    """
+    cone = trimesh.creation.cone(radius=0.3, height=2)
+    cone.apply_translation([7, -3, 11])
+    mesh = normalize(mesh_of(cone))
+    centered = cone.vertices - cone.centroid
+    assert_allclose(mesh.vertices, centered / np.abs(centered).max(), atol=2**-25)
+    assert np.abs(mesh.vertices).max() == 1
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert_allclose(shape.centroid, 0, atol=2**-25)
+
+
+def test_the_vertices_of_a_normalized_mesh_are_exact_in_float32():
+    mesh = normalize(mesh_of(trimesh.creation.cone(radius=0.3, height=2)))
+    assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
+
+
+@pytest.mark.parametrize("faces", [[[0, 1, 9]], [[0, 1, -1]], np.zeros((0, 3))])
+def test_missing_faces_and_faces_of_missing_vertices_are_refused(faces):
+    with pytest.raises(InputError, match="faces"):
+        Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], faces)
+
+
+def test_a_surface_of_zero_area_cannot_be_normalized():
+    with pytest.raises(InputError):
+        normalize(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))
+
+
+def height_field(cells: int = 3) -> Mesh:
+    """Create a rough surface over [-1, 1]² with colors and texture coordinates that have seams.
+
+    Args:
+        cells: Number of cells per side. Each cell has two faces.
+    """
+    rng = np.random.default_rng(0)
+    ticks = np.linspace(-1, 1, cells + 1)
+    x, y = np.meshgrid(ticks, ticks, indexing="ij")
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a = index[:-1, :-1].ravel()
+    b = index[1:, :-1].ravel()
+    c = index[1:, 1:].ravel()
+    d = index[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    heights = rng.uniform(-0.3, 0.3, x.size)
+    small_texture = rng.integers(0, 256, (4, 4, 3), dtype=np.uint8)
+    large_texture = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
+    return replace(
+        Mesh.plain(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces),
+        corner_colors=rng.random((len(faces), 3, 3), dtype=np.float32),
+        corner_uvs=rng.random((len(faces), 3, 2), dtype=np.float32),
+        texture_ids=rng.integers(-1, 2, len(faces)).astype(np.int32),
+        textures=(small_texture, large_texture),
+    )
+
+
+SHEET = height_field()
+MESHES = {
+    "box": BOX_MESH,
+    "cup": solid("cup"),
+    "two that touch": concatenate([BOX_MESH, mesh_of(trimesh.creation.icosphere(1))]),
+    "open": SHEET,
+}
+every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+
+
+@pytest.mark.parametrize(("min_count", "expected_count"), [(0, 12), (11, 12), (12, 42), (42, 162)])
+def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(
+    min_count,
+    expected_count,
+):
+    mesh = subdivide(mesh_of(trimesh.creation.icosahedron()), min_count)
+    assert len(mesh.vertices) == expected_count
+    # Euler's formula for a closed surface of triangles.
+    assert len(mesh.faces) == 2 * expected_count - 4
+
+
+@every_mesh
+def test_a_subdivided_mesh_keeps_its_vertices(mesh):
+    finer = subdivide(mesh, len(mesh.vertices))
+    assert_array_equal(finer.vertices[: len(mesh.vertices)], mesh.vertices)
+
+
+@every_mesh
+def test_a_subdivided_face_has_its_corners_and_the_centers_of_its_edges(mesh):
+    finer = subdivide(mesh, len(mesh.vertices))
+    a, b, c = corners_of(mesh).swapaxes(0, 1)
+    ab = (a + b) / 2
+    bc = (b + c) / 2
+    ca = (c + a) / 2
+    quarters = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+    expected = quarters.transpose(2, 0, 1, 3)
+    assert_array_equal(corners_of(finer).reshape(-1, 4, 3, 3), expected)
+
+
+@every_mesh
+def test_subdivision_keeps_the_topology(mesh):
+    finer = subdivide(mesh, len(mesh.vertices))
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    finer_shape = trimesh.Trimesh(finer.vertices, finer.faces, process=False)
+    assert finer_shape.euler_number == shape.euler_number
+    assert finer.closed is mesh.closed
+
+
+def linear_values(mesh: Mesh) -> np.ndarray:
+    """Evaluate five functions, linear on each face of SHEET, at the corners of a subdivision."""
+    slopes = np.random.default_rng(1).uniform(-0.2, 0.2, (len(SHEET.faces), 3, 5))
+    parts_per_face = len(mesh.faces) // len(SHEET.faces)
+    return 0.5 + corners_of(mesh) @ slopes.repeat(parts_per_face, axis=0)
+
+
+def test_colors_and_texture_coordinates_are_linear_on_the_original_faces():
+    """Values are rounded to float32 at each of two subdivisions."""
+    values = linear_values(SHEET).astype(np.float32)
+    mesh = replace(SHEET, corner_colors=values[..., :3], corner_uvs=values[..., 3:])
+    finer = subdivide(mesh, 150)
+    assert len(finer.faces) == 16 * len(SHEET.faces)
+    found = np.concatenate([finer.corner_colors, finer.corner_uvs], axis=-1)
+    assert_allclose(found, linear_values(finer), rtol=0, atol=2 * EPS32)
+
+
+def test_subdivided_faces_keep_their_textures():
+    finer = subdivide(SHEET, 150)
+    assert_array_equal(finer.texture_ids, SHEET.texture_ids.repeat(16))
+    assert finer.textures is SHEET.textures
+
+
+# One face of area 8 in the plane z = 0, and one of area 2.
+CORNER = Mesh.plain(
+    [[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]],
+    [[0, 1, 2], [0, 3, 1]],
+    np.eye(4)[:, :3],
+)
+
+
+def flat_faces(mesh: Mesh) -> np.ndarray:
+    """Return a mask (F,) of the faces in the plane z = 0."""
+    return (corners_of(mesh)[..., 2] == 0).all(axis=1)
+
+
+def test_a_face_is_refined_as_often_as_its_area_needs():
+    finer = refine(CORNER, 0.6)
+    is_flat = flat_faces(finer)
+    assert_allclose(finer.face_areas()[is_flat], [0.5] * 16)
+    assert_allclose(finer.face_areas()[~is_flat], [0.5] * 4)
+    assert_array_equal(refine(CORNER, 8.0).faces, CORNER.faces)
+
+
+def test_refined_faces_keep_the_orientation_and_the_vertices():
+    finer = refine(CORNER, 0.6)
+    assert_array_equal(finer.vertices[:4], CORNER.vertices)
+    normals = finer.face_normals()[flat_faces(finer)]
+    assert_array_equal(normals, np.tile([0, 0, 1], (16, 1)))
+
+
+def test_refined_faces_interpolate_the_colors():
+    finer = refine(CORNER, 0.6)
+    is_flat = flat_faces(finer)
+    x, y, _ = corners_of(finer)[is_flat].reshape(-1, 3).T / 4
+    colors = finer.corner_colors[is_flat].reshape(-1, 3)
+    assert_allclose(colors, np.stack([1 - x - y, x, y], axis=1), atol=1e-7)

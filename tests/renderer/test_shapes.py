@@ -1,0 +1,87 @@
+"""Procedural solids: closed shells of faces that point outward."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from renderer.mesh import Mesh
+from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
+
+ALL = SOLIDS | HARD_NEGATIVES
+# The handle of a cup is a second shell.
+SHELL_COUNTS = dict.fromkeys(ALL, 1) | {"cup": 2}
+SEEDS = range(2)
+# The volume of a tetrahedron is a sixth of the determinant of its edges.
+TETRAHEDRON = 1 / 6
+# Euler characteristic of a surface without holes or handles.
+SPHERE = 2
+
+
+def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Add up the signed tetrahedra between the origin and each face (divergence theorem)."""
+    return np.linalg.det(vertices[faces]).sum() * TETRAHEDRON
+
+
+def shells(mesh: Mesh) -> list[np.ndarray]:
+    """Return the faces (F, 3) of each connected component."""
+    a, b, c = mesh.faces.T
+    rows = np.concatenate([a, b])
+    columns = np.concatenate([b, c])
+    vertex_count = len(mesh.vertices)
+    links = coo_array(
+        (np.ones(len(rows)), (rows, columns)),
+        shape=(vertex_count, vertex_count),
+    )
+    count, shell_of_vertex = connected_components(links, directed=False)
+    return [mesh.faces[shell_of_vertex[a] == shell] for shell in range(count)]
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_solid_is_closed(name, seed):
+    """Each directed edge occurs once, and its reverse, too."""
+    mesh = solid(name, seed)
+    edges = Counter((face[i], face[(i + 1) % 3]) for face in mesh.faces.tolist() for i in range(3))
+    assert set(edges.values()) == {1}
+    assert all((end, start) in edges for start, end in edges)
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_each_shell_of_a_solid_is_a_topological_sphere_with_faces_outward(name, seed):
+    mesh = solid(name, seed)
+    parts = shells(mesh)
+    assert len(parts) == SHELL_COUNTS[name]
+    for faces in parts:
+        vertex_count = len(np.unique(faces))
+        edge_count = 3 * len(faces) / 2
+        assert vertex_count - edge_count + len(faces) == SPHERE
+        assert enclosed_volume(mesh.vertices, faces) > 1e-3
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_solid_has_no_empty_faces_or_unused_vertices_and_fills_the_unit_box(name, seed):
+    mesh = solid(name, seed)
+    assert mesh.face_areas().min() > 1e-6
+    np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
+    assert 0.8 < np.abs(mesh.vertices).max() < 1.05
+    assert mesh.corner_colors.min() >= 0
+    assert mesh.corner_colors.max() <= 1
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_seed_picks_one_instance(name):
+    first = solid(name, 1)
+    again = solid(name, 1)
+    other = solid(name, 2)
+    np.testing.assert_array_equal(first.vertices, again.vertices)
+    np.testing.assert_array_equal(first.faces, again.faces)
+    np.testing.assert_array_equal(first.corner_colors, again.corner_colors)
+    assert not np.array_equal(first.corner_colors, other.corner_colors)
+    # All balls have one shape.
+    if name != "ball":
+        assert not np.array_equal(first.vertices, other.vertices)
