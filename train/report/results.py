@@ -114,8 +114,8 @@ def _is_of_training(folder: Path) -> bool:
     return False
 
 
-def remove_run(folder: Path) -> None:
-    """Remove the results of a training run and of its first training and baselines.
+def remove_run(folder: Path, *, with_others: bool = True) -> None:
+    """Remove the results of a training run, and those of its first training and baselines.
 
     The metrics go first, without which no run counts as finished, and config.yaml goes last. If
     the removal is stopped, what is left belongs to the run that config.yaml describes. The log
@@ -123,6 +123,7 @@ def remove_run(folder: Path) -> None:
 
     Args:
         folder: Folder of the run.
+        with_others: False keeps the first training and the baselines, which may be resumed.
     """
     files = [folder / name for name in (*OF_RUN, FAILURE, PAGE)]
     files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
@@ -132,7 +133,7 @@ def remove_run(folder: Path) -> None:
         shutil.rmtree(folder / name, ignore_errors=True)
     with suppress(InputError):
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
-            if (folder / name / CONFIG).is_file():
+            if with_others and (folder / name / CONFIG).is_file():
                 remove_run(folder / name)
     (folder / CONFIG).unlink(missing_ok=True)
 

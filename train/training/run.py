@@ -169,7 +169,7 @@ class Run:
         # Without `overwrite`, a configuration is that of a run without a checkpoint.
         is_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
         if is_left and not self._is_resumed:
-            remove_run(self.folder)
+            remove_run(self.folder, with_others=not self.settings.train.resume)
         self._write_config()
 
     def fit(self) -> None:

@@ -95,6 +95,7 @@ class TestAClassifierThatKnowsOrangesBeforeLightGrayAlone:
 
         return Classifier(is_light, 8, ("orange", "other"))
 
+    @pytest.mark.filterwarnings("ignore:the first gradient")  # it sees the background alone
     def test_is_attacked_in_a_scene_that_is_searched_for(self, classifier):
         settings = configured()
         ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))

@@ -281,13 +281,15 @@ def photographed_cup(here) -> Path:
     ("arguments", "message"),
     [
         (["mask=small.png"], "mask=small.png has 9 × 9 pixels"),
-        (["mask=black.png"], "no white pixels"),
-        (["mask=none.png"], "none.png cannot be read"),
+        (["mask=black.png"], "all of its pixels have the value 0"),
+        (["mask=none.png"], "none.png does not exist"),
         ([], "mask=FILE or box="),
     ],
 )
 def test_a_fit_without_a_usable_mask_is_refused(call, photographed_cup, capsys, arguments, message):
-    Image.new("L", (9, 9), 255).save(photographed_cup / "small.png")
+    half = np.zeros((9, 9), np.uint8)
+    half[:5] = 255
+    Image.fromarray(half).save(photographed_cup / "small.png")
     Image.new("L", (192, 192)).save(photographed_cup / "black.png")
     assert call(*FIT, *arguments) == USER_ERROR
     assert message in capsys.readouterr().err
