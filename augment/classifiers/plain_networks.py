@@ -153,8 +153,8 @@ def as_classifier(
             evaluation mode, or a function of tensors or of NumPy arrays. If it
             is a `Classifier`, only `normalize_light` is applied.
         size: Pixels per side of the images. None for the size that a network of
-            torchvision or timm tells or, if it tells none, for 224. It is
-            then logged, and so is an assumed normalization.
+            torchvision or timm tells or, if it tells none, for 224. The size
+            is then logged, and so is what is assumed.
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
         normalization: "imagenet", or mean and standard deviation of the
@@ -206,14 +206,16 @@ def as_classifier(
         name = network.__name__
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
     require_evaluation_mode(network, argument)
-    known_size = own_size(network) if size is None else size
+    known_size = own_size(network)
     device = device_of(network) if device is None else as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
     if size is None:
         assumed = assumed_facts(known_size, normalization_of(function) or None)
-        say_inputs(name, function, known_size or USUAL_SIZE, assumed)
-    size = known_size or USUAL_SIZE
+        # timm records the size of the published weights, which need not be those of the network.
+        published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
+        size = known_size or published[-1]
+        say_inputs(name, function, size, assumed)
     count = _count_outputs(function, size, device, dtype, argument)
     if names is not None and len(names) != count:
         raise InputError(

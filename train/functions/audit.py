@@ -65,7 +65,7 @@ def audit(
             beside `network`. None to audit one network.
         classes: Names of the classes of plain networks, in the order of their
             outputs. None for "0", "1" and so on.
-        size: Pixels per side of the images of plain networks. None for 224.
+        size: Pixels per side of the images of plain networks. None for its own, or 224.
         normalization: "imagenet", or mean and standard deviation, as `attack`
             takes it.
         value_range: Values of black and white that plain networks take before

@@ -92,7 +92,7 @@ def harden(
             confuse with the class. None for generated fruit.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
-        size: Pixels per side of the images of a plain network. None for 224.
+        size: Pixels per side of the images of a plain network. None for its own, or 224.
         normalization: "imagenet", or mean and standard deviation, as `attack`
             takes it.
         value_range: Values of black and white that a plain network takes before

@@ -149,3 +149,13 @@ def test_a_transformer_in_memory_tells_its_size(said):
     (line,) = said()
     assert "64 × 64" in line
     assert "assumed" not in line
+
+
+def test_a_network_of_timm_in_memory_has_the_size_of_its_configuration(said):
+    timm = pytest.importorskip("timm")
+    network = timm.create_model("test_efficientnet", num_classes=3).eval()
+    assert network.pretrained_cfg["input_size"] == (3, 160, 160)
+    assert as_classifier(network).size == 160
+    (line,) = said()
+    assert "160 × 160" in line
+    assert ASSUMED in line
