@@ -2,6 +2,7 @@
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -16,38 +17,14 @@ def rank() -> int:
 
 
 def shard(total: int, rank: int, world_size: int) -> Tensor:
-    """Select the examples that one of several processes works on.
-
-    Args:
-        total: Number of examples, at least 1.
-        rank: Index of the process, counted from 0.
-        world_size: Number of processes.
-
-    Returns:
-        Indices of every `world_size`-th example, int64. If there are more
-        processes than examples, several processes get the same example.
-
-    Example:
-        >>> shard(5, rank=1, world_size=2)
-        tensor([1, 3])
-    """
+    """Select the examples that one of several processes works on."""
     return torch.arange(rank % total, total, world_size)
 
 
-def all_gather_rows(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tensor:
-    """Collect the results for all examples from all processes.
-
-    Args:
-        part: Results of this process, one row for each of A examples, shape
-            (A, ...).
-        examples: Index of each of these A examples, shape (A,), int64.
-        total: Number of examples of all processes.
-        world_size: Number of processes.
-
-    Returns:
-        One row for each example, shape (total, ...). Every process gets the
-        same rows.
-    """
+def all_gather_rows(
+    part: Float[Tensor, "A ..."], examples: Int[Tensor, " A"], total: int, world_size: int
+) -> Float[Tensor, "total ..."]:
+    """Collect the results for all examples from all processes."""
     if world_size == 1:
         return part
     # Make a list with an entry for each process. `all_gather_object` replaces entry i by what

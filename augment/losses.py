@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderer.errors import require_range
@@ -21,25 +22,16 @@ NO_CLASS = -(10**9)
 OVERCONFIDENT = 50.0
 
 
-def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
+def adversarial_cost(
+    logits: Float[Tensor, "N classes"],
+    source: Int[Tensor, " N"],
+    target: Int[Tensor, " N"] | None = None,
+) -> Float[Tensor, " N"]:
     """Compute the cost that an attack decreases.
 
     It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy. Without a target,
     the cost and its gradient round to 0 if the log-odds o of the source are large. Where they
     exceed 50, o − 50 is therefore added.
-
-    Args:
-        logits: Logits of N images, shape (N, classes).
-        source: Class whose probability the attack lowers in each image, int64, shape (N,).
-            NO_CLASS omits the first term.
-        target: Class whose probability the attack raises in each image, int64, shape (N,).
-            NO_CLASS omits the second term of an image. None omits it for all images.
-
-    Returns:
-        The cost of each image, shape (N,).
-
-    Raises:
-        InputError: If a source class has no logit.
     """
     # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
     require_known(source.clamp(min=0), logits)
@@ -65,34 +57,22 @@ def _log_odds(logits: Tensor, classes: Tensor) -> Tensor:
     return logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
 
 
-def is_overconfident(logits: Tensor) -> Tensor:
-    """Return a mask of the images with a class of log-odds above 50 or below −50.
-
-    Args:
-        logits: Logits of images in any number of dimensions, shape (..., classes).
-
-    Returns:
-        Mask, shape (...).
-    """
+def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ..."]:
+    """Return a mask of the images with a class of log-odds above 50 or below −50."""
     lowest, highest = logits.aminmax(dim=-1)
     return highest - lowest > OVERCONFIDENT
 
 
-def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
+def logit_gap(
+    logits: Float[Tensor, "... classes"],
+    source: Float[Tensor, " ..."],
+    target: Float[Tensor, " ..."] | None = None,
+) -> Float[Tensor, " ..."]:
     """Compute by how much logits reach the aim of an attack.
 
     With a target class, the logit gap is the logit of the target minus the largest other logit.
     Without one, it is the largest logit of the other classes minus the logit of the source class.
     It is positive if the attack succeeds, and negative if it does not.
-
-    Args:
-        logits: Logits of images in any number of dimensions, shape (..., classes).
-        source: Source class of each image, shape (...).
-        target: Target class of each image, shape (...). NO_CLASS stands for no target of an
-            image, and None for no target of all images.
-
-    Returns:
-        Logit gap of each image, shape (...).
     """
     if target is None:
         target = torch.full_like(source, NO_CLASS)
@@ -106,50 +86,26 @@ def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> T
 
 
 def complementary_label(label: int) -> int:
-    """Return the complementary label of a class.
-
-    Args:
-        label: Class that images with the complementary label do not show.
-
-    Returns:
-        The complementary label, −1 − label.
-    """
+    """Return the complementary label of a class."""
     return -1 - label
 
 
-def require_known(labels: Tensor, logits: Tensor) -> None:
-    """Check that every label has a logit.
-
-    Args:
-        labels: Labels, also complementary ones, int64, shape (N,).
-        logits: Logits, shape (N, classes).
-
-    Raises:
-        InputError: If the class of a label is not below the number of classes.
-    """
+def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "N classes"]) -> None:
+    """Check that every label has a logit."""
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
 
 def label_loss(
-    logits: Tensor,
-    labels: Tensor,
+    logits: Float[Tensor, "N classes"],
+    labels: Int[Tensor, " N"],
     label_smoothing: float = 0.0,
     absent: Sequence[int] = (),
-) -> Tensor:
+) -> Float[Tensor, " N"]:
     """Compute the loss of each image by its label.
 
     An image of class c has the label c. Its loss is the cross entropy. An image that does not
     show class c has the complementary label −1 − c. Its loss is −log(1 − p), where p is the sum
     of the probabilities of c and of the classes `absent`.
-
-    Args:
-        logits: Logits, shape (N, classes).
-        labels: Labels, int64, shape (N,).
-        label_smoothing: Label smoothing of the cross entropy, at least 0 and below 1.
-        absent: Further classes that images with a complementary label do not show.
-
-    Returns:
-        Losses, shape (N,).
     """
     classes = _class_of(labels)
     # Set the logits of the classes that are not shown to -∞. Only the logits of the other
@@ -165,36 +121,23 @@ def label_loss(
     return torch.where(labels < 0, complementary, cross_entropy)
 
 
-def log_odds(logits: Tensor, label: int) -> Tensor:
+def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " N"]:
     """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
 
     The result is finite even if p rounds to 0 or 1.
-
-    Args:
-        logits: The logits, shape (N, classes).
-        label: The class.
-
-    Returns:
-        The log-odds, shape (N,).
     """
     others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
     return logits[:, label] - others.logsumexp(dim=1)
 
 
-def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
+def ranking_loss(
+    logits: Float[Tensor, "N classes"], labels: Int[Tensor, " N"], label: int
+) -> Tensor:
     """Compute the pairwise ranking loss of a class (RankNet, Burges et al. 2005).
 
     It is low if the images of the class have higher log-odds than all other images. It is the
     mean of log(1 + exp(n − p)) over all pairs of an image of the class, with log-odds p, and an
     image of another class, with log-odds n. Up to a factor, it is a smooth upper bound of 1 − AUC.
-
-    Args:
-        logits: Logits, shape (N, classes).
-        labels: Labels, int64, shape (N,).
-        label: The class that is to rank first.
-
-    Returns:
-        The loss, a scalar. It is 0 if there is no pair.
     """
     odds = log_odds(logits, label)
     is_of_class = labels == label
@@ -204,18 +147,13 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
     return losses.sum() / is_pair.sum().clamp(min=1)
 
 
-def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
+def kl_divergence(
+    logits: Float[Tensor, "N classes"], predictions: Float[Tensor, "N classes"]
+) -> Float[Tensor, " N"]:
     """Compute the distillation loss (Hinton et al. 2015) at temperature 1.
 
     It is the Kullback–Leibler divergence Σ q log(q / p), summed over the classes, where p are the
     probabilities of the student and q are those of the teacher.
-
-    Args:
-        logits: Logits of the student, the network that is trained, shape (N, classes).
-        predictions: Logits of the teacher, shape (N, classes).
-
-    Returns:
-        Divergence for each image, shape (N,).
     """
     student = logits.log_softmax(1)
     teacher = predictions.log_softmax(1)
@@ -223,20 +161,14 @@ def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     return terms.sum(1)
 
 
-def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
+def is_correct(
+    predicted: Int[Tensor, " N"], labels: Int[Tensor, " N"], absent: Sequence[int] = ()
+) -> Bool[Tensor, " N"]:
     """Return a mask of the predictions that agree with the labels.
 
     A label that is a class demands the prediction of this class. The complementary label
     −1 − c says that the image does not show class c. It demands a prediction that is neither c
     nor one of the classes `absent`.
-
-    Args:
-        predicted: Predicted classes, int64, shape (N,).
-        labels: Labels, int64, shape (N,).
-        absent: Further classes that images with a complementary label do not show.
-
-    Returns:
-        Mask of the correct predictions, bool, shape (N,).
     """
     is_complementary = labels < 0
     is_class_of_label = predicted == _class_of(labels)

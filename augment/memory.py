@@ -28,15 +28,6 @@ def attack_bytes(
     """Estimate the memory that an attack on the light of a scene takes.
 
     The linear operators from light to image are not counted.
-
-    Args:
-        pixels: Number of pixels of all images.
-        pixels_at_once: Number of pixels of the images that are rendered at the same time.
-        lights: RGB coefficients of the light of each of E examples, shape (E, coefficients, 3).
-        camera_effects: Whether effects of a camera, such as blur and noise, are rendered.
-
-    Returns:
-        The number of bytes.
     """
     per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
     if camera_effects:
@@ -48,14 +39,6 @@ def attack_bytes(
 
 
 def operator_bytes(degree: int, pixels: int) -> int:
-    """Estimate the memory of the linear operators that map light to images.
-
-    Args:
-        degree: Degree of the spherical harmonics of the light.
-        pixels: Number of pixels of all images.
-
-    Returns:
-        The number of bytes.
-    """
+    """Estimate the memory of the linear operators that map light to images."""
     coefficient_count = (degree + 1) ** 2
     return OPERATOR_BYTES * coefficient_count * pixels

@@ -26,24 +26,7 @@ class BatchSize:
     images: int
 
     def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
-        """Call a function for one batch of images after the other.
-
-        Args:
-            compute: A function of a slice, which selects the images of a batch.
-                If memory runs out, it is called again with half of the slice.
-            total: Number of all images.
-
-        Yields:
-            The result of each call, in order.
-
-        Raises:
-            Exception: Whatever `compute` raises, also if memory runs out on a
-                single image.
-
-        Example:
-            >>> list(BatchSize(2).map(lambda part: "abc"[part], 3))
-            ['ab', 'c']
-        """
+        """Call a function for one batch of images after the other."""
         begin = 0
         while begin < total:
             part = slice(begin, begin + self.images)
@@ -72,10 +55,8 @@ def warn_once(images: int) -> None:
 
 @contextmanager
 def eval_mode(model: nn.Module) -> Iterator[None]:
-    """Set a model to eval mode in a `with` block, and restore the mode of each module afterwards.
-
-    Args:
-        model: The model. Its modules may have different modes.
+    """Set a model to eval mode in a `with` block, and restore the mode of each module
+    afterwards.
     """
     training = [module for module in model.modules() if module.training]
     # `eval` of a large network takes as long as rendering an image, so call it only if needed.
@@ -94,9 +75,6 @@ def frozen_eval_mode(model: nn.Module) -> Iterator[None]:
 
     The mode of each module, `requires_grad` of each parameter and the state of
     the global random generators are restored after the block.
-
-    Args:
-        model: The model, such as a classifier that is attacked.
     """
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     gpus = {parameter.device for parameter in model.parameters() if parameter.is_cuda}

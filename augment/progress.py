@@ -29,15 +29,6 @@ def progress(
     no item is done by then, and is removed at the end. Nothing is written if the
     stream is a file or a pipe. If there are several processes, only the first
     one shows the bar.
-
-    Args:
-        items: The items.
-        description: What is done with the items, such as "saving".
-        total: Number of items. Needed only if `items` has no length.
-        done: Number of items that were done before.
-
-    Yields:
-        Each item.
     """
     is_shown = sys.stderr.isatty() and rank() == 0
     bar = tqdm(
@@ -68,11 +59,7 @@ def _show(bar: "tqdm[Item]") -> None:
 
 @contextmanager
 def progress_message(description: str) -> Iterator[None]:
-    """Show a progress bar with a description during a `with` block.
-
-    Args:
-        description: What the block does, such as "loading the network".
-    """
+    """Show a progress bar with a description during a `with` block."""
     for _ in progress([None], description):
         yield
 
@@ -83,13 +70,6 @@ class Phases:
     Args:
         device: Device of the computation. At the beginning and the end of a
             part, the timer waits until this device is idle.
-
-    Example:
-        >>> phases = Phases()
-        >>> with phases("attack"):
-        ...     pass
-        >>> [*phases.take()]
-        ['attack']
     """
 
     def __init__(self, device: torch.device | str = "cpu"):
@@ -98,11 +78,7 @@ class Phases:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Measure how long a `with` block takes, and add the seconds to those under a name.
-
-        Args:
-            name: Name of the part of the computation that the block is.
-        """
+        """Measure how long a `with` block takes, and add the seconds to those under a name."""
         start = self._now()
         try:
             yield

@@ -7,32 +7,12 @@ import torch
 
 
 def stream_seed(*key: int | str) -> int:
-    """Compute the seed of a sequence of random numbers from a key.
-
-    Args:
-        key: Numbers and names that tell what the random numbers are for, such as
-            the seed of a run, an epoch and "order". Different keys give
-            independent random numbers.
-
-    Returns:
-        A seed of 63 bits.
-
-    Example:
-        >>> stream_seed(0, 7, "order") == stream_seed(0, 7, "order")
-        True
-        >>> stream_seed(0, 7, "order") == stream_seed(0, 8, "order")
-        False
-    """
+    """Compute the seed of a sequence of random numbers from a key."""
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)
     return int(state[0] >> 1)
 
 
 def generator(*key: int | str) -> torch.Generator:
-    """Return a new CPU generator of random numbers, whose seed is computed from a key.
-
-    Args:
-        key: Numbers and names that tell what the random numbers are for, see
-            `stream_seed`.
-    """
+    """Return a new CPU generator of random numbers, whose seed is computed from a key."""
     return torch.Generator().manual_seed(stream_seed(*key))

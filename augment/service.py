@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
@@ -69,10 +70,10 @@ class AttackExamples:
         basis: Basis of the light.
     """
 
-    images: Tensor
-    lights: Tensor
-    predictions: Tensor
-    labels: Tensor
+    images: Float[Tensor, "2 S 3 H W"]
+    lights: Float[Tensor, "2 S _ 3"]
+    predictions: Float[Tensor, "2 S C"]
+    labels: Int[Tensor, " S"]
     basis: Basis = HARMONICS
 
     def __len__(self) -> int:
@@ -95,19 +96,10 @@ class Renders(Dataset[tuple[Tensor, int]]):
         diagnostics: Numbers about the attack, such as its success rate, by name.
         attack_examples: A few successfully attacked renders, before and after
             the attack. None if nothing is rendered.
-
-    Example:
-        >>> tensors = torch.utils.data.TensorDataset(torch.rand(2, 3, 8, 8), torch.tensor([0, 1]))
-        >>> data = [(image, int(label)) for image, label in tensors]
-        >>> renders = Renders(torch.rand(1, 3, 8, 8), torch.tensor([2]), {})
-        >>> both = torch.utils.data.ConcatDataset([data, renders])
-        >>> [(images, labels)] = torch.utils.data.DataLoader(both, batch_size=3)
-        >>> labels
-        tensor([0, 1, 2])
     """
 
-    images: Tensor
-    labels: Tensor
+    images: Float[Tensor, "E 3 H W"]
+    labels: Int[Tensor, " E"]
     diagnostics: Mapping[str, float]
     attack_examples: AttackExamples | None = None
 
@@ -193,15 +185,8 @@ class AugmentationService:
             if not attack.allow_negative:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 
-    def _checked_images(self, images: Tensor) -> Tensor:
-        """Convert images to a tensor, and check its dtype and shape.
-
-        Args:
-            images: Tensor or array, which must be uint8 of shape (E, 3, H, W) for E labels.
-
-        Raises:
-            InputError: If the images have another dtype or shape.
-        """
+    def _checked_images(self, images: UInt8[Tensor, "E 3 H W"]) -> Tensor:
+        """Convert images to a tensor, and check its dtype and shape."""
         if not isinstance(images, Tensor):
             images = torch.from_numpy(as_array("images", images))
         if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
@@ -382,19 +367,13 @@ class AugmentationService:
         digest = hashlib.sha256(repr(shown).encode()).digest()
         return torch.tensor(list(digest), dtype=torch.uint8)
 
-    def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
+    def _from_folder(
+        self, model: nn.Module, images: UInt8[Tensor, "F 3 H W"], number: int
+    ) -> Renders:
         """Select the next images of a folder in place of renders, and classify some of them.
 
         The images are shown in passes through the folder, each in another random order. A
         selection may begin in one pass and end in another.
-
-        Args:
-            model: The network.
-            images: All images of the folder, uint8, shape (F, 3, H, W).
-            number: How many selections were made before.
-
-        Returns:
-            The selected images.
         """
         image_count = len(images)
         # Imagine all passes one after the other. These are the positions of the first and the
@@ -417,18 +396,7 @@ class AugmentationService:
     def _random(
         self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
     ) -> Renders:
-        """Render all examples with random values of the parameters, such as random lighting.
-
-        Args:
-            model: The network, which classifies some of the images.
-            problem: The scene of E examples, and the parameters whose values are random.
-            number: How often the renders were made before, on which the random numbers depend.
-            shard: Indices of the examples that this process renders. The other processes
-                render the other examples.
-
-        Returns:
-            The images of all E examples.
-        """
+        """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
         images = self._gather(problem.images(values, shard)[:, 0], shard)
         is_error, diagnostics = self._classify(model, images, self.labels)
@@ -437,21 +405,9 @@ class AugmentationService:
         return Renders(images, self.labels, diagnostics, examples)
 
     def _classify(
-        self, model: nn.Module, images: Tensor, labels: Tensor
+        self, model: nn.Module, images: Float[Tensor, "E 3 H W"], labels: Float[Tensor, " E"]
     ) -> tuple[Tensor, dict[str, float]]:
-        """Classify up to `CLASSIFIED` of the images, evenly spaced, to estimate the error rate.
-
-        Args:
-            model: The network.
-            images: Images in [0, 1], shape (E, 3, H, W).
-            labels: Labels of the images, shape (E,).
-
-        Returns:
-            Two values:
-            - A mask of the images that are known to be misclassified, shape (E,).
-            - The diagnostics "attack_success", the fraction of the classified images that are
-              misclassified, and "loss", their mean loss.
-        """
+        """Classify up to `CLASSIFIED` of the images, evenly spaced, to estimate the error rate."""
         count = min(CLASSIFIED, len(labels))
         rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
         with frozen_eval_mode(model), self.phases("attack_classifier"):
@@ -468,18 +424,7 @@ class AugmentationService:
     def _adversarial(
         self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
     ) -> Renders:
-        """Attack all examples.
-
-        Args:
-            model: The network to attack.
-            problem: The scene of E examples, and the parameters that the attack changes.
-            number: How often the renders were made before, on which the random numbers depend.
-            shard: Indices of the examples that this process attacks. The other processes
-                attack the other examples.
-
-        Returns:
-            The attacked images of all E examples.
-        """
+        """Attack all examples."""
         attack = self.settings.attack
         criterion = self._attack_criterion().select(shard)
         attacked_model = preprocessed_model(attack, model)
@@ -534,16 +479,10 @@ class AugmentationService:
         )
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
-    def _gather(self, part: Tensor, shard: Tensor) -> Tensor:
-        """Collect what all processes have computed, each for some of the E examples.
-
-        Args:
-            part: Results of this process, one row for each of its A examples, shape (A, ...).
-            shard: Index of each of these A examples among all E, shape (A,).
-
-        Returns:
-            One row for each of the E examples, shape (E, ...).
-        """
+    def _gather(
+        self, part: Float[Tensor, "A ..."], shard: Int[Tensor, " A"]
+    ) -> Float[Tensor, "E ..."]:
+        """Collect what all processes have computed, each for some of the E examples."""
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
@@ -565,19 +504,12 @@ class AugmentationService:
         target = torch.where(is_positive, NO_CLASS, target_in_turn)
         return Criterion(source[:, None], target[:, None])
 
-    def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
+    def _attack_start(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
         """Return the attack values at which the next attack starts.
 
         With `warm_start`, they are the values at which the previous attack ended, projected to
         the norm-balls, whose centers may have moved. With `init="random"`, they are random.
         Otherwise they are those of the scene.
-
-        Args:
-            problem: The scene of E examples, and the attacked parameters.
-            number: How often the renders were made before, on which the random numbers depend.
-
-        Returns:
-            D values of each example, shape (E, D).
         """
         if self._last_values is not None:
             return problem.project(self._last_values, problem.all_examples)
@@ -585,16 +517,8 @@ class AugmentationService:
             return self._random_values(problem, number)
         return problem.start
 
-    def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        """Draw random values of all attacked parameters.
-
-        Args:
-            problem: The scene of E examples, and the attacked parameters.
-            number: How often the renders were made before. It selects the random numbers.
-
-        Returns:
-            D feasible values of each example in the norm-balls, shape (E, D).
-        """
+    def _random_values(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
+        """Draw random values of all attacked parameters."""
         settings = self.settings.random_light
         parts = []
         for parameter, start in problem.split_by_parameter(problem.start):
@@ -647,47 +571,27 @@ class CheckedNetwork(nn.Module):
     """
 
     def __init__(self, model: nn.Module):
-        """Wrap a network.
-
-        Args:
-            model: The network, from images to logits.
-        """
+        """Wrap a network."""
         super().__init__()
         self.model = model
         self._call_network = NetworkCall("model")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of images, shape (N, 3, H, W).
-
-        Raises:
-            InputError: If the network fails, or if its outputs cannot be logits.
-        """
+        """Return the logits of images, shape (N, 3, H, W)."""
         return self._call_network(self.model, images)
 
 
 def select_examples_to_log(
     model: nn.Module,
     problem: AttackProblem,
-    values: Tensor,
-    success: Tensor,
-    labels: Tensor,
+    values: Float[Tensor, "E D"],
+    success: Bool[Tensor, " E"],
+    labels: Float[Tensor, " E"],
 ) -> AttackExamples:
     """Select a few successfully attacked examples for a figure, and render and classify them.
 
     At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful
     examples.
-
-    Args:
-        model: The network. Its state is restored afterwards.
-        problem: The scene of E examples with one view each, and the attacked
-            parameters.
-        values: D attack values of each example after the attack, shape (E, D).
-        success: Whether the attack on each example succeeded, shape (E,), bool.
-        labels: Label of each example, shape (E,).
-
-    Returns:
-        Images, lights and predictions of the selected examples, before and
-        after the attack.
     """
     successful = torch.nonzero(success).squeeze(1)
     count = min(SHOWN_EXAMPLES, len(successful))
@@ -715,17 +619,8 @@ def select_examples_to_log(
     )
 
 
-def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """Compute by how much an attack changed the light, the vertices and other conditions.
-
-    Args:
-        problem: The scene of E examples, and the attacked parameters.
-        values: D attack values of each example after the attack, shape (E, D).
-
-    Returns:
-        Diagnostics such as "light_change": the L2 norm of the change, averaged over the
-        examples. Conditions that the attack does not change, which are None, are left out.
-    """
+def _changes(problem: AttackProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
+    """Compute by how much an attack changed the light, the vertices and other conditions."""
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}

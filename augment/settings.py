@@ -102,15 +102,7 @@ def _is_gloss(values: object) -> bool:
 
 
 def require_color(name: str, color: Sequence[float] | None) -> None:
-    """Check that a color has three channels from 0 to 1.
-
-    Args:
-        name: Name of the argument, for the error.
-        color: Red, green and blue. None is accepted.
-
-    Raises:
-        InputError: If the color has another length or a value outside [0, 1].
-    """
+    """Check that a color has three channels from 0 to 1."""
     if color is None:
         return
     if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
@@ -316,16 +308,7 @@ class SceneSettings(Settings):
 
 
 def _as_settings(name: str, value: object, kind: type[Settings]) -> Settings | None:
-    """Convert a mapping to settings. None and settings are returned as they are.
-
-    Args:
-        name: Name of the value, for the error.
-        value: Mapping, settings or None.
-        kind: Class of the settings.
-
-    Raises:
-        InputError: If the value is something else.
-    """
+    """Convert a mapping to settings. None and settings are returned as they are."""
     if isinstance(value, Mapping):
         return settings_from(kind, value, name)
     if value is None or isinstance(value, kind):
@@ -693,18 +676,6 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
 
     The number of renders is meshes × views × backgrounds. For example, 2 meshes, 10 views and 5
     backgrounds give 100 renders.
-
-    Args:
-        examples: Number of renders. None if it follows from the views.
-        objects: Number of meshes.
-        backgrounds: Number of backgrounds.
-        views: Number of views of each mesh. None if it follows from the renders.
-
-    Returns:
-        Number of views of each mesh.
-
-    Raises:
-        InputError: If the number of renders is not such a product.
     """
     if not objects or not backgrounds:
         raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
@@ -759,18 +730,7 @@ NormalizeLight = bool | Mapping[str, Any] | NormalizedLightSettings | None
 
 
 def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | None:
-    """Convert a value of the argument `normalize_light` to settings.
-
-    Args:
-        value: True for the defaults, a mapping with fields of `NormalizedLightSettings`, or
-            settings. False or None if the light is not to be normalized.
-
-    Returns:
-        The settings. None if the light is not to be normalized.
-
-    Raises:
-        InputError: If the value is something else.
-    """
+    """Convert a value of the argument `normalize_light` to settings."""
     if value is None or value is False:
         return None
     if value is True:

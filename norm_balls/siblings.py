@@ -15,11 +15,7 @@ SIBLINGS = ("renderer", "augment", "train", "conf")
 
 
 def import_siblings() -> None:
-    """Import each package from the folder of this library.
-
-    Raises:
-        ImportError: If another module was imported under the name of one.
-    """
+    """Import each package from the folder of this library."""
     for name in SIBLINGS:
         if name in sys.modules:
             _require_own(name)

@@ -13,20 +13,7 @@ ANGLES = ("polar", "azimuth", "fov")
 
 
 def angles_in_degrees(description: Mapping[str, Any], unit: str | None) -> dict[str, Any]:
-    """Convert the angles of a camera or of a projector from a file to degrees.
-
-    Args:
-        description: Entries of the camera or of the projector by name. The
-            entries "polar", "azimuth" and "fov" are angles.
-        unit: Unit of the angles in the file: "degrees", or None for files of
-            earlier versions, whose angles are in radians.
-
-    Returns:
-        Copy of the entries, with angles in degrees.
-
-    >>> angles_in_degrees({"polar": math.pi, "width": 2.0}, unit=None)
-    {'polar': 180.0, 'width': 2.0}
-    """
+    """Convert the angles of a camera or of a projector from a file to degrees."""
     converted = dict(description)
     if unit == DEGREES:
         return converted

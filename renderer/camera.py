@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import (
@@ -236,16 +237,10 @@ class Camera(ABC):
         columns = np.column_stack([axes.T, position @ axes])
         return np.vstack([columns, [0, 0, 0, 1]])
 
-    def _from_pivot(self, points: np.ndarray) -> np.ndarray:
+    def _from_pivot(self, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
         """Subtract the point about which attacks turn the camera from other points.
 
         This point is the origin, except for a `PinholeCamera`.
-
-        Args:
-            points: Points in world axes, shape (..., 3).
-
-        Returns:
-            Vectors from the point to the other points, same shape.
         """
         return points
 
@@ -271,13 +266,7 @@ class Camera(ABC):
         return F.pad(axes[2], (0, 1))
 
     def _differentiable_axes(self) -> tuple[Tensor, Tensor]:
-        """Compute the axes of the camera differentiably with respect to its fields.
-
-        Returns:
-            A tuple of
-            - the axes, one in each row, float64, shape (3, 3);
-            - the origin of the world in camera coordinates, shape (3,).
-        """
+        """Compute the axes of the camera differentiably with respect to its fields."""
         # Camera coordinates of the origin and of the
         # unit vectors give the axes of the camera.
         origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
@@ -327,17 +316,11 @@ class Camera(ABC):
         y = (up + self.up) * scale
         return torch.stack([x, y, w]).T, nearness
 
-    def _camera_coordinates(self, points: Tensor) -> Tensor:
+    def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
         """Convert points from world axes to the axes right, up and back of the camera.
 
         The result is differentiable with respect to the points, and with respect
         to angles of the camera that are tensors.
-
-        Args:
-            points: V points in world axes, shape (V, 3).
-
-        Returns:
-            Coordinates right, up and back, measured from the origin, shape (3, V).
         """
         polar = _as_tensor(_in_radians(self.polar), points)
         azimuth = _as_tensor(_in_radians(self.azimuth), points)
@@ -353,18 +336,8 @@ class Camera(ABC):
         return torch.stack([torch.stack(axis) for axis in axes]) @ points.T
 
     @abstractmethod
-    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w and the nearness of points.
-
-        Args:
-            back: Coordinate of V points along the axis from the origin to the
-                camera, in world units, shape (V,).
-
-        Returns:
-            A tuple of
-            - the number w by which image coordinates are divided, shape (V,);
-            - the nearness, which is larger for nearer points, shape (V,).
-        """
+    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
+        """Compute the homogeneous coordinate w and the nearness of points."""
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
         """Compute the depths of points, which a perspective projection divides by.
@@ -419,16 +392,8 @@ class OrthographicCamera(Camera):
         coordinates += (shift * scale)[:, None]
         return coordinates.T
 
-    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w, which is 1, and the nearness of points.
-
-        Args:
-            back: Coordinate of V points along the axis from the origin to the
-                camera, shape (V,).
-
-        Returns:
-            The number w of each point, and `back` as the nearness, shape (V,) each.
-        """
+    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
+        """Compute the homogeneous coordinate w, which is 1, and the nearness of points."""
         return torch.ones_like(back), back
 
 
@@ -504,17 +469,8 @@ class PerspectiveCamera(Camera):
         normalized_depth = depth_scale * ((near_back - back) / depths) - 1
         return np.stack([x, y, normalized_depth]).T
 
-    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w and the nearness of points.
-
-        Args:
-            back: Coordinate of V points along the axis from the origin to the
-                camera, shape (V,).
-
-        Returns:
-            w, which is the depth divided by the distance of the camera, and the
-            nearness 1 / w, shape (V,) each.
-        """
+    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
+        """Compute the homogeneous coordinate w and the nearness of points."""
         w = 1 - back / self.distance
         return w, 1 / w
 
@@ -710,15 +666,8 @@ class PinholeCamera(PerspectiveCamera):
         pose[:3, 3] += [self.center_x, self.center_y, self.center_z]
         return pose
 
-    def _from_pivot(self, points: np.ndarray) -> np.ndarray:
-        """Subtract the point about which attacks turn the camera from other points.
-
-        Args:
-            points: Points in world axes, shape (..., 3).
-
-        Returns:
-            Vectors from the point to the other points, same shape.
-        """
+    def _from_pivot(self, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
+        """Subtract the point about which attacks turn the camera from other points."""
         return points - np.array([self.center_x, self.center_y, self.center_z])
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -765,16 +714,8 @@ class PinholeCamera(PerspectiveCamera):
         y = y * self.pixel_aspect + self.principal_up * w
         return torch.stack([x, y, w]).T, nearness
 
-    def _camera_coordinates(self, points: Tensor) -> Tensor:
-        """Convert points from world axes to the axes right, up and back of the camera.
-
-        Args:
-            points: V points in world axes, shape (V, 3).
-
-        Returns:
-            Coordinates right, up and back, measured from the point about which
-            attacks turn the camera, shape (3, V).
-        """
+    def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
+        """Convert points from world axes to the axes right, up and back of the camera."""
         center = [self.center_x, self.center_y, self.center_z]
         pivot = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
         right, up, back = super()._camera_coordinates(points - pivot)
@@ -807,18 +748,7 @@ class PinholeCamera(PerspectiveCamera):
 
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Check a view matrix, and split it into a rotation matrix and a translation.
-
-    Args:
-        view: Matrix from world to camera coordinates, shape (4, 4) or (3, 4).
-
-    Returns:
-        Rotation matrix, shape (3, 3), and translation, shape (3,).
-
-    Raises:
-        InputError: If the matrix has another shape, or is no rotation and
-            translation.
-    """
+    """Check a view matrix, and split it into a rotation matrix and a translation."""
     matrix = as_array("view", view).astype(np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"view has shape {matrix.shape}: give a matrix (4, 4) or (3, 4)")
@@ -835,18 +765,7 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
-    """Check an intrinsic matrix, and return its focal lengths and principal point.
-
-    Args:
-        intrinsics: Matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels,
-            shape (3, 3).
-
-    Returns:
-        Focal lengths fx and fy, and principal point cx and cy, in pixels.
-
-    Raises:
-        InputError: If the matrix has another form.
-    """
+    """Check an intrinsic matrix, and return its focal lengths and principal point."""
     matrix = as_array("intrinsics", intrinsics).astype(np.float64)
     if matrix.shape != (3, 3):
         raise InputError(f"intrinsics has shape {matrix.shape}: give a matrix (3, 3)")
@@ -861,17 +780,7 @@ def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
 
 
 def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Convert the size of an image to its width and its height, and check them.
-
-    Args:
-        size: Number of pixels per side, or a pair of width and height.
-
-    Returns:
-        Width and height in pixels.
-
-    Raises:
-        InputError: If a number is not whole or not positive.
-    """
+    """Convert the size of an image to its width and its height, and check them."""
     width, height = size if isinstance(size, tuple | list) and len(size) == 2 else (size, size)
     for side in (width, height):
         require_whole("size", side)
@@ -880,19 +789,7 @@ def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _as_scalar(name: str, value: Any) -> Any:
-    """Convert the value of a camera's field to a number, or to a tensor of shape ().
-
-    Args:
-        name: Name of the field, for the error.
-        value: Number, or a tensor, array or list with one number.
-
-    Returns:
-        Tensor of shape () for a tensor, so that gradients with respect to the field
-        can be computed. Otherwise a number.
-
-    Raises:
-        InputError: If the value is not one number.
-    """
+    """Convert the value of a camera's field to a number, or to a tensor of shape ()."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.reshape(())
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:

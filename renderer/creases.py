@@ -9,6 +9,7 @@ Shapes use these letters: a mesh has V vertices and F faces.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from renderer.normals import CANCELLATION, doubled_area_vectors
 
@@ -24,11 +25,11 @@ MAX_FACES_AT_EDGE = 8
 
 
 def normal_groups(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    file_normals: np.ndarray | None = None,
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    file_normals: Float[np.ndarray, "F 3 3"] | None = None,
     crease: float = CREASE,
-) -> np.ndarray:
+) -> Int[np.ndarray, "F 3"]:
     """Divide the corners of faces into groups, each at one vertex and with a normal of its own.
 
     Two corners of a vertex with normals from a file are in one group if these
@@ -38,16 +39,6 @@ def normal_groups(
     A group whose face normals cancel would have no normal. It is divided at the
     creases, and if that does not help, into its corners. So the two sides of a leaf
     with the same vertices are always in different groups.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        file_normals: Normal of each corner in a file, shape (F, 3, 3). Normals that
-            are zero or NaN are ignored. None if the file has no normals.
-        crease: Angle in degrees.
-
-    Returns:
-        Index of the group of each corner, int64, shape (F, 3).
     """
     faces = faces.astype(np.int64, copy=False)
     # Positions may be NaN or infinite here. Renders refuse them later.

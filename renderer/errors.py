@@ -92,15 +92,7 @@ class InputError(ValueError):
 
 
 def single_line(error: Exception) -> str:
-    """Return the message of an error in one line.
-
-    Args:
-        error: Error of any class.
-
-    Returns:
-        Message without line breaks. If the error has no message, the name of its
-        class.
-    """
+    """Return the message of an error in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -109,25 +101,12 @@ def composed(name: str) -> str:
 
     macOS writes the names of files in the form NFD, in which an accent is a
     character of its own.
-
-    Args:
-        name: Name of a class, folder or file.
-
-    Returns:
-        Name in the form NFC.
     """
     return unicodedata.normalize("NFC", name)
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Return whether an error reports that the memory of a GPU or of the CPU ran out.
-
-    Args:
-        error: Error of any class.
-
-    Returns:
-        True if memory ran out.
-    """
+    """Return whether an error reports that the memory of a GPU or of the CPU ran out."""
     import torch
 
     has_known_message = any(words in str(error) for words in OUT_OF_MEMORY)
@@ -135,17 +114,7 @@ def is_out_of_memory(error: Exception) -> bool:
 
 
 def as_device(device: torch.device | str) -> torch.device:
-    """Convert a device name to a device of this machine.
-
-    Args:
-        device: Device or its name, such as "cpu" or "cuda".
-
-    Returns:
-        Device with its index.
-
-    Raises:
-        InputError: If the name is unknown, or if the machine has no such device.
-    """
+    """Convert a device name to a device of this machine."""
     import torch
 
     try:
@@ -163,13 +132,6 @@ def require_file(path: str | Path, advice: str) -> None:
     """Check that a path is a regular file.
 
     A named pipe is not accepted, because reading it might never end.
-
-    Args:
-        path: Path of the file.
-        advice: Advice at the end of the error, such as "give a mesh file".
-
-    Raises:
-        InputError: If the path is not a regular file.
     """
     # isfile returns False for an invalid name,
     # and in a folder without permission.
@@ -180,18 +142,7 @@ def require_file(path: str | Path, advice: str) -> None:
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """Check that a number lies in a range.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Number to check. None is accepted and means that the argument is
-            not set.
-        least: Smallest allowed value.
-        most: Largest allowed value.
-
-    Raises:
-        InputError: If the value is outside the range, NaN, or not a number.
-    """
+    """Check that a number lies in a range."""
     if value is None:
         return
     try:
@@ -205,29 +156,13 @@ def require_range(name: str, value: float | None, least: float, most: float) -> 
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Check that a value is one of several names.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value to check.
-        choices: Allowed names.
-
-    Raises:
-        InputError: If the value is not one of them.
-    """
+    """Check that a value is one of several names."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"{name}={_short_text(value)}: choose one of {', '.join(choices)}", name)
 
 
 def require_finite(**tensors: Tensor) -> None:
-    """Check that tensors have no NaN and no infinite values.
-
-    Args:
-        **tensors: Floating-point tensors by the names of the arguments.
-
-    Raises:
-        InputError: If a tensor has NaN or infinite values.
-    """
+    """Check that tensors have no NaN and no infinite values."""
     import torch
 
     for name, tensor in tensors.items():
@@ -237,15 +172,7 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """Check that tensors hold floating-point numbers with magnitudes of at most MAX_MAGNITUDE.
-
-    Args:
-        **tensors: Tensors by the names of the arguments.
-
-    Raises:
-        InputError: If a value is not a floating-point tensor, or if it has NaN,
-            infinite or too large values.
-    """
+    """Check that tensors hold floating-point numbers with magnitudes of at most MAX_MAGNITUDE."""
     from torch import Tensor
 
     for name, tensor in tensors.items():
@@ -262,28 +189,12 @@ def require_bounded(**tensors: Tensor) -> None:
 
 
 def is_whole(value: object) -> bool:
-    """Return whether a value is a whole number of Python or NumPy.
-
-    Args:
-        value: Any value.
-
-    Returns:
-        True for whole numbers. False for other values, also for the values True
-        and False.
-    """
+    """Return whether a value is a whole number of Python or NumPy."""
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is one real number of Python, NumPy or torch.
-
-    Args:
-        value: Any value.
-
-    Returns:
-        True for real numbers, and for tensors and arrays of shape () with a real
-        number. False for other values, also for the values True and False.
-    """
+    """Return whether a value is one real number of Python, NumPy or torch."""
     if getattr(value, "ndim", None) == 0:
         # The value is a tensor or an array of shape (), or a number of NumPy.
         value = value.item()  # type: ignore[attr-defined]
@@ -291,29 +202,14 @@ def is_number(value: object) -> bool:
 
 
 def is_flag(value: object) -> bool:
-    """Tell whether a value is True, False, 1 or 0.
-
-    Args:
-        value: Any value of Python or NumPy.
-
-    Returns:
-        True for the four values. False for other values, such as None.
-    """
+    """Tell whether a value is True, False, 1 or 0."""
     if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():
         value = value.item()  # type: ignore[attr-defined]
     return isinstance(value, bool) or (is_whole(value) and value in (0, 1))
 
 
 def describe(value: Any) -> str:
-    """Describe a value for an error message.
-
-    Args:
-        value: Any value.
-
-    Returns:
-        Type and shape of a tensor or an array, `repr` of a number, a text or a
-        list, and type of any other value.
-    """
+    """Describe a value for an error message."""
     if value is None or isinstance(value, str | bytes | bool | int | float | complex):
         return _short_repr(value)
     if isinstance(value, list | tuple | dict | Set):

@@ -21,11 +21,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
@@ -41,9 +42,6 @@ from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
 from renderer.solids import sphere
 from renderer.validation import as_tensor
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, UInt8
 
 # Polar angles in degrees of the first cameras of a search:
 # the angles between +z and the direction to the camera.
@@ -182,25 +180,6 @@ def fit_photograph(
     direction in the window depends on the height of the camera, which is only
     known after the fit. If the first window was tilted, a second window is cut
     and fitted.
-
-    Args:
-        photograph: Photograph with 8 bits per channel, shape (H, W, 3) for H
-            rows and W columns. The camera of the photograph is upright, and its
-            optical axis passes through the center of the photograph.
-        mask: Mask with 8 bits, white where the object is, shape (H, W).
-        mesh: Mesh of the object, normalized and upright.
-        size: Number of pixels per side of the images that are compared.
-        fov: Field of view of the window in degrees. The window is 1.6 times as
-            wide as the object. None for a camera without perspective.
-        encoding: Encoding of the photograph and of the images that will be
-            rendered with the result, "linear" or "srgb".
-        **options: Other arguments of `fit_scene`.
-
-    Returns:
-        Camera and light, and the window of the photograph that the camera shows.
-
-    Raises:
-        InputError: If no pixel of the mask is white.
     """
     is_object = mask > MASK_THRESHOLD
     rows = np.flatnonzero(is_object.any(axis=1))
@@ -241,17 +220,7 @@ def fit_photograph(
 def _centered_on_mesh(
     scene: FittedScene, window: Window, camera_image: Photograph
 ) -> FittedPhotograph:
-    """Turn a fitted camera and its window so that the mesh center is in their center.
-
-    Args:
-        scene: Fitted camera and light. The camera may show the mesh center
-            elsewhere in its image.
-        window: Window of the photograph that the camera shows.
-        camera_image: Photograph with its focal length.
-
-    Returns:
-        Turned camera with the same light, and a window of the same size.
-    """
+    """Turn a fitted camera and its window so that the mesh center is in their center."""
     camera = scene.camera
     # Offset (right, up) of the mesh center from the window center, in pixels.
     offset = np.array([camera.right, camera.up]) * window.side / camera.width
@@ -280,15 +249,7 @@ class _WindowFit:
     options: dict[str, Any]
 
     def fit(self, window: Window, start: Camera | None) -> FittedScene:
-        """Fit the camera and the light in one window.
-
-        Args:
-            window: Window of the photograph.
-            start: Camera that is refined. None searches for a camera.
-
-        Returns:
-            Camera and light with which a render resembles the window most.
-        """
+        """Fit the camera and the light in one window."""
         linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
         # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
@@ -296,16 +257,7 @@ class _WindowFit:
 
 
 def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
-    """Convert the world's z-axis to the axes of the camera that took the photograph.
-
-    Args:
-        camera: Fitted camera, which shows the window.
-        window: Window of the photograph.
-
-    Returns:
-        Unit vector along the z-axis with the components right, up and back,
-        shape (3,).
-    """
+    """Convert the world's z-axis to the axes of the camera that took the photograph."""
     # The z-components of the axes right, up and back of the fitted
     # camera. These axes are also the axes of the window.
     z_axis_in_window = camera.axes()[:, 2]
@@ -318,13 +270,6 @@ def _turned_to_mesh(camera: Camera) -> Camera:
     The center of the mesh is the origin. A perspective camera is turned if it does
     not show the origin in the center of its image. An orthographic camera is
     shifted.
-
-    Args:
-        camera: Camera that may show the origin elsewhere in its image
-            (`camera.right` and `camera.up`).
-
-    Returns:
-        Camera that shows the origin in the center of its image.
     """
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
@@ -459,18 +404,10 @@ def fit_scene(
     return target_with_bounces.fit_final_light(best_camera)
 
 
-def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
-    """Search all directions for a few cameras, one of which should be near the best camera.
-
-    Args:
-        target: Small copy of the photograph, to which renders are compared.
-        mask: Share of each pixel of the photograph that the object covers,
-            shape (size, size).
-        fov: Field of view in degrees. None for cameras without perspective.
-
-    Returns:
-        At most `KEPT_CAMERAS` different cameras, the best one first.
-    """
+def _plausible_cameras(
+    target: _Target, mask: Float[Tensor, "size size"], fov: float | None
+) -> list[Camera]:
+    """Search all directions for a few cameras, one of which should be near the best camera."""
     mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
     first_cameras = []
@@ -494,16 +431,7 @@ def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
-    """Remove cameras that look in nearly the same direction as an earlier camera.
-
-    Args:
-        cameras: Cameras in order of preference.
-
-    Returns:
-        Different cameras in the same order. A camera is left out if all its axes
-        differ from those of an earlier camera by less than `MIN_CAMERA_ANGLE`
-        degrees.
-    """
+    """Remove cameras that look in nearly the same direction as an earlier camera."""
     kept_cameras: list[Camera] = []
     max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
     for camera in cameras:
@@ -531,9 +459,9 @@ class _LightFit(NamedTuple):
             shape (size²,).
     """
 
-    residuals: Tensor
-    light: Tensor
-    coverage: Tensor
+    residuals: Float[Tensor, " N"]
+    light: Float[Tensor, "49 3"]
+    coverage: Float[Tensor, " size²"]
 
 
 class _Target(NamedTuple):
@@ -549,8 +477,8 @@ class _Target(NamedTuple):
         options: Arguments with which the mesh is rendered.
     """
 
-    image: Tensor
-    mask: Tensor
+    image: Float[Tensor, "3 size²"]
+    mask: Float[Tensor, " size²"]
     gray: float
     mesh: Mesh
     size: int
@@ -558,22 +486,16 @@ class _Target(NamedTuple):
 
     @staticmethod
     def from_photograph(
-        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
+        photograph: Float[Tensor, "3 H H"],
+        mask: Float[Tensor, "H H"],
+        mesh: Mesh,
+        size: int,
+        options: _RenderOptions,
     ) -> _Target:
         """Resample a photograph and its mask, and replace the background by black or white.
 
         Pixels on the border of the object show a mixture of object and
         background. They get the mean color of the object's pixels around them.
-
-        Args:
-            photograph: Linear values, shape (3, H, H).
-            mask: Share of each pixel that the object covers, shape (H, H).
-            mesh: Mesh of the object.
-            size: Number of pixels per side of the resampled photograph.
-            options: Arguments with which the mesh is rendered.
-
-        Returns:
-            Resampled photograph with `size` pixels per side.
         """
         # 1 in pixels that the object covers
         # completely, and 0 elsewhere, shape (1, H, H).
@@ -599,18 +521,7 @@ class _Target(NamedTuple):
     def fit_light(
         self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
     ) -> _LightFit:
-        """Find the light under which a render from a camera resembles the photograph most.
-
-        Args:
-            camera: Camera from which the mesh is rendered.
-            min_coverage: Smallest share of a pixel that both the mesh and the mask
-                must cover. The fit ignores other pixels.
-            grid: Number of subdivisions of the icosphere whose vertices are the
-                directions in which the radiance of the light is constrained.
-
-        Returns:
-            Best light, with its residuals and the rendered coverage.
-        """
+        """Find the light under which a render from a camera resembles the photograph most."""
         operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
@@ -634,33 +545,16 @@ class _Target(NamedTuple):
 
     def _fit_pixels(
         self,
-        transfer: Tensor,
-        background: Tensor,
-        image: Tensor,
-        is_covered: Tensor,
+        transfer: Float[Tensor, "3 49 P"],
+        background: Float[Tensor, " P"],
+        image: Float[Tensor, "3 P"],
+        is_covered: Bool[Tensor, "3 P"],
         grid: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Fit a light to P pixels of the photograph by least squares.
 
         A pixel that is clipped in the photograph may have been brighter. The fit
         is repeated without the clipped pixels that the render makes brighter than 1.
-
-        Args:
-            transfer: Radiance of each pixel in each channel under 49 lights, each
-                of which has a single coefficient of 1, shape (3, 49, P).
-            background: Linear values that the background adds, shape (P,).
-            image: Linear values of the photograph, shape (3, P).
-            is_covered: True for the pixels to which the light is fitted,
-                shape (3, P).
-            grid: Number of subdivisions of the icosphere whose vertices are the
-                directions in which the radiance of the light is constrained.
-
-        Returns:
-            A tuple of
-            - the SH coefficients of the light, shape (49, 3);
-            - the values of the pixels in a render with this light, shape (3, P);
-            - the weighted differences between the coefficients of the light and of
-              the expected light, shape (3, 49).
         """
         object_radiance = image - background
         is_clipped = image >= CLIPPED_VALUE
@@ -681,21 +575,14 @@ class _Target(NamedTuple):
         return light, rendered, penalty.sqrt() * (light - expected_light).T
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-        """Sort cameras by the squared error of a render with the best light of each camera.
-
-        Args:
-            cameras: Cameras to compare.
-
-        Returns:
-            Pairs of the squared error and the camera, the smallest error first.
-        """
+        """Sort cameras by the squared error of a render with the best light of each camera."""
         pairs = []
         for camera in cameras:
             residuals = self.fit_light(camera).residuals
             pairs.append((float(residuals.square().sum()), camera))
         return sorted(pairs, key=lambda pair: pair[0])
 
-    def penalty(self, normal_matrix: Tensor) -> Tensor:
+    def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
         """Compute the weights of the smoothness penalty of a light.
 
         The penalty is the weighted sum of the squared differences between the SH
@@ -704,14 +591,6 @@ class _Target(NamedTuple):
         the Laplacian on the sphere. It is also proportional to the squared
         brightness of the object under uniform light. The fit therefore does not
         depend on the scale of the albedo.
-
-        Args:
-            normal_matrix: Matrix of the normal equations of each channel,
-                shape (3, 49, 49). Entry (j, k) is the sum over pixels of the
-                radiance under coefficient j times the radiance under coefficient k.
-
-        Returns:
-            Weight of each coefficient, shape (49,).
         """
         # Entry (0, 0) is the sum over pixels of the squared radiance under
         # uniform light (coefficient 0). The small summand keeps the sum
@@ -724,15 +603,11 @@ class _Target(NamedTuple):
         """Find the camera near a given camera whose render resembles the photograph most."""
         return _Descent(self, camera).run()
 
-    def render_linear(self, camera: Camera, light: Tensor) -> Tensor:
-        """Render the mesh in front of the gray background, and decode the image to linear values.
-
-        Args:
-            camera: Camera of the image.
-            light: SH coefficients, shape (49, 3).
-
-        Returns:
-            Linear values, shape (3, size²).
+    def render_linear(
+        self, camera: Camera, light: Float[Tensor, "49 3"]
+    ) -> Float[Tensor, "3 size²"]:
+        """Render the mesh in front of the gray background, and decode the image to linear
+        values.
         """
         options = asdict(self.options)
         image = render(self.mesh, camera, light, self.size, self.gray, **options)
@@ -742,12 +617,6 @@ class _Target(NamedTuple):
         """Fit the light for the final camera, and compute how well the render fits.
 
         Only the pixels that the object covers completely count.
-
-        Args:
-            camera: Camera that was found.
-
-        Returns:
-            Camera and light, with the error and the overlap of the silhouettes.
         """
         fit = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
         rendered = self.render_linear(camera, fit.light)
@@ -803,17 +672,8 @@ class _Descent:
         )
         return self._camera_of(found.x)
 
-    def _camera_of(self, parameters: np.ndarray) -> Camera:
-        """Convert the five parameters of the refinement to a camera.
-
-        Args:
-            parameters: Polar angle and azimuth in radians, width divided by the
-                width of the first camera, and shifts right and up divided by the
-                width of the first camera, shape (5,).
-
-        Returns:
-            Camera.
-        """
+    def _camera_of(self, parameters: Float[np.ndarray, " 5"]) -> Camera:
+        """Convert the five parameters of the refinement to a camera."""
         polar, azimuth, relative_width, right, up = parameters.tolist()
         width = self._first_camera.width
         moved = replace(
@@ -830,31 +690,14 @@ class _Descent:
             moved = replace(moved, distance=moved.distance * relative_width)
         return moved
 
-    def _residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Compute the differences between the photograph and a render with the best light.
-
-        Args:
-            parameters: Polar angle, azimuth, relative width, and shifts right and up
-                of the camera, shape (5,).
-
-        Returns:
-            Residuals of the best light, shape (N,). The sum of their squares is the
-            error to minimize.
-        """
+    def _residuals(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
+        """Compute the differences between the photograph and a render with the best light."""
         return self._target.fit_light(self._camera_of(parameters)).residuals.numpy()
 
-    def _jacobian(self, parameters: np.ndarray) -> np.ndarray:
+    def _jacobian(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
         """Compute the derivatives of the residuals by central differences.
 
         The residuals are the differences between the photograph and a render.
-
-        Args:
-            parameters: Polar angle, azimuth, relative width, and shifts right and up
-                of the camera, shape (5,).
-
-        Returns:
-            Derivatives of the N residuals with respect to the parameters,
-            shape (N, 5).
         """
         columns = []
         step_sizes = np.array(DERIVATIVE_STEPS) / self._target.size
@@ -866,7 +709,10 @@ class _Descent:
 
 
 def _fit_channels(
-    normal_matrix: Tensor, right_side: Tensor, penalty: Tensor, grid: int
+    normal_matrix: Float[Tensor, "3 49 49"],
+    right_side: Float[Tensor, "3 49"],
+    penalty: Float[Tensor, " 49"],
+    grid: int,
 ) -> tuple[Tensor, Tensor]:
     """Fit the light of each color channel, with the light of the brightest channel as a guide.
 
@@ -874,22 +720,6 @@ def _fit_channels(
     shows from where blue light comes. The light of each channel is therefore
     expected to be a multiple of the light of the brightest channel. Differences
     between the light and this expected light are penalized.
-
-    Args:
-        normal_matrix: Matrix of the normal equations of each channel,
-            shape (3, 49, 49). Entry (j, k) is the sum over pixels of the radiance
-            under coefficient j times the radiance under coefficient k.
-        right_side: Right side of the normal equations of each channel,
-            shape (3, 49). Entry j is the sum over pixels of the radiance under
-            coefficient j times the radiance in the photograph.
-        penalty: Weight of the squared difference between each coefficient and the
-            expected coefficient, shape (49,).
-        grid: Number of subdivisions of the icosphere whose vertices are the
-            directions in which the radiance of the light is constrained.
-
-    Returns:
-        The light and the expected light, shape (49, 3) each. For the brightest
-        channel, the expected light is zero.
     """
     regularized = normal_matrix + torch.diag(penalty)
     # The brightest channel reflects most of a
@@ -908,7 +738,9 @@ def _fit_channels(
     return _nonnegative_light(regularized, penalized_right_side, grid), expected
 
 
-def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tensor:
+def _nonnegative_light(
+    matrices: Float[Tensor, "C 49 49"], right_sides: Float[Tensor, "C 49"], grid: int
+) -> Float[Tensor, "49 C"]:
     """Minimize xᵀ S x / 2 - wᵀ x over all lights x without negative radiance.
 
     The rows of a matrix R map a light x to its radiance in the directions of a
@@ -918,16 +750,6 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
     point is L⁻¹ w + L⁻¹ Rᵀ m. Here m ≥ 0 is the vector that makes the length of
     this sum as small as possible. SciPy's `nnls` (non-negative least squares)
     finds m.
-
-    Args:
-        matrices: Positive definite matrix S of each of C channels,
-            shape (C, 49, 49).
-        right_sides: Vector w of each channel, shape (C, 49).
-        grid: Number of subdivisions of the icosphere whose vertices are the
-            directions.
-
-    Returns:
-        Light x of each channel, shape (49, C).
     """
     # Matrix R that maps a light to its radiance in N directions, shape (N, 49).
     radiance_rows = _radiance_rows(grid)
@@ -951,13 +773,6 @@ def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[
     Only few of the vectors limit the result. The problem is first solved with
     some of them. Vectors whose dot product with the solution is negative are
     added until there are none. The result is the same as with all vectors.
-
-    Args:
-        point: Given point in K dimensions, shape (K,).
-        constraints: The N vectors as columns, shape (K, N).
-
-    Returns:
-        Nearest point to the given point, shape (K,).
     """
     constraint_count = constraints.shape[1]
     is_used = np.arange(constraint_count) % FIRST_DIRECTION_STEP == 0
@@ -979,14 +794,6 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
 
     The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance
     of the light.
-
-    Args:
-        grid: Number of subdivisions of the icosphere whose N vertices are the
-            directions.
-
-    Returns:
-        Matrix that maps the 49 SH coefficients of a light to N directions,
-        shape (N, 49).
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
@@ -997,20 +804,11 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
     return rows
 
 
-def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
+def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Camera:
     """Change the width and the shift of a camera so that the mesh is as large as the mask.
 
     The bounding box of the mesh in the image gets the center and the area of the
     bounding box of the mask.
-
-    Args:
-        camera: Camera whose direction is kept.
-        mesh: Mesh of the object.
-        mask: Share of each pixel that the object covers, shape (size, size).
-
-    Returns:
-        Copy of the camera with another width, shift and, if it has perspective,
-        distance.
     """
     # Bounding boxes in image coordinates from
     # -1 to 1, with x to the right and y up.
@@ -1032,16 +830,8 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     return framed
 
 
-def _mask_box(mask: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Compute the bounding box of the pixels that an object covers by more than half.
-
-    Args:
-        mask: Share of each pixel that the object covers, shape (size, size).
-
-    Returns:
-        Lower left and upper right corner of the box in image coordinates from -1
-        to 1, with x to the right and y up, shape (2,) each.
-    """
+def _mask_box(mask: Float[Tensor, "size size"]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Compute the bounding box of the pixels that an object covers by more than half."""
     size = len(mask)
     rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
     columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())

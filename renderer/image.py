@@ -5,18 +5,16 @@ Clamping is not linear. The conversion therefore comes after all sums of radianc
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_bounded, require_choice
 from renderer.settings import ENCODINGS
 from renderer.validation import as_tensor
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int, UInt8
 
 # Linear value at which the sRGB curve changes
 # from a straight line to a power function.
@@ -35,24 +33,7 @@ def tonemap(
     background: Float[Tensor, "*#batch channels #P"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 P"]:
-    """Convert the radiance of pixels to image values in front of a background.
-
-    Args:
-        radiance: Linear radiance of P pixels, already multiplied by the
-            coverage, shape (..., 3, P).
-        coverage: Fraction of each pixel that shows the mesh, in [0, 1],
-            shape (..., 1, P).
-        background: Image values in [0, 1] behind the mesh, with three channels
-            or one, shape (..., 3 or 1, P or 1).
-        encoding: Encoding of image values, "linear" or "srgb".
-
-    Returns:
-        Image values in [0, 1], shape (..., 3, P).
-
-    Raises:
-        InputError: If a tensor has NaN, infinite or too large values, or if the
-            encoding is unknown.
-    """
+    """Convert the radiance of pixels to image values in front of a background."""
     require_bounded(radiance=radiance)
     linear = radiance + background_term(coverage, background, encoding)
     return encode(clamp(linear), encoding)
@@ -65,25 +46,7 @@ def composite(
     background: Float[Tensor, "*#batch 3 size size"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 size size"]:
-    """Put the radiance of covered pixels in front of a background.
-
-    Args:
-        radiance: Linear radiance of the P covered pixels, already multiplied by
-            the coverage, shape (..., 3, P).
-        coverage: Fraction of each covered pixel that shows the mesh, in [0, 1],
-            shape (P,).
-        pixels: Row-major indices of the covered pixels, shape (P,).
-        background: Image values in [0, 1] behind the mesh,
-            shape (..., 3, size, size).
-        encoding: Encoding of image values, "linear" or "srgb".
-
-    Returns:
-        Images in [0, 1], shape (..., 3, size, size).
-
-    Raises:
-        InputError: If a tensor has NaN, infinite or too large values, or if the
-            encoding is unknown.
-    """
+    """Put the radiance of covered pixels in front of a background."""
     batch_shape = radiance.shape[:-2]
     backgrounds = background.expand(*batch_shape, *background.shape[-3:])
     # The last axis is over the pixels of an image
@@ -95,21 +58,10 @@ def composite(
     return images.unflatten(-1, background.shape[-2:])
 
 
-def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
-    """Convert a gray value, a color or images to background images.
-
-    Args:
-        background: Gray value, color of shape (3,), or images of shape
-            (..., 3, size, size), with values in [0, 1].
-        size: Width and height of the images in pixels.
-        like: Tensor whose dtype and device the result gets.
-
-    Returns:
-        Images, shape (..., 3, size, size).
-
-    Raises:
-        InputError: If the shape is another one, or a value is outside [0, 1].
-    """
+def as_background(
+    background: float | Tensor, size: int, like: Tensor
+) -> Float[Tensor, "... 3 size size"]:
+    """Convert a gray value, a color or images to background images."""
     values = as_tensor("background", background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
@@ -121,42 +73,22 @@ def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor
     return values.expand(*values.shape[:-3], 3, size, size)
 
 
-def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """Compute the linear values that the background adds to pixels that a mesh partly covers.
-
-    Args:
-        coverage: Fraction of each of P pixels that shows the mesh, in [0, 1],
-            shape (..., 1, P).
-        background: Image values of the background in [0, 1],
-            shape (..., 3 or 1, P or 1).
-        encoding: Encoding of the background, "linear" or "srgb".
-
-    Returns:
-        Linear background times the uncovered fraction of each pixel,
-        shape (..., 3 or 1, P).
-
-    Raises:
-        InputError: If a tensor has NaN, infinite or too large values, or if the
-            encoding is unknown.
-    """
+def background_term(
+    coverage: Float[Tensor, "... 1 P"],
+    background: Float[Tensor, "... _ _"],
+    encoding: str = "linear",
+) -> Float[Tensor, "... _ P"]:
+    """Compute the linear values that the background adds to pixels that a mesh partly covers."""
     require_bounded(coverage=coverage, background=background)
     return (1 - coverage) * decode(background, encoding)
 
 
-def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
+def clamp(values: Float[Tensor, " ..."], ceiling: Tensor | float = 1.0) -> Tensor:
     """Clamp values to [0, ceiling], with a gradient of 1 at the limits themselves.
 
     With a gradient of 0 at the limit 0, an optimization could not increase a
     light of 0 in front of a black background. The gradient of `torch.clamp` at
     its limits differs between versions of torch.
-
-    Args:
-        values: Values to clamp, shape (...).
-        ceiling: Upper limit, a number or a tensor that broadcasts to `values`.
-            It gets no gradient.
-
-    Returns:
-        Clamped values, same shape as `values`.
     """
     return _Clamp.apply(values, ceiling)
 
@@ -166,16 +98,7 @@ class _Clamp(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, ceiling: Tensor | float) -> Tensor:
-        """Clamp values to [0, ceiling].
-
-        Args:
-            ctx: Context of autograd.
-            values: Values to clamp, any shape.
-            ceiling: Upper limit, a number or a tensor that broadcasts to `values`.
-
-        Returns:
-            Clamped values, same shape as `values`.
-        """
+        """Clamp values to [0, ceiling]."""
         clamped = values.clamp(min=0).clamp_(max=ceiling)
         # 1.0 for values that clamping did not change, and 0.0
         # for other values. A product with booleans would be
@@ -187,35 +110,13 @@ class _Clamp(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient of the loss, which is 0 for values that clamping changed.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient of the loss with respect to the clamped values, any
-                shape.
-
-        Returns:
-            Gradient with respect to the values, same shape, and None, because the
-            ceiling has no gradient.
-        """
+        """Compute the gradient of the loss, which is 0 for values that clamping changed."""
         (is_unclamped,) = ctx.saved_tensors
         return upstream * is_unclamped, None
 
 
-def encode(linear: Tensor, encoding: str) -> Tensor:
-    """Encode linear values as image values.
-
-    Args:
-        linear: Linear values in [0, 1], shape (...).
-        encoding: "linear" returns the values unchanged. "srgb" applies the sRGB
-            transfer function (IEC 61966-2-1).
-
-    Returns:
-        Image values in [0, 1], same shape.
-
-    Raises:
-        InputError: If the encoding is unknown.
-    """
+def encode(linear: Float[Tensor, " ..."], encoding: str) -> Tensor:
+    """Encode linear values as image values."""
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
@@ -226,20 +127,11 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 
 
-def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
+def encode_gradient(linear: Float[Tensor, " ..."], upstream: Tensor, encoding: str) -> Tensor:
     """Compute the gradient with respect to linear values from that for encoded values.
 
     The bits of the result are the same as those of autograd for `encode`, because
     the operations and their order are the same.
-
-    Args:
-        linear: Linear values in [0, 1] that `encode` took, shape (...).
-        upstream: Gradient of the loss with respect to the encoded values, same
-            shape.
-        encoding: Encoding, "linear" or "srgb".
-
-    Returns:
-        Gradient of the loss with respect to the linear values, same shape.
     """
     if encoding == "linear":
         return upstream
@@ -247,20 +139,8 @@ def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
     return torch.where(linear <= SRGB_KNEE, upstream * 12.92, upstream * 1.055 * power_slope)
 
 
-def decode(image: Tensor, encoding: str) -> Tensor:
-    """Decode image values to linear values. This is the inverse of `encode`.
-
-    Args:
-        image: Image values in [0, 1], shape (...).
-        encoding: "linear" returns the values unchanged. "srgb" applies the
-            inverse of the sRGB transfer function (IEC 61966-2-1).
-
-    Returns:
-        Linear values in [0, 1], same shape.
-
-    Raises:
-        InputError: If the encoding is unknown.
-    """
+def decode(image: Float[Tensor, " ..."], encoding: str) -> Tensor:
+    """Decode image values to linear values. This is the inverse of `encode`."""
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return image
@@ -269,25 +149,11 @@ def decode(image: Tensor, encoding: str) -> Tensor:
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Convert image values in [0, 1] to 8-bit values.
-
-    Args:
-        image: Image values in [0, 1], shape (...).
-
-    Returns:
-        Whole numbers from 0 to 255, uint8, same shape.
-    """
+    """Convert image values in [0, 1] to 8-bit values."""
     # `round_` rounds in place, which saves the memory of a copy.
     return (image * 255).round_().to(torch.uint8)
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
-    """Convert 8-bit image values to values in [0, 1].
-
-    Args:
-        images: Whole numbers from 0 to 255, uint8, shape (...).
-
-    Returns:
-        Values in [0, 1], float32, same shape.
-    """
+    """Convert 8-bit image values to values in [0, 1]."""
     return images.float() / 255

@@ -21,19 +21,6 @@ def attach(
     """Create the module functions that import public names of a package on first use.
 
     The public names are the names that the stub file `__init__.pyi` imports.
-
-    Args:
-        package: `__name__` of the package.
-        file: `__file__` of the package, the path of its `__init__.py`. The stub
-            file is in the same folder.
-
-    Returns:
-        Values for `__getattr__`, `__dir__` and `__all__` of the package.
-
-    Example:
-        >>> import renderer
-        >>> attach("renderer", renderer.__file__)[2][0]
-        'Camera'
     """
     modules = _read_stub(f"{file}i")
     names = sorted(modules)
@@ -58,14 +45,7 @@ def attach(
 
 
 def _read_stub(path: str) -> dict[str, str]:
-    """Find out from which module a stub file imports each name.
-
-    Args:
-        path: Path of the stub file.
-
-    Returns:
-        Name of the module of each imported name.
-    """
+    """Find out from which module a stub file imports each name."""
     with open(path, encoding="utf-8") as stub:
         tree = ast.parse(stub.read())
     modules = {}

@@ -12,16 +12,7 @@ GIB = 2**30
 
 
 def require_memory(name: str, needed: int, device: torch.device) -> None:
-    """Check that enough memory is free, because Linux would otherwise kill the process.
-
-    Args:
-        name: Objects that need the memory, in the plural, such as "40 renders".
-        needed: Number of bytes that they need.
-        device: Device on which they are stored.
-
-    Raises:
-        InputError: If fewer bytes are free.
-    """
+    """Check that enough memory is free, because Linux would otherwise kill the process."""
     if not has_memory(needed, device):
         free = free_memory(device) or 0
         raise InputError(
@@ -31,28 +22,13 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
 
 
 def has_memory(needed: int, device: torch.device) -> bool:
-    """Return whether a number of bytes is free on a device.
-
-    Args:
-        needed: Number of bytes.
-        device: Device on which they are needed.
-
-    Returns:
-        Whether enough bytes are free. True also if the amount of free memory is unknown.
-    """
+    """Return whether a number of bytes is free on a device."""
     free = free_memory(device)
     return free is None or needed <= free
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Return the free memory of a GPU, the machine or the container.
-
-    Args:
-        device: The device.
-
-    Returns:
-        The number of bytes. None if it is unknown.
-    """
+    """Return the free memory of a GPU, the machine or the container."""
     if device.type == "cuda":
         # torch reserves memory that it does not use yet. This memory is free for torch.
         reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

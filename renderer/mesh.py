@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from renderer.creases import CREASE, normal_groups
@@ -346,17 +347,8 @@ class Mesh:
 # The result for the last mesh is cached. The next mesh often has the same
 # faces, for example if it is another instance of the same procedural solid.
 @lru_cache(maxsize=1)
-def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
-    """Find the connected parts of a mesh, all of which must be closed surfaces.
-
-    Args:
-        face_bytes: Bytes of the int64 array `Mesh.faces`, shape (F, 3). Unlike an
-            array, bytes can be a key of the cache.
-
-    Returns:
-        Index of the connected part of each face, shape (F,). None if a part is not
-        closed, or if two neighboring faces have opposite orientations.
-    """
+def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
+    """Find the connected parts of a mesh, all of which must be closed surfaces."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.graph import connected_component_labels
 
@@ -385,20 +377,7 @@ def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
 
 
 def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
-    """Check textures, and convert them to a tuple of arrays.
-
-    Args:
-        name: Name of the argument in the error.
-        textures: List or tuple of textures.
-        channels: Number of channels that each texture must have.
-
-    Returns:
-        Textures, uint8, shape (H, W, channels) each. A tuple of arrays is
-        returned as it is.
-
-    Raises:
-        InputError: If a texture has a wrong shape or type.
-    """
+    """Check textures, and convert them to a tuple of arrays."""
     expected = f"a list of arrays (height, width, {channels}) of uint8"
     if not isinstance(textures, list | tuple):
         raise InputError(f"{name} is {describe(textures)}: give {expected}")
@@ -411,15 +390,7 @@ def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray
 
 
 def require_mesh(name: str, value: object) -> None:
-    """Check that an argument is a mesh with colors in [0, 1].
-
-    Args:
-        name: Name of the argument in the error.
-        value: Value of the argument.
-
-    Raises:
-        InputError: If the value is no `Mesh`, or if a color is not in [0, 1].
-    """
+    """Check that an argument is a mesh with colors in [0, 1]."""
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
         raise InputError(
@@ -437,12 +408,6 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
     Vertices are not merged. The result has the joints of the first mesh. These
     joints do not move the vertices of meshes that have no joints.
-
-    Args:
-        meshes: One or more meshes.
-
-    Returns:
-        Mesh with all vertices, faces and textures.
     """
     faces = []
     texture_ids = []
@@ -474,16 +439,8 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _concatenate_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
-    """Concatenate the gloss (specular reflection) of the faces of several meshes.
-
-    Args:
-        meshes: Meshes with F faces in total.
-
-    Returns:
-        Roughness, metallic and specular factor of each face, float32,
-        shape (F, 3). None if all meshes are matte.
-    """
+def _concatenate_gloss(meshes: Sequence[Mesh]) -> Float[np.ndarray, "F 3"] | None:
+    """Concatenate the gloss (specular reflection) of the faces of several meshes."""
     if all(mesh.gloss is None for mesh in meshes):
         return None
     gloss_by_mesh = []
@@ -498,14 +455,6 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
 
     A gloss texture has factors for roughness and metallic. If a mesh has any, it
     has one for each of its color textures.
-
-    Args:
-        meshes: Meshes with T color textures in total.
-
-    Returns:
-        T gloss textures, uint8, shape (H, W, 2) each. The color textures of a mesh
-        without gloss textures get gloss textures with the factor 1. Empty if no
-        mesh has gloss textures.
     """
     if not any(mesh.gloss_textures for mesh in meshes):
         return ()
@@ -517,16 +466,7 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
 
 
 def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
-    """Create a skin with the joints of the first mesh for the vertices of several meshes.
-
-    Args:
-        meshes: Meshes with V vertices in total. Each has the joints of the first
-            mesh, or none.
-
-    Returns:
-        Skin for all V vertices. Its joints do not move the vertices of meshes
-        without joints. None if the first mesh has no joints.
-    """
+    """Create a skin with the joints of the first mesh for the vertices of several meshes."""
     skin = meshes[0].skin
     if skin is None:
         return None
@@ -581,19 +521,6 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     """Compute the center of a mesh, and its largest extent from the center along an axis.
 
     `normalize` moves the center to the origin and scales the extent to 1.
-
-    Args:
-        mesh: Mesh to measure.
-
-    Returns:
-        A tuple of
-        - the mean of the face centers, weighted with the areas of the faces, in
-          world axes, shape (3,);
-        - the largest distance of a vertex from the center along an axis, in
-          world units.
-
-    Raises:
-        InputError: If the surface has no area.
     """
     areas = mesh.face_areas()
     if not areas.sum() > 0:
@@ -605,19 +532,11 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     return center, np.abs(mesh.vertices - center).max()
 
 
-def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
     """Return a copy of a mesh after an affine transformation.
 
     A transformation that mirrors the mesh would make its faces clockwise seen
     from outside. The order of their corners is therefore reversed.
-
-    Args:
-        mesh: Mesh to transform.
-        matrix: Affine matrix, shape (4, 4). The product with a column (x, y, z, 1)
-            is the transformed point.
-
-    Returns:
-        Transformed copy of the mesh, with transformed joints.
     """
     is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
     corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
@@ -675,13 +594,6 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     The surface stays the same, but the order of the faces changes. The old
     vertices keep their indices. A new vertex of a divided face may lie in the
     middle of an edge of a neighboring face that is not divided.
-
-    Args:
-        mesh: Mesh to divide.
-        area: Largest allowed area of a face in squared world units.
-
-    Returns:
-        Divided mesh. The given mesh itself if all its faces are small enough.
     """
     is_large = mesh.face_areas() > area
     if not is_large.any():
@@ -703,15 +615,7 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
-    """Return a copy of a mesh with some of its faces and all of its vertices.
-
-    Args:
-        mesh: Mesh with F faces.
-        faces: Faces to keep: their indices, a mask of shape (F,), or a slice.
-
-    Returns:
-        Copy of the mesh with the chosen faces.
-    """
+    """Return a copy of a mesh with some of its faces and all of its vertices."""
     selected_rows = {}
     for name in PER_FACE:
         rows = getattr(mesh, name)
@@ -726,12 +630,6 @@ def _quartered(mesh: Mesh) -> Mesh:
 
     New vertices are the midpoints of edges. Two faces that share an edge also
     share its midpoint.
-
-    Args:
-        mesh: Mesh with V vertices and F faces.
-
-    Returns:
-        Mesh with 4 F faces. Its first V vertices are the old ones.
     """
     edge_ends, edge_of_side = _shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
@@ -761,18 +659,8 @@ def _quartered(mesh: Mesh) -> Mesh:
     )
 
 
-def _shared_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """List the E edges of a mesh. Sides of faces with the same two vertices are one edge.
-
-    Args:
-        faces: Vertex indices of the faces, shape (F, 3).
-
-    Returns:
-        A tuple of
-        - the two vertices of each edge, shape (E, 2);
-        - the index of the edge of each of the three sides of each face,
-          shape (F, 3).
-    """
+def _shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """List the E edges of a mesh. Sides of faces with the same two vertices are one edge."""
     vertex_count = faces.max() + 1
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
@@ -785,19 +673,13 @@ def _shared_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edge_ends, edge_of_side.reshape(-1, 3)
 
 
-def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
+def _interpolate_quarters(
+    corner_values: Float[np.ndarray, "F 3 D"],
+) -> Float[np.ndarray, "4*F 3 D"]:
     """Interpolate values at the corners of faces to the corners of the four parts of each face.
 
     The four parts are the triangles between the corners of a face and the
     midpoints of its edges.
-
-    Args:
-        corner_values: D values at the three corners of each of F faces,
-            shape (F, 3, D).
-
-    Returns:
-        Values at the three corners of each of the four parts of each face, in the
-        order of `_QUARTERS`, shape (4 F, 3, D).
     """
     # Values at both ends of each edge of each
     # face, shape (F, 3 edges, 2 ends, D).

@@ -19,6 +19,7 @@ same way.
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.vectors import unit
@@ -33,24 +34,18 @@ REFRACTIVE_INDEX = 1.5
 SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
-def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: Tensor) -> Tensor:
+def reflectance(
+    normals: Float[Tensor, "... 3"],
+    toward: Float[Tensor, "... 3"],
+    directions: Float[Tensor, "... 3"],
+    roughness: Float[Tensor, " ..."],
+) -> Float[Tensor, "3 ..."]:
     """Compute π times the specular reflectance (BRDF) for light from single directions.
 
     In the units of this project, a diffuse surface reflects the radiance
     albedo · irradiance, without the usual division by π. A specular surface
     therefore reflects π · BRDF · irradiance. The result is differentiable with
     respect to all arguments.
-
-    Args:
-        normals: Unit surface normals n, shape (..., 3). If a normal faces away
-            from the camera or the light, its cosine counts as 0.
-        toward: Unit vectors v to the camera, shape (..., 3).
-        directions: Unit vectors l to the light, shape (..., 3).
-        roughness: Roughness r in (0, 1], shape (...).
-
-    Returns:
-        π times the BRDF for each of the three Fresnel terms SCHLICK, EDGE and
-        DIELECTRIC, shape (3, ...).
     """
     # Unit half vectors h. `unit` takes vectors with their components along the first axis.
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
@@ -66,41 +61,30 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
     return torch.stack([without_fresnel * term for term in fresnel_terms])
 
 
-def distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+def distribution(
+    cosine: Float[Tensor, " ..."], alpha_squared: Float[Tensor, " ..."]
+) -> Float[Tensor, " ..."]:
     """Compute π times the GGX distribution D of the normals of microfacets.
 
     D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33.
-
-    Args:
-        cosine: Cosine n·h between surface normal and half vector, shape (...).
-        alpha_squared: Fourth power α² of the roughness, shape (...).
-
-    Returns:
-        π D, shape (...).
     """
     return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
 
 
-def masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+def masking_denominator(
+    cosine: Float[Tensor, " ..."], alpha_squared: Float[Tensor, " ..."]
+) -> Float[Tensor, " ..."]:
     """Compute the denominator of Smith's masking term G₁(c).
 
     G₁(c) is 2 c / (c + √(α² + (1 - α²) c²)). The BRDF contains
     G₁(n·l) G₁(n·v) / (4 (n·l) (n·v)), in which the numerators 2 c cancel. So only
     the denominators are needed, and the BRDF stays finite at grazing angles.
-
-    Args:
-        cosine: Cosine c between the normal and the direction to the light or to
-            the camera, shape (...). Negative cosines count as 0.
-        alpha_squared: Fourth power α² of the roughness, shape (...).
-
-    Returns:
-        Denominator, shape (...).
     """
     facing_cosine = cosine.clamp(min=0)
     return facing_cosine + (alpha_squared + (1 - alpha_squared) * facing_cosine**2).sqrt()
 
 
-def fresnel(cosine: Tensor) -> Tensor:
+def fresnel(cosine: Float[Tensor, " ..."]) -> Float[Tensor, "3 ..."]:
     """Compute three Fresnel terms, which depend on the angle between light and microfacet.
 
     A metal reflects the fraction F0 · SCHLICK + F90 · EDGE (Schlick's
@@ -110,12 +94,6 @@ def fresnel(cosine: Tensor) -> Tensor:
     g² = n² - 1 + c² and the refractive index n (REFRACTIVE_INDEX), it is
     ((g - c) / (g + c))² (1 + ((c (g + c) - 1) / (c (g - c) + 1))²) / 2
     (Walter et al. 2007, equation 22).
-
-    Args:
-        cosine: Cosine c of the angle of incidence, in [0, 1], shape (...).
-
-    Returns:
-        SCHLICK, EDGE and DIELECTRIC, each in [0, 1], shape (3, ...).
     """
     # Refractive index times the cosine of the refracted ray (Snell's law).
     refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()

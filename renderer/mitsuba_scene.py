@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from renderer.camera import Camera
@@ -98,16 +99,6 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     """Import Mitsuba, and set its variant for a `with` block.
 
     The previous variant is restored at the end of the block.
-
-    Args:
-        variant: Variant of Mitsuba, such as "scalar_rgb" or "llvm_ad_rgb".
-
-    Yields:
-        The module `mitsuba`.
-
-    Raises:
-        InputError: If Mitsuba is not installed, or if the variant needs LLVM
-            and LLVM is not installed.
     """
     try:
         import drjit
@@ -133,16 +124,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
-    """Create a Mitsuba object, such as a scene or a material, from a dictionary.
-
-    Args:
-        module: The module `mitsuba`.
-        scene: Dictionary as for `mitsuba.load_dict`, but with NumPy arrays for
-            transformations and images (see `renderer.io.mitsuba_entries`).
-
-    Returns:
-        Object of Mitsuba.
-    """
+    """Create a Mitsuba object, such as a scene or a material, from a dictionary."""
     converted = dict(scene)
     for name, value in scene.items():
         # A dictionary of the type "rgb" is a
@@ -157,19 +139,7 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """Render a scene file with Mitsuba, from the first cameras in the file.
-
-    Args:
-        path: Scene file (.xml).
-        views: Number of cameras.
-
-    Returns:
-        Linear red, green and blue radiance and coverage of each pixel, float32,
-        shape (views, 4, size, size).
-
-    Raises:
-        InputError: If Mitsuba is not installed or cannot render the file.
-    """
+    """Render a scene file with Mitsuba, from the first cameras in the file."""
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
@@ -183,16 +153,8 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     return torch.stack(images)
 
 
-def _as_square(image: np.ndarray) -> torch.Tensor:
-    """Move the channels of an image to the first axis, and stretch the image to a square.
-
-    Args:
-        image: Image of H rows and W columns, shape (H, W, C). H differs from W if
-            the camera has pixels that are not square.
-
-    Returns:
-        Square image, shape (C, W, W).
-    """
+def _as_square(image: Float[np.ndarray, "H W C"]) -> torch.Tensor:
+    """Move the channels of an image to the first axis, and stretch the image to a square."""
     channels = torch.from_numpy(image).permute(2, 0, 1)
     height, width = channels.shape[1:]
     if height == width:
@@ -206,14 +168,6 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
     In Mitsuba, the centers of the first and the last row are the poles. In our
     maps, the outer edges of these rows are the poles. If Mitsuba read one of our
     maps with 256 rows, the light would be 0.2% too dim.
-
-    Args:
-        coefficients: Spherical-harmonic coefficients of the light,
-            shape (K, 3).
-        height: Number of rows of the map.
-
-    Returns:
-        Radiance, float64, shape (height, 2 · height, 3).
     """
     # The directions of a map with a single row are horizontal: they have z = 0.
     horizontal, _ = equirectangular(1, 2 * height)
@@ -243,29 +197,20 @@ class Part:
             shape (H, W, 2). None for faces without such a texture.
     """
 
-    positions: np.ndarray
-    normals: np.ndarray
-    uvs: np.ndarray
-    colors: np.ndarray
-    texture: np.ndarray | None
-    gloss: np.ndarray | None = None
-    factors: np.ndarray | None = None
+    positions: Float[np.ndarray, "F 3 3"]
+    normals: Float[np.ndarray, "F 3 3"]
+    uvs: Float[np.ndarray, "F 3 2"]
+    colors: Float[np.ndarray, "F 3 3"]
+    texture: UInt8[np.ndarray, "H W 3"] | None
+    gloss: Float[np.ndarray, " 3"] | None = None
+    factors: UInt8[np.ndarray, "H W 2"] | None = None
 
 
-def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
+def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) -> list[Part]:
     """Split a mesh into parts, each of which has one texture and one specular reflection.
 
     Mitsuba cannot multiply a texture by corner colors. If corners of faces with a
     texture are not white, the colors are first multiplied into new textures.
-
-    Args:
-        mesh: Mesh with F faces.
-        normals: Unit normals of the three corners of each face,
-            shape (F, 3, 3).
-        encoding: Encoding of colors and textures, "linear" or "srgb".
-
-    Returns:
-        Parts in ascending order of the index of the texture and the gloss.
     """
     textured_colors = mesh.corner_colors[mesh.texture_ids >= 0]
     if (textured_colors != 1).any():
@@ -302,29 +247,13 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
 def shape(
     module: Any,
     surface: Scene,
-    positions: np.ndarray,
-    faces: np.ndarray,
-    normals: np.ndarray | None = None,
-    uvs: np.ndarray | None = None,
-    colors: np.ndarray | None = None,
+    positions: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"] | None = None,
+    uvs: Float[np.ndarray, "V 2"] | None = None,
+    colors: Float[np.ndarray, "V 3"] | None = None,
 ) -> Any:
-    """Create a Mitsuba mesh in memory.
-
-    Args:
-        module: The module `mitsuba`.
-        surface: Material as a dictionary for Mitsuba (a "bsdf").
-        positions: Positions of the vertices, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        normals: Unit normals of the vertices, shape (V, 3). None shades each face
-            with its own normal.
-        uvs: Texture coordinates of the vertices as in `Mesh`, shape (V, 2). None
-            for a mesh without texture coordinates.
-        colors: Linear colors of the vertices, shape (V, 3), which become the
-            attribute "vertex_color". None for a mesh without this attribute.
-
-    Returns:
-        Mitsuba mesh.
-    """
+    """Create a Mitsuba mesh in memory."""
     properties = module.Properties()
     properties["bsdf"] = load(module, surface)
     properties["face_normals"] = normals is None
@@ -360,21 +289,7 @@ def write_mitsuba_scene(
     light: str,
     local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
 ) -> None:
-    """Write a scene file for Mitsuba, with the mesh and texture files that it refers to.
-
-    Args:
-        folder: Folder for the files. It is created.
-        mesh: Mesh to show.
-        albedo_scale: Factor for the albedo of the mesh.
-        cameras: Cameras of the scene.
-        settings: Size, normals, encoding and bounces of the images.
-        light: Path of the environment map, relative to `folder`.
-        local_lights: Pairs of a `Lamps` or `Projector` object and its coefficients,
-            shape (N, 3).
-
-    Raises:
-        OSError: If a file cannot be written.
-    """
+    """Write a scene file for Mitsuba, with the mesh and texture files that it refers to."""
     folder.mkdir(parents=True, exist_ok=True)
     local_emitters = _local_emitters(folder, local_lights, albedo_scale)
     sky = environment({"filename": light}, math.pi * albedo_scale)
@@ -400,14 +315,7 @@ def write_mitsuba_scene(
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Append a value of a Mitsuba scene to an XML element.
-
-    Args:
-        parent: XML element.
-        name: Name of the value, or an empty string for no name.
-        value: Number, flag, string or list of numbers. An array of shape (4, 4) is a
-            transformation. A dictionary is a color, or an object such as a camera.
-    """
+    """Append a value of a Mitsuba scene to an XML element."""
     attributes = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", attributes)
@@ -435,18 +343,7 @@ def _as_text(value: Any) -> str:
 def _local_emitters(
     folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
 ) -> list[Scene]:
-    """Describe local lights for Mitsuba, and write the patterns of projectors as .exr files.
-
-    Args:
-        folder: Folder for the files.
-        lights: Pairs of a `Lamps` or `Projector` object and its coefficients,
-            shape (N, 3).
-        albedo_scale: Factor for the albedo of the mesh. The lights are multiplied
-            by it instead of the materials.
-
-    Returns:
-        Entry of each emitter for a Mitsuba scene. Patterns are names of files.
-    """
+    """Describe local lights for Mitsuba, and write the patterns of projectors as .exr files."""
     emitters: list[Scene] = []
     for basis, coefficients in lights:
         emitters += basis.mitsuba_emitters(coefficients, albedo_scale)
@@ -468,16 +365,7 @@ class _PartWriter:
     def __init__(
         self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
     ) -> None:
-        """Store the arguments, and compute the fraction of light that passes a glossy coat.
-
-        Args:
-            folder: Folder for the files.
-            number: Number of the part in the names of the files.
-            part: Part of the mesh to write.
-            encoding: Encoding of the texture, "linear" or "srgb".
-            albedo_scale: Factor for the albedo of the mesh. The lights of the scene
-                are multiplied by it instead of the materials.
-        """
+        """Store the arguments, and compute the fraction of light that passes a glossy coat."""
         self._folder = folder
         self._number = number
         self._part = part
@@ -490,11 +378,7 @@ class _PartWriter:
         self._albedo_factor = 1.0 if self._gloss is None else _reflected_albedo(self._gloss)
 
     def write(self) -> Scene:
-        """Write the mesh and the textures of the part as files.
-
-        Returns:
-            Entry of the mesh and its material for a Mitsuba scene.
-        """
+        """Write the mesh and the textures of the part as files."""
         mesh_file = self._write_mesh()
         albedo = self._albedo()
         material = {"type": "diffuse", "reflectance": albedo}
@@ -504,11 +388,7 @@ class _PartWriter:
         return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
 
     def _write_mesh(self) -> str:
-        """Write a .ply file in which each corner of each face is a vertex of its own.
-
-        Returns:
-            Name of the file.
-        """
+        """Write a .ply file in which each corner of each face is a vertex of its own."""
         import trimesh
 
         part = self._part
@@ -531,11 +411,7 @@ class _PartWriter:
         return name
 
     def _albedo(self) -> Scene:
-        """Write the texture of the part as an image file, if there is a texture.
-
-        Returns:
-            Albedo for a Mitsuba material: the image file, or the vertex colors.
-        """
+        """Write the texture of the part as an image file, if there is a texture."""
         texture = self._part.texture
         if texture is None:
             return {"type": "mesh_attribute", "name": "vertex_color"}
@@ -545,18 +421,11 @@ class _PartWriter:
         write_image(self._folder / name, Image.fromarray(image.numpy()))
         return {"type": "bitmap", "filename": name, "raw": self._encoding == "linear"}
 
-    def _glossy_material(self, gloss: np.ndarray, albedo: Scene) -> Scene:
+    def _glossy_material(self, gloss: Float[np.ndarray, " 3"], albedo: Scene) -> Scene:
         """Describe a material with specular reflection for Mitsuba.
 
         If the part has a texture of roughness and metallic, it is written as image
         files.
-
-        Args:
-            gloss: Roughness, metallic and specular factor, shape (3,).
-            albedo: Albedo for a Mitsuba material, as `_albedo` returns it.
-
-        Returns:
-            Entry of the material, of the type "principled".
         """
         roughness, metallic, specular_factor = gloss.tolist()
         # A metal has no coat and needs the full albedo, but
@@ -581,15 +450,6 @@ class _PartWriter:
 
         If the part has a texture of roughness and metallic, one channel of the
         texture is written as an image file.
-
-        Args:
-            name: "roughness" or "metallic".
-            factor: Value for all faces. If there is a texture, factor for the
-                texture.
-            minimum: Smallest value that the renderer uses.
-
-        Returns:
-            Number, or entry of the image file for a Mitsuba scene.
         """
         factors = self._part.factors
         if factors is None:
@@ -601,17 +461,11 @@ class _PartWriter:
         return {"type": "bitmap", "filename": file_name, "raw": True}
 
 
-def _reflected_albedo(gloss: np.ndarray) -> float:
+def _reflected_albedo(gloss: Float[np.ndarray, " 3"]) -> float:
     """Compute which fraction of its albedo a glossy surface reflects under uniform light.
 
     A metal reflects all of the albedo. A dielectric reflects the albedo times the
     fraction of the light that passes its coat.
-
-    Args:
-        gloss: Roughness, metallic and specular factor, shape (3,).
-
-    Returns:
-        Fraction in [0, 1].
     """
     roughness, metallic, specular_factor = torch.from_numpy(gloss).double()[:, None]
     below_coat = 1 - specular_factor * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))

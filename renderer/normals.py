@@ -10,18 +10,16 @@ Shapes use these letters: a mesh has V vertices and F faces.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_finite
 from renderer.vectors import unit
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float64, Int
 
 # `vertex_normals` adds up the area vectors of the faces around a vertex.
 # They cancel if their sum is shorter than this fraction of the sum of
@@ -47,23 +45,6 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
     ∂n/∂v = -h nᵀ / |h|². The vector h is the height of the triangle: it leads from
     the opposite edge to v and is perpendicular to this edge. (Section 3 of the
     paper "Beyond Pixel Norm-Balls" prints the wrong sign.)
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-
-    Returns:
-        Outward unit normals in the dtype of `vertices`, shape (F, 3). The normal
-        of a face without area is zero, and so is its gradient.
-
-    Raises:
-        InputError: If a position is NaN or infinite.
-
-    Example:
-        >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        >>> face_normals(corners, torch.tensor([[0, 1, 2]])).tolist()
-        [[0.0, 0.0, 1.0]]
     """
     return unit(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
@@ -79,21 +60,6 @@ def vertex_normals(
     The normal of a vertex is the mean of the normals of the faces around the
     vertex, weighted with the areas of the faces. At sharp edges, a vertex has
     several normals, each of which belongs to some of these faces.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-        normal_ids: Index of the normal of each corner (see `Mesh.normal_ids`),
-            shape (F, 3). None for one normal per vertex.
-        count: Number N of normals. None for one normal per vertex.
-
-    Returns:
-        Outward unit normals in the dtype of `vertices`, shape (N, 3). The normal
-        is zero for an index without faces, and where face normals cancel.
-
-    Raises:
-        InputError: If a position is NaN or infinite.
     """
     # Each corner of a face gets the area vector of the
     # face, shape (3 components, 3 F corners). The F first
@@ -109,20 +75,13 @@ def vertex_normals(
     return unit(sums.masked_fill(is_canceled, 0)).T.to(vertices.dtype)
 
 
-def plain_face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def plain_face_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
     """Compute the unit normals of faces with NumPy, without a gradient.
 
     Unlike `face_normals`, this function does not correct the rounding errors of
     triangles with a very small angle.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-
-    Returns:
-        Outward unit normals, shape (F, 3). The normal of a face without area is
-        zero.
     """
     doubled_vectors = doubled_area_vectors(vertices, faces)
     lengths = np.linalg.norm(doubled_vectors, axis=1, keepdims=True)
@@ -130,17 +89,10 @@ def plain_face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.divide(doubled_vectors, lengths, out=zeros, where=lengths > 0)
 
 
-def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute a vector along the normal of each face, whose length is twice the face area.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-
-    Returns:
-        Outward vectors, shape (F, 3).
-    """
+def doubled_area_vectors(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Compute a vector along the normal of each face, whose length is twice the face area."""
     # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
     # The edge a leads from the first corner of a face to the second
@@ -157,18 +109,6 @@ def area_vectors(
     """Compute a vector along the normal of each face, with a length in proportion to its area.
 
     The vectors are differentiable with respect to the vertices.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, counter-clockwise seen from outside,
-            shape (F, 3).
-
-    Returns:
-        Outward vectors, float64, shape (3, F). The ratio of length to face area is
-        the same for all faces, and is a power of two.
-
-    Raises:
-        InputError: If a position is NaN or infinite.
     """
     require_finite(vertices=vertices)
     return _AreaVectors.apply(vertices, faces)
@@ -183,20 +123,14 @@ class _AreaVectors(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "3 F"]:
         """Compute the area vector u × v of each face from its edges u and v.
 
         Edges in float64 are first divided by a power of two that all faces share.
         Products of large edges then do not overflow. The area vectors become
         smaller by the square of this power.
-
-        Args:
-            ctx: Context of autograd.
-            vertices: Vertex positions, shape (V, 3).
-            faces: Vertex indices of the faces, shape (F, 3).
-
-        Returns:
-            Area vectors, float64, shape (3, F).
         """
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
         # Positions of the corners of F faces,
@@ -227,18 +161,8 @@ class _AreaVectors(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient of the loss with respect to the vertices.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient of the loss with respect to the area vectors,
-                shape (3, F).
-
-        Returns:
-            Gradient with respect to the vertices, shape (V, 3), and None, because
-            the faces have no gradient.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "3 F"]) -> tuple[Tensor, None]:
+        """Compute the gradient of the loss with respect to the vertices."""
         faces, edge_u, edge_v, scale = ctx.saved_tensors
         # With g for `upstream`, the gradient of g · (u × v) is v × g
         # with respect to u, and g × u with respect to v. The edge u
@@ -259,20 +183,12 @@ class _AreaVectors(torch.autograd.Function):
 
 
 def _sum_at_vertices(
-    corner_gradients: Tensor, faces: Tensor, vertex_count: int, dtype: torch.dtype
-) -> Tensor:
-    """Add up the gradients of all face corners that lie at the same vertex.
-
-    Args:
-        corner_gradients: Gradient of each corner: all first corners of the F
-            faces, then all second and all third corners, shape (3, 3 F).
-        faces: Vertex indices of the corners of each face, shape (F, 3).
-        vertex_count: Number V of vertices of the mesh.
-        dtype: Type of the result.
-
-    Returns:
-        Gradient of each vertex, shape (3, V).
-    """
+    corner_gradients: Float[Tensor, "3 3*F"],
+    faces: Int[Tensor, "F 3"],
+    vertex_count: int,
+    dtype: torch.dtype,
+) -> Float[Tensor, "3 V"]:
+    """Add up the gradients of all face corners that lie at the same vertex."""
     vertex_of_corner = faces.T.flatten()
     if vertex_count < SPARSE_VERTEX_RATIO * len(vertex_of_corner):
         zeros = corner_gradients.new_zeros(3, vertex_count)
@@ -286,31 +202,19 @@ def _sum_at_vertices(
     return gradient.index_copy_(1, used_vertices, sums.to(dtype))
 
 
-def _length(vectors: Tensor) -> Tensor:
+def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
     """Compute the lengths of N vectors.
 
     torch.norm would be fifty times slower along an axis of length three.
-
-    Args:
-        vectors: Vectors, shape (3, N).
-
-    Returns:
-        Lengths, shape (N,).
     """
     return vectors.square().sum(0).sqrt()
 
 
-def _power_of_two(edges: Tensor) -> Tensor:
+def _power_of_two(edges: Tensor) -> Float[Tensor, ""]:
     """Find the smallest power of two above the magnitudes of all components of some edges.
 
     Edges that are divided by this power have components between -1 and 1, so
     products of them do not overflow. The division has no rounding error.
-
-    Args:
-        edges: Edge vectors of any shape.
-
-    Returns:
-        Power of two, shape (). It is 1 if there are no edges, or if all are zero.
     """
     if not edges.numel():
         return edges.new_ones(())
@@ -319,37 +223,24 @@ def _power_of_two(edges: Tensor) -> Tensor:
     return torch.ldexp(edges.new_ones(()), exponent)
 
 
-def _cross(u: Tensor, v: Tensor) -> Tensor:
+def _cross(u: Float[Tensor, "3 N"], v: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
     """Compute the cross products of N pairs of vectors.
 
     Unlike torch.linalg.cross, this function gives exactly zero for parallel
     vectors, because it does not fuse multiplications and additions.
-
-    Args:
-        u: First vector of each pair, shape (3, N).
-        v: Second vector of each pair, shape (3, N).
-
-    Returns:
-        Cross products u × v, shape (3, N).
     """
     ux, uy, uz = u
     vx, vy, vz = v
     return torch.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
-def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+def _exact_cross(
+    a: Float[Tensor, "3 N"], b: Float[Tensor, "3 N"], c: Float[Tensor, "3 N"]
+) -> Float[Tensor, "3 N"]:
     """Compute (b - a) × (c - a) for the corners of N triangles, almost without rounding errors.
 
     The rounding errors of differences (Knuth 1969) and of products (Dekker 1971)
     are computed and added back.
-
-    Args:
-        a: First corners, float64, shape (3, N).
-        b: Second corners, float64, shape (3, N).
-        c: Third corners, float64, shape (3, N).
-
-    Returns:
-        Cross products, shape (3, N).
     """
     u, u_error = _difference(b, a)
     v, v_error = _difference(c, a)
@@ -367,17 +258,7 @@ def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a - b, and the rounding error of this difference (Knuth 1969).
-
-    Args:
-        a: Minuend, float64, shape (N,) or (3, N).
-        b: Subtrahend, same shape.
-
-    Returns:
-        A tuple of
-        - the rounded difference;
-        - the exact difference minus the rounded difference.
-    """
+    """Compute a - b, and the rounding error of this difference (Knuth 1969)."""
     rounded = a - b
     # `negative_b` would be -b without rounding, and both errors would be 0.
     negative_b = rounded - a
@@ -386,20 +267,11 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return rounded, error_of_a - error_of_b
 
 
-def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
     """Compute a · b, and the rounding error of this product (Dekker 1971).
 
     The binary digits of each factor are split into an upper and a lower half.
     Products of two halves have no rounding error.
-
-    Args:
-        a: First factor, float64, shape (N,).
-        b: Second factor, float64, shape (N,).
-
-    Returns:
-        A tuple of
-        - the rounded product;
-        - the exact product minus the rounded product.
     """
     rounded = a * b
     a_high, a_low = _halves(a)
@@ -410,34 +282,18 @@ def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return rounded, error + a_low * b_low
 
 
-def _halves(numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971).
-
-    Args:
-        numbers: Numbers, float64, shape (N,).
-
-    Returns:
-        Upper halves and lower halves, shape (N,) each. Their sums are exactly the
-        given numbers.
-    """
+def _halves(numbers: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
+    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971)."""
     scaled = _SPLITTER * numbers
     # Both subtractions round away the lower half of the digits.
     high = scaled - (scaled - numbers)
     return high, numbers - high
 
 
-def _difference_of_products(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Compute a · b - c · d for N quadruples of numbers, almost without rounding errors.
-
-    Args:
-        a: First factor of the first product, float64, shape (N,).
-        b: Second factor of the first product, same shape.
-        c: First factor of the second product, same shape.
-        d: Second factor of the second product, same shape.
-
-    Returns:
-        Differences, shape (N,).
-    """
+def _difference_of_products(
+    a: Float[Tensor, " N"], b: Tensor, c: Tensor, d: Tensor
+) -> Float[Tensor, " N"]:
+    """Compute a · b - c · d for N quadruples of numbers, almost without rounding errors."""
     product_ab, error_ab = _product(a, b)
     product_cd, error_cd = _product(c, d)
     rounded, error = _difference(product_ab, product_cd)

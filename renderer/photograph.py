@@ -55,16 +55,6 @@ class Photograph:
         The window shows what the camera would see if it were turned toward the
         point and stayed upright. Without perspective, the window is a square of the
         photograph itself.
-
-        Args:
-            center: Column and row of the point in the photograph, in pixels,
-                shape (2,).
-            side: Side of the window in pixels.
-            z_axis: World's z-axis in the axes right, up and back of the camera that
-                took the photograph, shape (3,).
-
-        Returns:
-            Window with the point in its center.
         """
         focal_length = self.focal_length
         if focal_length is None:
@@ -122,18 +112,7 @@ class Window:
         encoding: str = "linear",
         beyond: int | None = None,
     ) -> Float[Tensor, "channels size size"]:
-        """Cut the window out of the photograph, and resample it.
-
-        Args:
-            photograph: Photograph or mask, uint8, shape (H, W, C).
-            size: Number of pixels per side of the result.
-            encoding: Encoding of the photograph, "linear" or "srgb".
-            beyond: Value of pixels outside of the photograph, from 0 to 255. None
-                repeats the pixels at the border of the photograph.
-
-        Returns:
-            Linear values in [0, 1], float32, shape (C, size, size).
-        """
+        """Cut the window out of the photograph, and resample it."""
         is_enlarged = self.side < size
         samples = 1 if is_enlarged else max(MIN_SAMPLES, math.ceil(self.side / size))
         rectangle = self._needed_rectangle()
@@ -162,15 +141,7 @@ class Window:
         return torch.cat(rows, dim=1).clamp(0, 1)
 
     def pixels(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Map points of the window to positions in the photograph.
-
-        Args:
-            x: Distances to the right of the window center in pixels, any shape.
-            y: Distances above the window center in pixels, same shape.
-
-        Returns:
-            Columns and rows in the photograph, same shape as `x` each.
-        """
+        """Map points of the window to positions in the photograph."""
         points = np.stack([x, y, np.ones_like(x)])
         columns, rows, weights = np.tensordot(self.homography, points, 1)
         return columns / weights, rows / weights
@@ -210,16 +181,7 @@ class _Rectangle:
     bottom: int
 
     def read(self, photograph: Array, beyond: int | None) -> Array:
-        """Read the pixels of the rectangle.
-
-        Args:
-            photograph: Photograph, shape (H, W, C).
-            beyond: Value of pixels outside of the photograph. None uses the value
-                of the nearest pixel.
-
-        Returns:
-            Pixels, shape (bottom - top, right - left, C).
-        """
+        """Read the pixels of the rectangle."""
         height, width = photograph.shape[:2]
         columns = np.arange(self.left, self.right)
         rows = np.arange(self.top, self.bottom)
@@ -231,14 +193,6 @@ class _Rectangle:
         return pixels
 
     def normalized(self, points: Array) -> Array:
-        """Convert positions in the photograph to coordinates for torch's `grid_sample`.
-
-        Args:
-            points: Columns and rows in the photograph in pixels, shape (..., 2).
-
-        Returns:
-            Coordinates (x, y), shape (..., 2). They go from -1 to 1 in the
-            rectangle.
-        """
+        """Convert positions in the photograph to coordinates for torch's `grid_sample`."""
         extent = [self.right - self.left, self.bottom - self.top]
         return 2 * (points - [self.left, self.top]) / extent - 1

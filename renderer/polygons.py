@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import mapbox_earcut
 import numpy as np
+from jaxtyping import Float
 
 # Axes that remain if a polygon is projected along the axis x, y or z. A
 # polygon that is counter-clockwise seen from the positive axis stays so.
@@ -12,22 +13,13 @@ _REMAINING_AXES = np.array([[1, 2], [2, 0], [0, 1]])
 _TOLERANCE = 1e-6
 
 
-def triangulate(corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+def triangulate(
+    corners: Float[np.ndarray, "C 3"], sizes: Float[np.ndarray, " P"]
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Divide polygons into triangles that cover the same area, also if the polygons are concave.
 
     All corners of a polygon are corners of its triangles, also corners on a
     straight edge. Neighboring faces therefore still share their vertices.
-
-    Args:
-        corners: Positions of the corners of all polygons, one polygon after the
-            other, shape (C, 3).
-        sizes: Number of corners of each polygon, at least 3, shape (P,).
-
-    Returns:
-        A tuple of
-        - the indices of the corners of the triangles, shape (T, 3);
-        - the polygon of each triangle, in ascending order, shape (T,);
-        - the number of polygons that intersect themselves, whose area is unclear.
     """
     starts = np.cumsum(sizes) - sizes
     triangle_counts = sizes - 2

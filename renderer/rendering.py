@@ -10,10 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera
@@ -41,9 +42,6 @@ from renderer.surface.gloss import Gloss
 from renderer.validation import as_list, as_tensor, require_kind, require_number
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import choose
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Type of a local light for `render`: a `Lamps` or a
 # `Projector` object, alone or in a pair with its coefficients.
@@ -228,22 +226,7 @@ def _white_ball() -> Mesh:
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Split a local light for `render` into its basis and its coefficients.
-
-    Args:
-        light: A `Lamps` or a `Projector` object, alone or in a pair with its
-            coefficients.
-
-    Returns:
-        A tuple of
-        - the `Lamps` or `Projector` object, which is the basis of the light;
-        - the coefficients, shape (basis.size, 3). If none were given, they are
-          white light at full power.
-
-    Raises:
-        InputError: If the light has another type, or the coefficients have a wrong
-            shape or NaN.
-    """
+    """Split a local light for `render` into its basis and its coefficients."""
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
         raise InputError(f"lights has the entry {describe(pair)}: give {_LOCAL_LIGHTS}")
@@ -409,17 +392,7 @@ def light_sphere(
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
-    """Convert one camera or a sequence of cameras to a list.
-
-    Args:
-        cameras: Camera, or sequence of cameras.
-
-    Returns:
-        List of one or more cameras.
-
-    Raises:
-        InputError: If the sequence is empty or has an entry of another type.
-    """
+    """Convert one camera or a sequence of cameras to a list."""
     if isinstance(cameras, Camera):
         return [cameras]
     expected = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
@@ -443,17 +416,7 @@ def _require_gloss(gloss: Gloss | None) -> None:
 
 
 def _as_light(light: object) -> Tensor:
-    """Convert the argument `light` to a tensor, and check its shape.
-
-    Args:
-        light: SH coefficients as a tensor, an array or a list.
-
-    Returns:
-        SH coefficients, shape ((degree + 1)², 3).
-
-    Raises:
-        InputError: If the argument is a string, or has a wrong shape.
-    """
+    """Convert the argument `light` to a tensor, and check its shape."""
     if isinstance(light, str):
         raise InputError(f"light is {light!r}: give coefficients, such as nb.load_light({light!r})")
     coefficients = as_tensor("light", light)
@@ -463,19 +426,7 @@ def _as_light(light: object) -> Tensor:
 
 
 def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
-    """Convert the argument `albedo` to a tensor, and check its shape and its values.
-
-    Args:
-        albedo: Linear albedo as a tensor, an array or a list.
-        mesh: Mesh that gets the albedo.
-
-    Returns:
-        Linear albedo.
-
-    Raises:
-        InputError: If the shape does not fit the mesh, or if a value is NaN or
-            not in [0, 1].
-    """
+    """Convert the argument `albedo` to a tensor, and check its shape and its values."""
     values = as_tensor("albedo", albedo)
     require_bounded(albedo=values)
     if values.numel() and not (values.min() >= 0 and values.max() <= MAX_ALBEDO):
@@ -494,16 +445,8 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     return values
 
 
-def _recolored(mesh: Mesh, albedo: Tensor, encoding: str) -> Mesh:
-    """Return a matte mesh with a given albedo, off which light bounces.
-
-    Args:
-        mesh: Mesh with F faces.
-        albedo: Linear albedo, shape (F, 3) for one color per face, or
-            (height, width, 3) for the only texture. The texture is rounded to 8
-            bits, which the mean over the patches of a surface evens out.
-        encoding: Encoding of the colors of the mesh, "linear" or "srgb".
-    """
+def _recolored(mesh: Mesh, albedo: Float[Tensor, "F 3"], encoding: str) -> Mesh:
+    """Return a matte mesh with a given albedo, off which light bounces."""
     colors = encode(albedo.detach().cpu().double(), encoding).numpy()
     if albedo.ndim == 3:
         texture = np.rint(255 * colors).astype(np.uint8)
@@ -520,20 +463,10 @@ def _recolored(mesh: Mesh, albedo: Tensor, encoding: str) -> Mesh:
     )
 
 
-def _sample_albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
-    """Compute the linear albedo at the samples of an image that show a mesh.
-
-    Args:
-        mesh: Mesh with F faces.
-        view: The S samples of the image that show the mesh.
-        albedo: Linear albedo to use instead of the colors of the mesh,
-            shape (F, 3) for one color per face, or (H, W, 3) for the only texture
-            of the mesh. None uses the colors of the mesh.
-        encoding: Encoding of the colors of the mesh, "linear" or "srgb".
-
-    Returns:
-        Linear albedo at the samples, shape (S, 3).
-    """
+def _sample_albedo(
+    mesh: Mesh, view: Fragments, albedo: Float[Tensor, "F 3"] | None, encoding: str
+) -> Float[Tensor, "S 3"]:
+    """Compute the linear albedo at the samples of an image that show a mesh."""
     if albedo is None:
         return surface_albedo(mesh, view, encoding)
     if albedo.shape == mesh.faces.shape:

@@ -150,34 +150,6 @@ def setting(
 
     If the value is a list, its items are checked against the range and the choices. None is
     permitted if the annotation of the field permits None.
-
-    Args:
-        default: Default value. A list or a mapping is copied for each instance. A function is
-            called for each instance. REQUIRED means that the user must give a value.
-        about: Explanation for the user.
-        unit: Unit of the value.
-        minimum: Smallest permitted value.
-        maximum: Largest permitted value.
-        above: Number that the value must exceed.
-        below: Number that the value must not reach.
-        choices: Names that the value may have.
-        is_pair: True if the value is a list of two numbers [minimum, maximum].
-        is_text: True if the annotation is Any, but the value on the command line is a name or
-            a path. The command line then reads 1.10 as text.
-        may_be_empty: True if an empty text is permitted.
-        checks_type: True checks that the value has the annotated type. False lets Python code
-            give values of other types.
-
-    Returns:
-        Field for a dataclass.
-
-    >>> from dataclasses import dataclass
-    >>> @dataclass
-    ... class EpochSettings(Settings):
-    ...     epochs: int = setting(150, "Number of passes over the images.", minimum=1)
-    >>> EpochSettings(epochs=0)
-    Traceback (most recent call last):
-    renderer.errors.InputError: epochs=0 must be at least 1
     """
     facts = Facts(
         about,
@@ -196,30 +168,12 @@ def setting(
 
 
 def setting_like(kind: type, name: str, default: Any) -> Any:
-    """Create a field with the explanation, unit and range of a field of another class.
-
-    Args:
-        kind: Settings class with the other field.
-        name: Name of the other field.
-        default: Default value of the new field.
-
-    Returns:
-        Field for a dataclass.
-    """
+    """Create a field with the explanation, unit and range of a field of another class."""
     return _field(default, facts_of(kind, name))
 
 
 def _field(default: Any, facts: Facts) -> Any:
-    """Create a field of a dataclass, and store facts about the field in its metadata.
-
-    Args:
-        default: Default value. A list or a mapping is copied for each instance, and a function
-            is called for each instance. REQUIRED for a field without a default.
-        facts: Explanation, unit, range and choices of the field.
-
-    Returns:
-        Field for a dataclass.
-    """
+    """Create a field of a dataclass, and store facts about the field in its metadata."""
     metadata = {"facts": facts}
     if default is REQUIRED:
         return field(metadata=metadata)
@@ -251,13 +205,6 @@ def facts_of(kind: type, name: str) -> Facts:
     """Return the explanation, unit, range and choices of a field.
 
     If a subclass only changes the default of a field, the facts of the parent class apply.
-
-    Args:
-        kind: Settings class.
-        name: Name of the field.
-
-    Returns:
-        Facts about the field. They are empty if no class created the field with `setting`.
     """
     for base in kind.__mro__:
         fields_of_base: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})
@@ -267,34 +214,13 @@ def facts_of(kind: type, name: str) -> Facts:
 
 
 def field_types(kind: type) -> dict[str, Any]:
-    """Return the types with which the fields of a dataclass are annotated.
-
-    Args:
-        kind: Dataclass.
-
-    Returns:
-        Types by the names of the fields.
-    """
+    """Return the types with which the fields of a dataclass are annotated."""
     hints = get_type_hints(kind)
     return {item.name: hints[item.name] for item in fields(cast(Any, kind))}
 
 
 def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) -> Kind:
-    """Create an instance of a settings class from a mapping.
-
-    Args:
-        kind: Settings class.
-        values: Value of each field by the name of the field. Fields with a default may be
-            missing.
-        argument: Name of the argument that holds the mapping. Errors begin with this name.
-
-    Returns:
-        Instance of the class.
-
-    Raises:
-        InputError: If the mapping has an unknown name, lacks a required name, or has a wrong
-            value.
-    """
+    """Create an instance of a settings class from a mapping."""
     known_fields = fields(cast(Any, kind))
     names = [known.name for known in known_fields]
     for name in values:
@@ -319,16 +245,7 @@ def _checked_fields(kind: type) -> list[tuple[str, Any, Facts]]:
 
 
 def _check_value(name: str, value: Any, facts: Facts) -> None:
-    """Check a value, or each item of a list, against the range and the choices of its field.
-
-    Args:
-        name: Name of the field, for the error.
-        value: Value of the field, but not None.
-        facts: Range and choices of the field.
-
-    Raises:
-        InputError: If the value or an item is not permitted.
-    """
+    """Check a value, or each item of a list, against the range and the choices of its field."""
     if isinstance(value, str) and not value and not facts.may_be_empty:
         raise InputError(f"{name} is empty: give a name", name)
     if facts.is_pair:
@@ -344,16 +261,7 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
 
 
 def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
-    """Check that a value is a number within some limits. NaN is outside of all limits.
-
-    Args:
-        name: Name of the field, for the error.
-        value: Value to check.
-        limits: Limits of the range. Without any limits, all values are accepted.
-
-    Raises:
-        InputError: If the value is no number, or not within the limits.
-    """
+    """Check that a value is a number within some limits. NaN is outside of all limits."""
     if limits and not is_number(value):
         raise InputError(f"{name}={describe(value)} must be a number", name)
     if not all(limit.holds(value, limit.end) for limit in limits):
@@ -362,17 +270,7 @@ def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
 
 
 def _check_pair(name: str, value: Any, facts: Facts) -> None:
-    """Check that a list is a pair [minimum, maximum] of numbers within the range of its field.
-
-    Args:
-        name: Name of the field, for the error.
-        value: List to check.
-        facts: Facts about the field, with the range in which both numbers must lie.
-
-    Raises:
-        InputError: If the list has not two numbers, if the first number is larger than the
-            second, or if a number is out of range.
-    """
+    """Check that a list is a pair [minimum, maximum] of numbers within the range of its field."""
     lower_limit = -math.inf if facts.minimum is None else facts.minimum
     upper_limit = math.inf if facts.maximum is None else facts.maximum
     if len(value) == 2 and lower_limit <= value[0] <= value[1] <= upper_limit:
@@ -389,13 +287,6 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
 
     This is for dataclasses that are not derived from `Settings`. A whole number is accepted for a
     float, and a path for a string.
-
-    Args:
-        settings: Instance of the dataclass.
-        unchecked: Names of fields that are not checked, because they accept other types, too.
-
-    Raises:
-        InputError: If a field holds a value of another type.
     """
     for name, hint, _ in _checked_fields(type(settings)):  # type: ignore[arg-type]  # types are hashable
         value = getattr(settings, name)
@@ -416,16 +307,7 @@ _CHECKS: dict[Any, Callable[[object], bool]] = {
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Tell whether a value is accepted for a field with a given type annotation.
-
-    Args:
-        value: Value to check.
-        hint: Annotation: a type such as int, a union such as `int | None`, a list type such as
-            `list[float]`, or a class.
-
-    Returns:
-        True if the value is accepted.
-    """
+    """Tell whether a value is accepted for a field with a given type annotation."""
     check = _CHECKS.get(hint)
     if check is not None:
         return check(value)
@@ -455,15 +337,7 @@ _NOUNS: dict[Any, str] = {
 
 
 def _expected(hint: Any) -> str:
-    """Describe the values that a type annotation allows, for an error.
-
-    Args:
-        hint: Annotation: a type such as int, a union such as `int | None`, a list type such as
-            `list[float]`, or a class.
-
-    Returns:
-        Description such as "a list of numbers or None".
-    """
+    """Describe the values that a type annotation allows, for an error."""
     if get_origin(hint) in (Union, types.UnionType):
         return " or ".join(_expected(option) for option in get_args(hint))
     if get_origin(hint) is list:
@@ -527,16 +401,7 @@ class ImageSettings(Settings):
 
 
 def samples_per_side(samples: int | None, silhouettes: bool) -> int:
-    """Choose the number of samples along one side of a pixel.
-
-    Args:
-        samples: Number that the user chose. None for the default.
-        silhouettes: True if gradients include visibility changes at silhouettes. The default is
-            then larger, because the documented accuracy of these gradients needs more samples.
-
-    Returns:
-        The user's number, or the default: 2, or 8 if `silhouettes` is True.
-    """
+    """Choose the number of samples along one side of a pixel."""
     if samples is not None:
         return samples
     return SILHOUETTE_SAMPLES if silhouettes else ImageSettings.samples

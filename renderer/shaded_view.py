@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.camera import Camera
@@ -41,9 +42,9 @@ class PixelRadiance(NamedTuple):
         radiance: Linear radiance times the coverage, shape (3, N).
     """
 
-    pixels: Tensor
-    coverage: Tensor
-    radiance: Tensor
+    pixels: Int[Tensor, " N"]
+    coverage: Float[Tensor, " N"]
+    radiance: Float[Tensor, "3 N"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,23 +89,19 @@ class ShadedView:
     mesh: Mesh
     fragments: Fragments
     settings: ImageSettings
-    vertices: Tensor
-    albedo: Tensor
+    vertices: Float[Tensor, "V 3"]
+    albedo: Float[Tensor, "S 3"]
     light: SplitLight
     rays: Rays | None = None
     is_moved: bool = True
     gloss: Gloss | None = None
-    corner_normals: Tensor | None = None
+    corner_normals: Float[Tensor, "F 3 3"] | None = None
     lamp_view: LocalLightView | None = None
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None
-    lamp_positions: Tensor | None = None
+    lamp_positions: Float[Tensor, "L 3"] | None = None
 
-    def radiance(self) -> Tensor:
-        """Compute the linear radiance of the P covered pixels, times their coverage.
-
-        Returns:
-            Radiance, shape (3, P).
-        """
+    def radiance(self) -> Float[Tensor, "3 P"]:
+        """Compute the linear radiance of the P covered pixels, times their coverage."""
         # Autograd adds up gradients in the reverse of this order,
         # so another order would change the last bits of gradients.
         summands = [
@@ -119,16 +116,6 @@ class ShadedView:
 
         If `settings.silhouettes` and `is_moved` are True, gradients include how
         silhouettes and surfaces move in the image.
-
-        Args:
-            camera: Camera that sees the shape. Gradients of moving silhouettes also
-                reach fields of the camera that are tensors.
-            background: Image values behind the shape, shape (3, size²) or
-                (1, size²).
-
-        Returns:
-            The covered pixels. If gradients include silhouettes, uncovered pixels
-            into which silhouettes may move follow.
         """
         if self.settings.silhouettes and self.is_moved:
             linear_background = decode(background, self.settings.encoding).expand(3, -1)
@@ -137,16 +124,8 @@ class ShadedView:
         coverage = self.fragments.coverage.to(pixel_radiance)
         return PixelRadiance(self.fragments.pixels, coverage, pixel_radiance)
 
-    def _environment_radiance(self, fragments: Fragments) -> Tensor | None:
-        """Compute the radiance of pixels under environment light, without shadows and bounces.
-
-        Args:
-            fragments: The samples that show the shape, in P pixels of the image. They
-                may also be in pixels of a finer image, with one sample each.
-
-        Returns:
-            Radiance, shape (3, P). None without environment light.
-        """
+    def _environment_radiance(self, fragments: Fragments) -> Float[Tensor, "3 P"] | None:
+        """Compute the radiance of pixels under environment light, without shadows and bounces."""
         environment = self.light.environment
         if environment is None:
             return None
@@ -155,28 +134,15 @@ class ShadedView:
             return radiance(*arguments)
         return glossy_radiance(*arguments, self._sample_gloss)
 
-    def _indirect_radiance(self) -> Tensor | None:
-        """Compute the radiance that shadows and bounces add to the P covered pixels.
-
-        Returns:
-            Radiance, which is negative in shadows, shape (3, P). None without
-            environment light, or without shadows and bounces.
-        """
+    def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
+        """Compute the radiance that shadows and bounces add to the P covered pixels."""
         environment = self.light.environment
         if environment is None or self.indirect is None:
             return None
         return self.indirect(self.albedo, environment)
 
     def _lamp_radiances(self, fragments: Fragments) -> list[Tensor]:
-        """Compute the radiance of pixels under each local light (lamps or a projector).
-
-        Args:
-            fragments: The samples that show the shape, in P pixels of the image. They
-                may also be in pixels of a finer image, with one sample each.
-
-        Returns:
-            Radiance under each local light, shape (3, P) each.
-        """
+        """Compute the radiance of pixels under each local light (lamps or a projector)."""
         radiances = []
         for basis, coefficients in self.light.local_lights:
             lamp_radiance = self._lamp_view.radiance(
@@ -185,32 +151,17 @@ class ShadedView:
             radiances.append(lamp_radiance)
         return radiances
 
-    def _sum(self, summands: Sequence[Tensor | None], fragments: Fragments) -> Tensor:
-        """Add up radiances, without those that are None.
-
-        Args:
-            summands: Radiances, shape (3, P) each, or None.
-            fragments: The covered samples, in P pixels.
-
-        Returns:
-            Sum, shape (3, P). It is 0 if all summands are None.
-        """
+    def _sum(self, summands: Sequence[Tensor | None], fragments: Fragments) -> Float[Tensor, "3 P"]:
+        """Add up radiances, without those that are None."""
         given_summands = [summand for summand in summands if summand is not None]
         if not given_summands:
             return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
         return reduce(torch.add, given_summands)
 
-    def _radiance_with_silhouettes(self, camera: Camera, background: Tensor) -> PixelRadiance:
-        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
-
-        Args:
-            camera: Camera that sees the shape.
-            background: Linear values behind the shape, shape (3, size²).
-
-        Returns:
-            The covered pixels, followed by uncovered pixels into which
-            silhouettes may move.
-        """
+    def _radiance_with_silhouettes(
+        self, camera: Camera, background: Float[Tensor, "3 size²"]
+    ) -> PixelRadiance:
+        """Compute radiance whose gradients include the movement of silhouettes and surfaces."""
         fragments = self.fragments
         # Each sample becomes a pixel of a finer
         # image, so that it is shaded alone.
@@ -241,18 +192,11 @@ class ShadedView:
             radiance=F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient,
         )
 
-    def _divide_among_samples(self, pixel_radiance: Tensor) -> Tensor:
+    def _divide_among_samples(self, pixel_radiance: Float[Tensor, "3 P"]) -> Float[Tensor, "3 S"]:
         """Divide the radiance of each pixel among its samples, in proportion to their albedo.
 
         The radiance of shadows and bounces is only known for whole pixels, but
         the gradients of silhouettes need the radiance of each sample.
-
-        Args:
-            pixel_radiance: Radiance of each pixel, which is the sum over its samples
-                divided by the number of samples per pixel, shape (3, P).
-
-        Returns:
-            Radiance of each covered sample, shape (3, S).
         """
         sample_to_pixel = self.fragments.sample_to_pixel
         sample_albedo = self.albedo.detach().T

@@ -6,14 +6,11 @@ Shapes use these letters: a mesh has V vertices, which J joints move.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Value of `Skin.parents` for a joint without a parent.
 NO_PARENT = -1
@@ -41,9 +38,9 @@ class Skin:
     """
 
     names: tuple[str, ...]
-    parents: np.ndarray
-    pivots: np.ndarray
-    carried: np.ndarray
+    parents: Int[np.ndarray, " J"]
+    pivots: Float[np.ndarray, "J 3"]
+    carried: Float[np.ndarray, "V J 4"]
 
     def displacements(self, rotations: Float[Tensor, "J 3 3"]) -> Float[Tensor, "V 3"]:
         """Compute how far the V vertices move if the J joints rotate about their pivots.
@@ -51,13 +48,6 @@ class Skin:
         A joint also rotates its children. The rotation of a child is applied
         before the rotation of its parent. The result is differentiable with
         respect to the rotations.
-
-        Args:
-            rotations: Rotation matrix of each joint in the axes of the mesh,
-                shape (J, 3, 3).
-
-        Returns:
-            Displacements of the vertices in the axes of the mesh, shape (V, 3).
         """
         # Subtracting the identity from the matrix of a joint gives a
         # matrix that maps a point (x, y, z, 1) to its displacement.
@@ -71,17 +61,8 @@ class Skin:
         # The matrix product adds up the displacements by all joints.
         return carried @ displacement_matrix
 
-    def _joint_matrices(self, rotations: Tensor) -> list[Tensor]:
-        """Compute the affine matrix with which each joint moves points.
-
-        Args:
-            rotations: Rotation matrix of each joint in the axes of the mesh,
-                shape (J, 3, 3).
-
-        Returns:
-            Matrix of each joint, shape (4, 3). A row (x, y, z, 1) times this matrix
-            is the point that the joint and all joints above it have moved.
-        """
+    def _joint_matrices(self, rotations: Float[Tensor, "J 3 3"]) -> list[Tensor]:
+        """Compute the affine matrix with which each joint moves points."""
         matrices: list[Tensor] = []
         pivots = torch.from_numpy(self.pivots).to(rotations)
         for parent, pivot, rotation in zip(self.parents, pivots, rotations, strict=True):
@@ -100,16 +81,8 @@ class Skin:
             matrices.append(matrix)
         return matrices
 
-    def transformed(self, matrix: np.ndarray) -> Skin:
-        """Return the skin of a mesh after an affine transformation of the mesh.
-
-        Args:
-            matrix: Affine matrix of the transformation, shape (4, 4). The product
-                with a column (x, y, z, 1) is the transformed point.
-
-        Returns:
-            Copy with transformed pivots and positions.
-        """
+    def transformed(self, matrix: Float[np.ndarray, "4 4"]) -> Skin:
+        """Return the skin of a mesh after an affine transformation of the mesh."""
         linear_part = matrix[:3, :3]
         pivots = self.pivots @ linear_part.T + matrix[:3, 3]
         carried = (self.carried @ matrix.T).astype(np.float32)

@@ -20,6 +20,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from renderer.errors import require_choice, require_range
@@ -222,17 +223,8 @@ def cup(rng: np.random.Generator) -> Mesh:
     return concatenate([body, Mesh.plain(handle_vertices, handle_faces, glaze)])
 
 
-def _handle(end_radii: np.ndarray) -> np.ndarray:
-    """Create the rings of points of the handle of a cup: a tube that is bent in the xz-plane.
-
-    Args:
-        end_radii: Distances of the lower and of the upper end of the tube from the
-            axis of the cup, shape (2,).
-
-    Returns:
-        19 rings of 12 points each, which `loft` connects, shape (19, 12, 3). The
-        first and the last ring have the radius 0, which closes the tube.
-    """
+def _handle(end_radii: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "19 12 3"]:
+    """Create the rings of points of the handle of a cup: a tube that is bent in the xz-plane."""
     x_axis = [1, 0, 0]
     y_axis = [0, 1, 0]
     z_axis = [0, 0, 1]
@@ -401,17 +393,8 @@ def fruit(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(vertices, faces, colors)
 
 
-def _random_shade(rng: np.random.Generator, hue: float) -> np.ndarray:
-    """Draw a color of a given hue with a random saturation and brightness (HSV).
-
-    Args:
-        rng: Random numbers.
-        hue: Hue as a fraction of the color circle. It is clipped to LOWEST_HUE
-            and HIGHEST_HUE, so that it is not the hue of an orange.
-
-    Returns:
-        RGB color, shape (3,).
-    """
+def _random_shade(rng: np.random.Generator, hue: float) -> Float[np.ndarray, " 3"]:
+    """Draw a color of a given hue with a random saturation and brightness (HSV)."""
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
     value = rng.uniform(0.3, 0.95)
@@ -446,17 +429,7 @@ HARD_NEGATIVES: dict[str, Maker] = {
 
 @cache
 def sphere(subdivisions: int = SUBDIVISIONS) -> tuple[np.ndarray, np.ndarray]:
-    """Create a unit sphere of triangles of similar size.
-
-    Args:
-        subdivisions: Number of times that each of the 20 triangles of an
-            icosahedron is divided into four.
-
-    Returns:
-        A tuple of
-        - the vertices, shape (V, 3);
-        - the faces, shape (F, 3).
-    """
+    """Create a unit sphere of triangles of similar size."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 
@@ -471,16 +444,6 @@ def revolve(
 
     The profile is a polygonal line from the axis back to the axis,
     counter-clockwise around the right half of the cross section of the solid.
-
-    Args:
-        *sections: Consecutive sections of the profile. Each is a list of points
-            (radius, height) and begins where the previous section ends.
-
-    Returns:
-        A tuple of
-        - vertices, shape (V, 3);
-        - faces, shape (F, 3);
-        - the index of the section to which each face belongs, shape (F,).
     """
     profile, section_of_piece = _divided_profile(sections)
     azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
@@ -497,18 +460,7 @@ def revolve(
 def _divided_profile(
     sections: Sequence[np.ndarray | Sequence[tuple[float, float]]],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Join the sections of a profile, and divide its long edges into pieces of equal length.
-
-    Args:
-        sections: Points (radius, height) of each section of the profile.
-
-    Returns:
-        A tuple of
-        - the P points (radius, height) of the profile, with points on its long
-          edges, shape (P, 2);
-        - the index of the section of each of the P - 1 pieces between neighboring
-          points, shape (P - 1,).
-    """
+    """Join the sections of a profile, and divide its long edges into pieces of equal length."""
     corners = np.concatenate(sections)
     point_counts = [len(section) for section in sections]
     section_of_corner = np.repeat(np.arange(len(sections)), point_counts)
@@ -527,22 +479,8 @@ def _divided_profile(
     return profile, section_of_corner[edge_of_piece + 1]
 
 
-def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Create a closed surface that connects each ring of points to the next ring.
-
-    Args:
-        rings: R rings of P points each, shape (R, P, 3). The points are
-            counter-clockwise about the direction from the first ring to the last.
-            The points of the first ring are all at the same place, and so are the
-            points of the last ring. This closes the surface.
-
-    Returns:
-        A tuple of
-        - vertices, shape (V, 3);
-        - faces, shape (F, 3);
-        - the index of the first one of the two rings between which each face lies,
-          shape (F,).
-    """
+def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Create a closed surface that connects each ring of points to the next ring."""
     ring_count, point_count = rings.shape[:2]
     first_point = rings[0, :1]
     last_point = rings[-1, :1]
@@ -569,18 +507,8 @@ def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return vertices, faces[has_area], ring_of_face[has_area]
 
 
-def surface_of_cells(is_filled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Create the surface of a solid that consists of cubic cells of a grid.
-
-    Args:
-        is_filled: True for the cells that belong to the solid, shape (X, Y, Z) for
-            X, Y and Z cells along the axes.
-
-    Returns:
-        A tuple of
-        - the vertices in units of cells, shape (V, 3);
-        - the faces, shape (F, 3).
-    """
+def surface_of_cells(is_filled: Bool[np.ndarray, "X Y Z"]) -> tuple[np.ndarray, np.ndarray]:
+    """Create the surface of a solid that consists of cubic cells of a grid."""
     padded = np.pad(is_filled, 1)
     unit_vectors = np.eye(3, dtype=int)
     squares = []
@@ -606,19 +534,13 @@ def surface_of_cells(is_filled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, triangles.reshape(-1, 3)
 
 
-def paint(vertices: np.ndarray, faces: np.ndarray, section: np.ndarray, *colors: ArrayLike) -> Mesh:
-    """Create a mesh whose faces have the colors of the sections to which they belong.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        section: Index of the section to which each face belongs, shape (F,).
-        *colors: Color of each section: one RGB color, shape (3,), or one color per
-            vertex, shape (V, 3).
-
-    Returns:
-        Mesh with these colors.
-    """
+def paint(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    section: Int[np.ndarray, " F"],
+    *colors: ArrayLike,
+) -> Mesh:
+    """Create a mesh whose faces have the colors of the sections to which they belong."""
     # Color that each vertex has in each section, shape (sections, V, 3).
     vertex_colors = np.stack([np.broadcast_to(color, vertices.shape) for color in colors])
     # The color of a corner depends on the
@@ -627,49 +549,27 @@ def paint(vertices: np.ndarray, faces: np.ndarray, section: np.ndarray, *colors:
     return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
 
 
-def arc(center: ArrayLike, radii: ArrayLike, start: float, stop: float) -> np.ndarray:
-    """Create points on an arc of an ellipse, for the profile of a surface of revolution.
-
-    Args:
-        center: Center of the ellipse as (radius, height).
-        radii: Semi-axes of the ellipse along the radius and along the height.
-        start: Angle of the first point in degrees: 0 is away from the axis of
-            revolution, and 90 is up.
-        stop: Angle of the last point in degrees.
-
-    Returns:
-        Points (radius, height), shape (ARC_POINTS, 2).
-    """
+def arc(
+    center: ArrayLike, radii: ArrayLike, start: float, stop: float
+) -> Float[np.ndarray, "ARC_POINTS 2"]:
+    """Create points on an arc of an ellipse, for the profile of a surface of revolution."""
     angle = np.radians(np.linspace(start, stop, ARC_POINTS))[:, None]
     on_unit_circle = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
     return np.array(center) + radii * on_unit_circle
 
 
-def bump(x: np.ndarray) -> np.ndarray:
-    """Evaluate exp(-x²), which is 1 at 0, and almost 0 from a distance of 2 on.
-
-    Args:
-        x: Positions, shape (...).
-
-    Returns:
-        Values, same shape.
-    """
+def bump(x: Float[np.ndarray, " ..."]) -> np.ndarray:
+    """Evaluate exp(-x²), which is 1 at 0, and almost 0 from a distance of 2 on."""
     return np.exp(-(x**2))
 
 
-def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> np.ndarray:
+def ripples(
+    rng: np.random.Generator, points: Float[np.ndarray, "V 3"], wavelength: float
+) -> Float[np.ndarray, " V"]:
     """Draw a smooth random field, and evaluate it at points.
 
     The field is a sum of plane waves in random directions, with the mean 0 and
     the variance 1.
-
-    Args:
-        rng: Random numbers for directions and phases of the waves.
-        points: Points, shape (V, 3).
-        wavelength: Wavelength in world units.
-
-    Returns:
-        Value of the field at each point, shape (V,).
     """
     wave_vectors = rng.normal(size=(3, WAVES))
     wave_vectors *= 2 * np.pi / wavelength / np.linalg.norm(wave_vectors, axis=0)
@@ -681,28 +581,15 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
     return waves.sum(axis=1) / 4
 
 
-def choose(rng: np.random.Generator, *colors: tuple[float, float, float]) -> np.ndarray:
-    """Draw one of several colors, and change it by up to 0.04 per channel.
-
-    Args:
-        rng: Random numbers.
-        *colors: RGB colors in [0, 1].
-
-    Returns:
-        RGB color, shape (3,).
-    """
+def choose(
+    rng: np.random.Generator, *colors: tuple[float, float, float]
+) -> Float[np.ndarray, " 3"]:
+    """Draw one of several colors, and change it by up to 0.04 per channel."""
     return np.clip(rng.choice(colors) + rng.uniform(-0.04, 0.04, 3), 0, 1)
 
 
-def mix(from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray) -> np.ndarray:
-    """Interpolate between two colors.
-
-    Args:
-        from_color: RGB color at weight 0, shape (3,) or (V, 3).
-        to_color: RGB color at weight 1, shape (3,) or (V, 3).
-        weight: Weight, clipped to [0, 1], shape (V,) or a number.
-
-    Returns:
-        RGB colors, shape (V, 3).
-    """
+def mix(
+    from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray
+) -> Float[np.ndarray, "V 3"]:
+    """Interpolate between two colors."""
     return from_color + np.clip(weight, 0, 1)[..., None] * (np.asarray(to_color) - from_color)

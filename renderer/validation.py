@@ -33,23 +33,6 @@ def as_tensor(name: str, value: object) -> Tensor:
     A floating-point tensor is returned unchanged. A floating-point NumPy array
     keeps its precision. Integers, numbers and lists become float32. Lists of
     tensors are stacked and stay differentiable.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Tensor, NumPy array, number, or nested lists of numbers.
-
-    Returns:
-        Tensor with the shape of the value.
-
-    Raises:
-        InputError: If the value is anything else, such as complex numbers,
-            strings, None or lists of unequal lengths.
-
-    >>> as_tensor("light", [[1, 2, 3]])
-    tensor([[1., 2., 3.]])
-    >>> as_tensor("light", "grace")
-    Traceback (most recent call last):
-    renderer.errors.InputError: light is 'grace': give a tensor, an array or a list of numbers
     """
     if isinstance(value, Tensor):
         if value.is_floating_point():
@@ -80,19 +63,7 @@ def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
 
 
 def as_integers(name: str, value: object) -> Tensor:
-    """Convert an argument, such as labels or indices, to an int64 tensor.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Tensor or NumPy array of integers, a whole number, or nested
-            lists of whole numbers. An empty tensor or list may have any type.
-
-    Returns:
-        int64 tensor with the shape of the value.
-
-    Raises:
-        InputError: If the value is anything else.
-    """
+    """Convert an argument, such as labels or indices, to an int64 tensor."""
     if isinstance(value, Tensor):
         is_real = not value.is_complex() and value.dtype != torch.bool
         has_integers = is_real and not value.is_floating_point()
@@ -108,15 +79,7 @@ def as_integers(name: str, value: object) -> Tensor:
 
 
 def _as_numbers(value: object) -> np.ndarray | None:
-    """Convert a value to an array of real numbers that torch can read.
-
-    Args:
-        value: Any value, such as an array, a number or nested lists.
-
-    Returns:
-        Contiguous array, or None if the value contains anything but real numbers,
-        or lists of unequal lengths.
-    """
+    """Convert a value to an array of real numbers that torch can read."""
     # NumPy calls methods of the value, such as
     # `__array__`. They can raise any exception.
     try:
@@ -134,20 +97,7 @@ def _as_numbers(value: object) -> np.ndarray | None:
 
 
 def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
-    """Convert an argument to a NumPy array of real numbers.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: NumPy array, tensor, number, or nested lists of numbers.
-        kinds: Allowed types of the numbers, as letters of `dtype.kind`. "iu" allows
-            only integers. The default also allows floating-point numbers.
-
-    Returns:
-        Array. If the value is an array already, it is returned unchanged.
-
-    Raises:
-        InputError: If the value is anything else.
-    """
+    """Convert an argument to a NumPy array of real numbers."""
     array = _as_numbers(value.detach().cpu() if isinstance(value, Tensor) else value)
     if array is None or (array.dtype.kind not in kinds and array.size):
         noun = "numbers" if "f" in kinds else "whole numbers"
@@ -156,37 +106,14 @@ def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
 
 
 def as_path(name: str, value: object) -> Path:
-    """Convert an argument to a `Path`.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Path as a string or as a `Path`.
-
-    Returns:
-        Path.
-
-    Raises:
-        InputError: If the value has another type.
-    """
+    """Convert an argument to a `Path`."""
     if isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str):
         return Path(value)
     raise InputError(f"{name} is {describe(value)}: give a path as a string", name)
 
 
 def as_folder(name: str, value: object) -> Path:
-    """Convert an argument to the path of a folder that exists or can be created.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Path as a string or as a `Path`.
-
-    Returns:
-        Path.
-
-    Raises:
-        InputError: If the value is no path, or if the path or a folder above it
-            is a file.
-    """
+    """Convert an argument to the path of a folder that exists or can be created."""
     path = as_path(name, value)
     for ancestor in (path, *path.absolute().parents):
         if not os.path.lexists(ancestor):
@@ -204,22 +131,7 @@ def as_folder(name: str, value: object) -> Path:
 
 
 def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
-    """Convert an argument to a list, and check the type of its items.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: List, tuple or another ordered iterable, but not a string, mapping
-            or set.
-        kind: Type that each item must have, or a tuple of types.
-        expected: Words for what the user should give, such as "a list of cameras",
-            for the error.
-
-    Returns:
-        List of the items.
-
-    Raises:
-        InputError: If the value is not a list, or if an item has another type.
-    """
+    """Convert an argument to a list, and check the type of its items."""
     # The types Tensor and np.ndarray are iterable,
     # but a value of shape () has no items.
     is_scalar = isinstance(value, Tensor | np.ndarray) and not value.ndim
@@ -234,47 +146,20 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
 
 
 def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
-    """Check the type of an argument.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value of the argument.
-        kind: Required type, or a tuple of types.
-        expected: Words for what the user should give, such as "a whole number", for
-            the error.
-
-    Raises:
-        InputError: If the value has another type.
-    """
+    """Check the type of an argument."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
 
 
 def require_whole(name: str, value: object) -> None:
-    """Check that an argument is a whole number.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value of the argument.
-
-    Raises:
-        InputError: If the value has another type, such as float or bool.
-    """
+    """Check that an argument is a whole number."""
     require_kind(name, value, Integral, "a whole number")
     if isinstance(value, bool):
         raise InputError(f"{name} is {value}: give a whole number", name)
 
 
 def require_number(name: str, value: object) -> None:
-    """Check that an argument is one real number.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value of the argument.
-
-    Raises:
-        InputError: If the value has another type, such as str, bool or None.
-    """
+    """Check that an argument is one real number."""
     if not is_number(value):
         raise InputError(f"{name} is {describe(value)}: give a number", name)
 
@@ -283,28 +168,13 @@ def require_flag(name: str, value: object) -> None:
     """Check that an argument is True or False. The numbers 1 and 0 are accepted, too.
 
     Without this check, a string such as "no" would count as True.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value of the argument.
-
-    Raises:
-        InputError: If the value is anything else.
     """
     if not is_flag(value):
         raise InputError(f"{name} is {describe(value)}: give True or False", name)
 
 
 def require_seed(name: str, value: object) -> None:
-    """Check that an argument can be the seed of random numbers.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: Value of the argument.
-
-    Raises:
-        InputError: If the value is not a whole number of at least 0.
-    """
+    """Check that an argument can be the seed of random numbers."""
     require_whole(name, value)
     if int(value) < 0:  # type: ignore[call-overload]
         raise InputError(f"{name}={value} is negative: give a whole number of at least 0", name)

@@ -3,28 +3,16 @@
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 
-def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
+def unit_vectors(vectors: Float[Tensor, "3 ..."]) -> tuple[Tensor, Tensor]:
     """Compute the unit vectors and the lengths of vectors.
 
     No square overflows or underflows. The three components are along the first
     axis, because adding rows is faster than adding columns.
-
-    Args:
-        vectors: Vectors, shape (3, ...).
-
-    Returns:
-        A tuple of
-        - the unit vectors, shape (3, ...). A zero vector stays zero;
-        - the lengths of the vectors, shape (...).
-
-    Example:
-        >>> directions, lengths = unit_vectors(torch.tensor([[3.0], [0.0], [4.0]]))
-        >>> directions.flatten().tolist(), lengths.tolist()
-        ([0.6000000238418579, 0.0, 0.800000011920929], [5.0])
     """
     largest = vectors.abs().amax(0)
     # The largest component of each scaled vector is 1 or -1.
@@ -34,23 +22,11 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     return scaled / scaled_length.clamp(min=1), scaled_length * largest
 
 
-def unit(vectors: Tensor) -> Tensor:
+def unit(vectors: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
     """Divide vectors by their lengths.
 
     The result can be differentiated once with respect to the vectors, but has no
     second derivatives.
-
-    Args:
-        vectors: Vectors, with the three components along the first axis,
-            shape (3, ...).
-
-    Returns:
-        Unit vectors, shape (3, ...). A zero vector stays zero, and the gradient
-        with respect to this vector is zero.
-
-    Example:
-        >>> unit(torch.tensor([[0.0], [2.0], [0.0]])).flatten().tolist()
-        [0.0, 1.0, 0.0]
     """
     return _Unit.apply(vectors)
 
@@ -59,33 +35,16 @@ class _Unit(torch.autograd.Function):
     """Division of vectors by their lengths, with the gradient 0 for a zero vector."""
 
     @staticmethod
-    def forward(ctx: Any, vectors: Tensor) -> Tensor:
-        """Divide vectors by their lengths.
-
-        Args:
-            ctx: Context of autograd.
-            vectors: Vectors, shape (3, ...).
-
-        Returns:
-            Unit vectors, shape (3, ...).
-        """
+    def forward(ctx: Any, vectors: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
+        """Divide vectors by their lengths."""
         directions, lengths = unit_vectors(vectors)
         ctx.save_for_backward(directions, lengths)
         return directions
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> Tensor:
-        """Compute the gradient of the loss with respect to the vectors.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient of the loss with respect to the unit vectors,
-                shape (3, ...).
-
-        Returns:
-            Gradient with respect to the vectors, shape (3, ...).
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
+        """Compute the gradient of the loss with respect to the vectors."""
         directions, lengths = ctx.saved_tensors
         # A change of a vector along itself does not change its unit vector.
         perpendicular = upstream - directions * (directions * upstream).sum(0)
@@ -98,22 +57,6 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
 
     The source of the formula is Duff et al. 2017, "Building an orthonormal
     basis, revisited".
-
-    Args:
-        x: First component of the unit vector: a number, or an array or a tensor
-            of any shape for several vectors.
-        y: Second component, same shape.
-        z: Third component, same shape.
-        sign: 1 or -1 for each vector. For z = -sign, the formula divides by 0.
-            Nearby vectors with the same sign have nearby results.
-
-    Returns:
-        Components [x, y, z] of the first orthogonal vector, and then those of
-        the second one.
-
-    Example:
-        >>> tangent_axes(0.0, 0.0, 1.0, 1)
-        [[1.0, -0.0, -0.0], [-0.0, 1.0, -0.0]]
     """
     a = -1 / (sign + z)
     b = x * y * a
@@ -122,22 +65,8 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
     return [first, second]
 
 
-def rotation_matrices(vectors: Tensor) -> Tensor:
-    """Convert rotation vectors to rotation matrices.
-
-    Args:
-        vectors: Rotation vectors, shape (..., 3). The direction of a vector is
-            the axis of the rotation, and its length is the angle in degrees.
-
-    Returns:
-        Rotation matrices, shape (..., 3, 3). They are differentiable with respect
-        to the vectors.
-
-    Example:
-        >>> quarter = torch.tensor([0, 0, 90.0])
-        >>> (rotation_matrices(quarter) @ torch.tensor([1.0, 0, 0])).round() + 0
-        tensor([0., 1., 0.])
-    """
+def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+    """Convert rotation vectors to rotation matrices."""
     radians = torch.deg2rad(vectors)
     axes = torch.eye(3).to(radians).expand(*radians.shape, 3)
     # Row i is the cross product of the rotation

@@ -10,12 +10,6 @@ def list_parameters(words: list[str]) -> list[str]:
 
     With reload=FOLDER and without attack=, the command only shows a saved
     adversary. attack=[] is then added, which means no attack.
-
-    Args:
-        words: Words of the command line.
-
-    Returns:
-        Words of the command line in which the attack is a list.
     """
     keys = {word.partition("=")[0] for word in words}
     rewritten = []

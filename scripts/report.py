@@ -11,12 +11,6 @@ def name_folders(words: list[str]) -> list[str]:
     """Replace the paths of folders on a command line by one setting, runs=[...].
 
     For example, "runs/a runs/b out=page" becomes "out=page runs=[runs/a,runs/b]".
-
-    Args:
-        words: Words of the command line.
-
-    Returns:
-        Words of the command line, with runs=[...] at the end.
     """
     folders = [word for word in words if names_folder(word)]
     other_words = [word for word in words if not names_folder(word)]

@@ -38,11 +38,7 @@ class TrainCommand(Command):
             import_function("train.commands.sweep:sweep")(super().__call__, overrides)
 
     def work(self, config: DictConfig) -> None:
-        """Train one run. With --multirun, Hydra calls this method for each run.
-
-        Args:
-            config: Configuration of the run, as Hydra composed it.
-        """
+        """Train one run. With --multirun, Hydra calls this method for each run."""
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:
             config.run = job.runtime.output_dir
@@ -56,14 +52,7 @@ class TrainCommand(Command):
 
 
 def name_model(words: list[str]) -> list[str]:
-    """Replace model=NAME, a short form of model.name=NAME, in the command line.
-
-    Args:
-        words: Arguments of the command line.
-
-    Returns:
-        Arguments, in which model={...} stays, because it sets several fields.
-    """
+    """Replace model=NAME, a short form of model.name=NAME, in the command line."""
     renamed = []
     for word in words:
         has_name = word.startswith("model=") and not word.startswith("model={")

@@ -14,39 +14,12 @@ from train.settings import OTHER, ExperimentSettings, label_names, simplified, s
 
 
 def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
-    """Return the name of a class of a network, which is given by its name or its index.
-
-    Args:
-        classes: Names of all classes of the network.
-        label: Name of the class, or its index.
-        key: Setting that has the label, for the error message.
-
-    Returns:
-        Name of the class.
-
-    Raises:
-        InputError: If the network has no such class.
-    """
+    """Return the name of a class of a network, which is given by its name or its index."""
     return classes[class_index(classes, label, key)]
 
 
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
-    """Return the settings of a mesh, in which its class is given by name instead of by index.
-
-    Args:
-        item: File, "solid:NAME", or mapping with the fields of `ObjectSettings`.
-            Only the mapping can have a label.
-        classes: Names of all classes of a network.
-        key: Setting that lists the mesh, for the error message.
-
-    Returns:
-        Mapping with the name of the class as its label. `item` itself if it has
-        no label, or a label that no network has, such as "other" or
-        "other_lemon".
-
-    Raises:
-        InputError: If the network lacks the class of the mesh.
-    """
+    """Return the settings of a mesh, in which its class is given by name instead of by index."""
     label = item.get("label") if isinstance(item, dict) else None
     if label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX):
         return item
@@ -57,14 +30,6 @@ def class_of_name(name: str, classes: Sequence[str]) -> str | None:
     """Find the class of a network that a name means, such as "sweet pepper" for "Sweet_Pepper".
 
     Upper and lower case, "_", "-" and spaces make no difference.
-
-    Args:
-        name: Name of a class as a user writes it.
-        classes: Names of all classes of the network.
-
-    Returns:
-        Name of the class as the network has it. None if no class matches, or if
-        several classes match and none of them is exactly `name`.
     """
     matches = [known for known in classes if simplified(known) == simplified(name)]
     if name in matches:
@@ -73,20 +38,7 @@ def class_of_name(name: str, classes: Sequence[str]) -> str | None:
 
 
 def name_of_mesh(mesh: str) -> str:
-    """Return what a mesh shows according to its name: NAME of "solid:NAME" or "NAME.glb".
-
-    Args:
-        mesh: Path of a file, or "solid:NAME" or "solid:NAME:SEED" for a
-            generated mesh.
-
-    Returns:
-        NAME of the solid, or the name of the file without its suffix.
-
-    >>> name_of_mesh("meshes/banana.glb")
-    'banana'
-    >>> name_of_mesh("solid:orange:7")
-    'orange'
-    """
+    """Return what a mesh shows according to its name: NAME of "solid:NAME" or "NAME.glb"."""
     return solid_name(mesh) or Path(mesh).stem
 
 
@@ -95,19 +47,6 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
 
     Without a label, the file "banana.glb" and the solid "solid:banana" are of the
     class "banana".
-
-    Args:
-        items: The meshes. Each is a file, "solid:NAME", or a mapping with the
-            fields of `ObjectSettings`, which can have a label.
-        classes: Names of all classes of a network.
-        key: Setting that lists the meshes, for the error message.
-
-    Returns:
-        Name of the class of each mesh.
-
-    Raises:
-        InputError: If the network lacks the class of a mesh, or if a mesh has no
-            label and its name is not the name of a class.
     """
     found = []
     for index, item in enumerate(items):
@@ -121,12 +60,7 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
 
 
 def _class_of_unlabeled_mesh(mesh: str, classes: Sequence[str]) -> str:
-    """Find the class of a mesh by its name, and raise InputError if no class has this name.
-
-    Args:
-        mesh: File, or "solid:NAME".
-        classes: Names of all classes of the network.
-    """
+    """Find the class of a mesh by its name, and raise InputError if no class has this name."""
     name = class_of_name(name_of_mesh(mesh), classes)
     if name is None:
         raise _unknown_class_error(mesh, classes)
@@ -134,12 +68,7 @@ def _class_of_unlabeled_mesh(mesh: str, classes: Sequence[str]) -> str:
 
 
 def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
-    """Create the error for a mesh whose class is unknown.
-
-    Args:
-        mesh: File, or "solid:NAME". Its name is not the name of a class.
-        classes: Names of all classes of the network.
-    """
+    """Create the error for a mesh whose class is unknown."""
     solid = solid_name(mesh)
     if not solid and not Path(mesh).exists():
         return InputError(f"{mesh} does not exist: give the path of a mesh, or solid:NAME")
@@ -156,21 +85,7 @@ def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
 
 
 def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:
-    """Find the class of meshes that are all of one class.
-
-    Args:
-        items: The meshes. Each is a file, "solid:NAME", or a mapping with the
-            fields of `ObjectSettings`, which can have a label.
-        classes: Names of all classes of a network.
-        key: Setting that lists the meshes, for the error message.
-
-    Returns:
-        Name of the class.
-
-    Raises:
-        InputError: If the class of a mesh is unknown, or if the meshes are of
-            several classes.
-    """
+    """Find the class of meshes that are all of one class."""
     found = set(classes_of_meshes(items, classes, key))
     if len(found) != 1:
         raise InputError(
@@ -188,17 +103,6 @@ def require_others(
 
     With several positive classes, an object of one of them may be a hard
     negative for the others. The settings must then give its class as a label.
-
-    Args:
-        hard_negatives: Hard negatives by their keys, such as
-            "scene.hard_negatives[0]". The label of an object without a class is
-            empty, "other", or begins with "other_".
-        labels: Names of the positive classes.
-        classes: Names of all classes of the network.
-
-    Raises:
-        InputError: If a hard negative is of a positive class, or has a label
-            that the network lacks.
     """
     for key, item in hard_negatives.items():
         is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
@@ -218,19 +122,7 @@ def require_others(
 def with_classes_of_meshes(
     settings: ExperimentSettings, classes: Sequence[str]
 ) -> ExperimentSettings:
-    """Fill in the missing label of the settings of a run from the classes of its meshes.
-
-    Args:
-        settings: Settings of a run. Their label is None.
-        classes: Names of all classes of the network.
-
-    Returns:
-        Copy of the settings. The label lists the classes of the meshes, each
-        class once. Each mesh has its class as a label.
-
-    Raises:
-        InputError: If the class of a mesh is unknown.
-    """
+    """Fill in the missing label of the settings of a run from the classes of its meshes."""
     items = settings.scene.meshes
     names = classes_of_meshes(items, classes, "scene.meshes")
     meshes = []
@@ -251,19 +143,7 @@ def with_classes_of_meshes(
 
 
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
-    """Replace the indices of classes in the settings of a run by the names of the classes.
-
-    Args:
-        settings: Settings of a run. Their label is not None.
-        classes: Names of all classes of the network.
-
-    Returns:
-        Copy of the settings with names in the label and in the labels of the
-        meshes and hard negatives.
-
-    Raises:
-        InputError: If the network lacks a class.
-    """
+    """Replace the indices of classes in the settings of a run by the names of the classes."""
     names = [class_name(classes, name, "label") for name in label_names(settings.label)]
     meshes = [with_class_name(item, classes, "scene.meshes") for item in settings.scene.meshes]
     negatives = [

@@ -140,17 +140,7 @@ class Command:
             start()
 
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
-        """Convert the arguments of the command line to overrides that Hydra reads.
-
-        Args:
-            arguments: Settings as "key=value", and options such as "--multirun".
-
-        Returns:
-            Options and overrides with the present keys of the settings (see `as_override`).
-
-        Raises:
-            InputError: If the command does not accept --multirun, or if a setting is to be removed.
-        """
+        """Convert the arguments of the command line to overrides that Hydra reads."""
         for argument in arguments:
             if argument in SWEEP_FLAGS and not self.sweeps:
                 raise InputError(
@@ -164,36 +154,18 @@ class Command:
         return [as_override(argument, keys) for argument in present]
 
     def run(self, config: DictConfig) -> None:
-        """Run the command, and report errors. Hydra calls this method.
-
-        Args:
-            config: Configuration that Hydra composed from conf/ and the command line.
-        """
+        """Run the command, and report errors. Hydra calls this method."""
         # An error that reached Hydra would get another line in its message.
         with self.handle_errors():
             self.work(config)
 
     def work(self, config: DictConfig) -> None:
-        """Do the work of the command: call the function `self.body` with the settings.
-
-        Args:
-            config: Configuration that is converted to the settings.
-        """
+        """Do the work of the command: call the function `self.body` with the settings."""
         settings = read_settings(self.settings, config)
         import_function(self.body)(settings)
 
     def compose(self, overrides: Sequence[str] = ()) -> DictConfig:
-        """Compose the configuration of the command without starting it.
-
-        Args:
-            overrides: Arguments of a command line, such as "seed=1".
-
-        Returns:
-            The configuration.
-
-        Raises:
-            InputError: If an argument is wrong.
-        """
+        """Compose the configuration of the command without starting it."""
         words = self.to_overrides(overrides)
         try:
             return compose(self.name, words)
@@ -204,11 +176,7 @@ class Command:
             raise InputError(sentence) from error
 
     def read(self, overrides: Sequence[str] = ()) -> Any:
-        """Return the settings that the command would have with the given arguments.
-
-        Args:
-            overrides: Arguments of a command line, such as "seed=1".
-        """
+        """Return the settings that the command would have with the given arguments."""
         return read_settings(self.settings, self.compose(overrides))
 
     @contextmanager
@@ -244,11 +212,7 @@ class Command:
             sys.exit(USER_ERROR)
 
     def format_help(self, overrides: Sequence[str] = ()) -> str:
-        """Return the text of --help, which shows the value of each setting.
-
-        Args:
-            overrides: Arguments of the command line besides --help. The text shows their values.
-        """
+        """Return the text of --help, which shows the value of each setting."""
         if not overrides and not self.has_file:
             # Hydra is not needed for the default values, and is slow.
             return self.help.format(OmegaConf.structured(self.settings))
@@ -267,15 +231,7 @@ def require_current_folder() -> None:
 
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    """Compose the configuration of a command from the files of conf/ and from overrides.
-
-    Args:
-        name: Name of the command without "pnb-".
-        overrides: Overrides as Hydra reads them (see `as_override`).
-
-    Returns:
-        The configuration.
-    """
+    """Compose the configuration of a command from the files of conf/ and from overrides."""
     # While a command runs, Hydra is initialized, and must not be initialized again.
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(name, list(overrides))
@@ -320,14 +276,7 @@ def exits_on_sigterm() -> Iterator[None]:
 
 
 def import_function(path: str) -> Callable[..., Any]:
-    """Import a function by its path.
-
-    Args:
-        path: Module and name of the function, as "module:function".
-
-    Returns:
-        The function.
-    """
+    """Import a function by its path."""
     module, _, name = path.partition(":")
     is_torch_imported = "torch" in sys.modules
     with _announced_if_slow(), _ended_by_ctrl_c():
@@ -371,12 +320,7 @@ def _ended_by_ctrl_c() -> Iterator[None]:
 
 
 def _end_at_once(number: int, frame: object) -> None:
-    """Handle a signal: print a line and end the process without cleanup.
-
-    Args:
-        number: Number of the signal.
-        frame: Not used. Python calls handlers of signals with it.
-    """
+    """Handle a signal: print a line and end the process without cleanup."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(128 + number)
 
@@ -391,19 +335,7 @@ def skip_last_collection() -> None:
 
 
 def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
-    """Convert a configuration of Hydra to an object of a settings class.
-
-    Args:
-        kind: Class of the settings.
-        config: Values of the fields of this class. Missing fields get their defaults.
-
-    Returns:
-        The settings.
-
-    Raises:
-        InputError: If a key is unknown or not set, or a value is wrong. The message begins with
-            the key.
-    """
+    """Convert a configuration of Hydra to an object of a settings class."""
     try:
         # A configuration that was read from a file does not know the types of its
         # values. Merging it into the class checks them.
@@ -418,18 +350,7 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 
 
 def _read_node(node: DictConfig, key: str) -> Any:
-    """Convert a configuration, or a group of settings in it, to an object of its settings class.
-
-    Args:
-        node: The configuration or group, which OmegaConf has typed with a settings class.
-        key: Dotted key of the group, such as "augment.attack". Empty for the whole configuration.
-
-    Returns:
-        Settings. The groups inside are objects of their settings classes, too.
-
-    Raises:
-        InputError: If a value is missing or wrong.
-    """
+    """Convert a configuration, or a group of settings in it, to an object of its settings class."""
     kind = cast(type, OmegaConf.get_type(node))
     values: dict[str, Any] = {}
     for item in fields(cast(Any, kind)):
@@ -456,16 +377,6 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     The value of a text setting is quoted if Hydra would change or refuse it: Hydra reads 1.10 as
     1.1, and refuses an umlaut. A single value of a list setting becomes a list with one member. A
     plus sign before a key is removed, because it would add a setting, and all settings exist.
-
-    Args:
-        argument: Argument such as "label=orange".
-        keys: Type annotation of each setting by its dotted key.
-
-    Returns:
-        Override such as "label=['orange']".
-
-    Raises:
-        InputError: If the argument begins with "~", with which Hydra removes a setting.
     """
     if argument.startswith("~"):
         raise InputError(f"{argument}: a setting cannot be removed: set another value")
@@ -487,14 +398,8 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
 
 
 def _as_text(key: str, value: str) -> str:
-    """Write the override of a text setting, with quotes if Hydra would change or refuse the value.
-
-    Args:
-        key: Key of the setting.
-        value: Value as the user typed it.
-
-    Returns:
-        Override such as "train.init_from='1.10'".
+    """Write the override of a text setting, with quotes if Hydra would change or refuse the
+    value.
     """
     override = f"{key}={value}"
     # A value that begins with "~" is a path in the home folder. The error of Hydra
@@ -518,17 +423,7 @@ def _as_text(key: str, value: str) -> str:
 
 
 def _as_list(key: str, value: str, is_text: bool) -> str:
-    """Write the override of a list setting.
-
-    Args:
-        key: Key of the setting.
-        value: Value as the user typed it. A list, null and a sweep of Hydra stay
-            the same. Any other value becomes a list with one member.
-        is_text: Whether the members of the list are texts.
-
-    Returns:
-        Override such as "label=['orange']".
-    """
+    """Write the override of a list setting."""
     if not value or value.startswith("["):
         return f"{key}={value}"
     try:
@@ -568,16 +463,7 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
-    """Explain an error of Hydra or OmegaConf in one sentence that begins with the key.
-
-    Args:
-        error: Any error.
-        keys: Type annotation of each setting by its dotted key.
-        words: Arguments of the command line.
-
-    Returns:
-        The sentence. None if neither Hydra nor OmegaConf raised the error.
-    """
+    """Explain an error of Hydra or OmegaConf in one sentence that begins with the key."""
     # An error of Hydra is often caused by an error of OmegaConf. Only the error of
     # OmegaConf has the attribute `full_key`, the key of the wrong setting.
     with_key = [cause for cause in causes(error) if getattr(cause, "full_key", None)]
@@ -609,10 +495,6 @@ def _name_conf_file(error: BaseException) -> str:
     """Name the file of conf/ in which Hydra found an error.
 
     Such an error begins with a text like "In 'attack': ".
-
-    Returns:
-        Text to append to a message, such as " (In 'attack')". Empty if the error
-        names no file.
     """
     start = _first_line(error).partition(":")[0]
     return f" ({start})" if start.startswith("In ") else ""
@@ -624,12 +506,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _suggest(key: str, keys: Collection[str]) -> str:
-    """Suggest the key that is most similar to a wrong key, or --help if no key is similar.
-
-    Args:
-        key: Key that is not a setting.
-        keys: Keys of all settings.
-    """
+    """Suggest the key that is most similar to a wrong key, or --help if no key is similar."""
     close = get_close_matches(key, keys, 1, 0.5)
     return f"did you mean {close[0]}?" if close else "--help shows all settings"
 
@@ -640,15 +517,7 @@ def _explain_value(
     keys: Mapping[str, Any],
     place: str,
 ) -> str:
-    """Explain the error of a value that does not have the type of its setting.
-
-    Args:
-        error: Error of OmegaConf.
-        key: Dotted key of the setting.
-        keys: Type annotation of each setting by its dotted key.
-        place: Text such as " (In 'attack')" with the file of conf/ that has the
-            value. Empty if the value comes from the command line.
-    """
+    """Explain the error of a value that does not have the type of its setting."""
     hint = without_none(keys.get(key))
     # The origin of list[str] is list.
     kind = get_origin(hint) or hint
@@ -667,25 +536,14 @@ def _explain_value(
 
 
 def _explain_choice(file: str) -> str:
-    """Explain the error of a choice, such as attack=light, for which conf/ has no file.
-
-    Args:
-        file: Missing file relative to conf/, such as "attack/light.yaml".
-    """
+    """Explain the error of a choice, such as attack=light, for which conf/ has no file."""
     group, _, choice = file.removesuffix(".yaml").rpartition("/")
     options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
     return f"{group}={choice} is not a choice: choose one of {', '.join(options)}"
 
 
 def _explain_overflow(words: Sequence[str]) -> str | None:
-    """Explain the error of a whole number that is too large for a float.
-
-    Args:
-        words: Arguments of the command line.
-
-    Returns:
-        Sentence about the first such number. None if no argument has one.
-    """
+    """Explain the error of a whole number that is too large for a float."""
     for word in words:
         key, _, value = word.partition("=")
         if value.lstrip("-").isdigit() and len(value) > MAX_DIGITS:
@@ -698,13 +556,6 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
 
     For example, attack.geometry.radius cannot be set while attack.geometry is
     null.
-
-    Args:
-        keys: Type annotation of each setting by its dotted key.
-        words: Arguments of the command line.
-
-    Returns:
-        Sentence about the first such setting. None if no argument sets one.
     """
     for word in words:
         key = word.partition("=")[0]
@@ -717,17 +568,7 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
 
 
 def program(name: str, as_called: bool = False) -> list[str]:
-    """Return the start of a command line that runs a command in the way of this process.
-
-    Args:
-        name: Name of the command without "pnb-".
-        as_called: Whether to write the full path of the Python interpreter or of the installed
-            command, instead of "python" or "pnb-NAME".
-
-    Returns:
-        Words of a shell: "pnb-NAME" if the package is installed, or else "python -m MODULE". If
-        torchrun started this process, the words begin with torchrun and its options.
-    """
+    """Return the start of a command line that runs a command in the way of this process."""
     called = Path(sys.argv[0])
     process_count = int(os.environ.get("WORLD_SIZE", "1"))
     installed_name = f"{PREFIX}{name}"
@@ -746,9 +587,5 @@ def program(name: str, as_called: bool = False) -> list[str]:
 
 
 def command_line(name: str) -> str:
-    """Return the command line of this process, as a user can type it again.
-
-    Args:
-        name: Name of the command without "pnb-".
-    """
+    """Return the command line of this process, as a user can type it again."""
     return shlex.join([*program(name), *sys.argv[1:]])

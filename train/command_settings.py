@@ -570,13 +570,6 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
 
     The threshold on the score of a class is chosen so that a given fraction of the negatives in
     a folder of photographs is above it.
-
-    Args:
-        rate: This fraction, the false-positive rate. None if it is not set.
-        calibrate: The folder of photographs. None if it is not set.
-
-    Raises:
-        InputError: If only one of both is set.
     """
     if (rate is None) != (calibrate is None):
         raise InputError(

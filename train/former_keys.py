@@ -27,18 +27,7 @@ FORMER_KEYS = {
 
 
 def replace_former_key(word: str) -> str:
-    """Replace the former key of a setting in an argument of the command line.
-
-    Args:
-        word: Argument such as "augment.every=60". It may begin with plus signs.
-
-    Returns:
-        Argument with the present key. An argument with any other key is
-        unchanged.
-
-    >>> replace_former_key("augment.every=60")
-    'augment.regenerate_every=60'
-    """
+    """Replace the former key of a setting in an argument of the command line."""
     key, equals, value = word.partition("=")
     name = key.lstrip("+")
     if name not in FORMER_KEYS:
@@ -49,11 +38,7 @@ def replace_former_key(word: str) -> str:
 
 
 def rename_former_keys(config: dict[str, Any]) -> None:
-    """Rename settings that have former keys in the contents of a config.yaml.
-
-    Args:
-        config: Nested dictionaries of settings, which are changed.
-    """
+    """Rename settings that have former keys in the contents of a config.yaml."""
     for former, present in FORMER_KEYS.items():
         *groups, name = former.split(".")
         node: Any = config

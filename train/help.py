@@ -42,11 +42,7 @@ class HelpText:
     groups: Sequence[str] = ()
 
     def format(self, config: DictConfig) -> str:
-        """Return the whole text of --help.
-
-        Args:
-            config: Configuration of the command. The text shows its values.
-        """
+        """Return the whole text of --help."""
         lines = dict(_setting_lines(config))
         sections = [
             self.about,
@@ -63,16 +59,7 @@ class HelpText:
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
-    """Return the type annotation of each setting in a settings class and in its groups.
-
-    Args:
-        kind: Class of settings. A field whose type is a settings class is a group.
-        prefix: Text before each key, such as "train.".
-
-    Returns:
-        Type annotation of each setting and of each group by its dotted key, such as `int` for
-        "train.epochs". It is `str` for a setting of any type that is shown as text.
-    """
+    """Return the type annotation of each setting in a settings class and in its groups."""
     found: dict[str, Any] = {}
     for name, hint in field_types(kind).items():
         found[f"{prefix}{name}"] = str if facts_of(kind, name).is_text else hint
@@ -83,21 +70,13 @@ def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
 
 
 def without_none(hint: Any) -> Any:
-    """Remove None from a type annotation: `int | None` becomes `int`.
-
-    Args:
-        hint: Type annotation. A union of several types with None stays as it is.
-    """
+    """Remove None from a type annotation: `int | None` becomes `int`."""
     options = [option for option in get_args(hint) if option is not NoneType]
     return options[0] if isinstance(hint, UnionType) and len(options) == 1 else hint
 
 
 def _choice_lines(groups: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of --help about choices, such as "attack=lighting" and its explanation.
-
-    Args:
-        groups: Groups as in `HelpText`. A choice is a file in the folder of the group.
-    """
+    """Yield the lines of --help about choices, such as "attack=lighting" and its explanation."""
     for group in groups:
         folder = CONF / group.partition("@")[0]
         for path in sorted(folder.glob("*.yaml")):
@@ -116,15 +95,7 @@ def _first_comment(path: Path) -> str:
 
 
 def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the line of --help about each setting in a configuration or in a group of it.
-
-    Args:
-        node: The configuration or group, with values.
-        prefix: Text before each key, such as "train.".
-
-    Yields:
-        Pair of the dotted key of a setting or group, and its line.
-    """
+    """Yield the line of --help about each setting in a configuration or in a group of it."""
     kind = cast(type, OmegaConf.get_type(node))
     values = cast(dict[str, Any], OmegaConf.to_container(node))
     for name in field_types(kind):
@@ -145,15 +116,7 @@ def _format_value(value: Any) -> str:
 
 
 def format_facts(kind: type, name: str) -> str:
-    """Format the explanation of a setting with its choices, its unit and its range.
-
-    Args:
-        kind: Class of settings.
-        name: Field of the class.
-
-    Returns:
-        Text such as "Weight decay. [≥ 0, ≤ 100000]".
-    """
+    """Format the explanation of a setting with its choices, its unit and its range."""
     facts = facts_of(kind, name)
     limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
@@ -162,12 +125,7 @@ def format_facts(kind: type, name: str) -> str:
 
 
 def _format_line(left: str, right: str) -> str:
-    """Format two columns. A long text on the left gets a line of its own above the right text.
-
-    Args:
-        left: Text of the left column, such as "seed=0".
-        right: Text of the right column, which is wrapped.
-    """
+    """Format two columns. A long text on the left gets a line of its own above the right text."""
     indent = " " * (KEY_WIDTH + 2)
     wrapped = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
     lines = [indent + line for line in wrapped]

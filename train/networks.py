@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
@@ -56,10 +57,6 @@ class WideResNet(nn.Module):
     The network WRN-depth-width has three groups of n blocks, where the depth is
     6n + 4. A block has two convolutions. WRN-16-4 has 2.77 million parameters
     for 100 classes. The network normalizes its input itself.
-
-    Example:
-        >>> WideResNet(classes=100)(torch.zeros(2, 3, 32, 32)).shape
-        torch.Size([2, 100])
     """
 
     mean: Tensor
@@ -74,20 +71,7 @@ class WideResNet(nn.Module):
         mean: Color = MEAN,
         std: Color = STD,
     ):
-        """Build a network with random weights.
-
-        Args:
-            classes: Number of classes.
-            depth: Number of layers: 10, 16, 22 and so on.
-            width: Factor of the number of channels, at least 1.
-            dropout: Probability of dropout in each block, in [0, 1).
-            mean: Mean of the data, RGB, for images in [0, 1].
-            std: Standard deviation of the data, RGB.
-
-        Raises:
-            InputError: If an argument is outside its range, or if the network
-                would have too many parameters.
-        """
+        """Build a network with random weights."""
         super().__init__()
         _require_shape(depth, width, dropout)
         channels = [16, 16 * width, 32 * width, 64 * width]
@@ -107,31 +91,14 @@ class WideResNet(nn.Module):
         self.head = nn.Linear(channels[3], classes)
         self.apply(_initialize)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Classify images.
-
-        Args:
-            images: RGB in [0, 1], shape (N, 3, H, W).
-
-        Returns:
-            Logits, shape (N, classes).
-        """
+    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N classes"]:
+        """Classify images."""
         features = self.groups(self.stem((images - self.mean) / self.std))
         return self.head(F.relu(self.norm(features)).mean((2, 3)))
 
 
 def _require_shape(depth: int, width: int, dropout: float) -> None:
-    """Check the arguments of a WideResNet.
-
-    Args:
-        depth: Number of layers.
-        width: Factor of the number of channels.
-        dropout: Probability of dropout.
-
-    Raises:
-        InputError: If an argument is outside its range, or if the network would
-            have too many parameters.
-    """
+    """Check the arguments of a WideResNet."""
     if depth < 10 or (depth - 4) % 6 or width < 1:
         raise InputError(
             f"depth={depth}, width={width} is no shape of a WideResNet: "
@@ -163,14 +130,7 @@ class _Block(nn.Module):
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int, dropout: float):
-        """Build a block with random weights.
-
-        Args:
-            inputs: Number of input channels.
-            outputs: Number of output channels.
-            stride: Stride of the first convolution and of the shortcut.
-            dropout: Probability of dropout, in [0, 1).
-        """
+        """Build a block with random weights."""
         super().__init__()
         self.norm1 = nn.BatchNorm2d(inputs)
         self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
@@ -181,15 +141,8 @@ class _Block(nn.Module):
         if inputs != outputs or stride > 1:
             self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Compute the output features of the block.
-
-        Args:
-            x: Features, shape (N, inputs, H, W).
-
-        Returns:
-            Features, shape (N, outputs, H / stride, W / stride).
-        """
+    def forward(self, x: Float[Tensor, "N inputs H W"]) -> Float[Tensor, "N outputs _ _"]:
+        """Compute the output features of the block."""
         activated = F.relu(self.norm1(x))
         shortcut = x if self.shortcut is None else self.shortcut(activated)
         hidden = self.conv1(activated)
@@ -216,14 +169,7 @@ class Dropout(nn.Dropout):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Set random values to 0, and scale the others by 1 / (1 - p).
-
-        Args:
-            x: Features of this process, which has a part of the batch. Any shape.
-
-        Returns:
-            Features of the same shape. In evaluation mode, they are unchanged.
-        """
+        """Set random values to 0, and scale the others by 1 / (1 - p)."""
         if not self.training or self.p == 0:
             return x
         if x.device.type == "cpu":
@@ -236,14 +182,7 @@ class Dropout(nn.Dropout):
         return x * is_kept / (1 - self.p)
 
     def _draw_factors(self, x: Tensor) -> Tensor:
-        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
-
-        Args:
-            x: Features on the CPU, of any shape.
-
-        Returns:
-            Factors of the shape and the memory layout of x.
-        """
+        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p)."""
         value_count = x.numel()
         draws = _draw_int16(value_count * distributed.world_size())
         shard_start = distributed.rank() * value_count
@@ -286,30 +225,7 @@ def build_network(
     trust_code: bool = False,
     **shape: Any,
 ) -> nn.Module:
-    """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits.
-
-    Args:
-        classes: Names of the classes.
-        size: Pixels per side of the images.
-        name: "wideresnet", "torchvision:NAME" or "python:MODULE:FUNCTION". The
-            Python function returns a network, the size of its images and its
-            classes. This network normalizes images itself.
-        mean: Mean of the pixels of the data, RGB. Images are normalized with it.
-            None for 0.5. A classifier that is not from a file has its own mean.
-        std: Standard deviation of the pixels of the data, RGB. None for 0.25.
-        classifier: Whether `augment.build_classifier` builds the network, with
-            pretrained weights. It then takes `name`.
-        trust_code: Whether the classifier may be a file of TorchScript or `torch.export`.
-        **shape: `depth`, `width` and `dropout` of "wideresnet".
-
-    Returns:
-        Network. A WideResNet and an architecture of torchvision have random
-        weights.
-
-    Raises:
-        InputError: If the name is unknown, or if the network does not accept
-            images of this size or has other classes.
-    """
+    """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits."""
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
         built = build_classifier(name, size, classes, normalization, trust_code)
@@ -345,22 +261,7 @@ def build_network(
 
 
 def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
-    """Call a Python function of the user that builds a network.
-
-    Args:
-        name: "python:MODULE:FUNCTION". The function returns a network, the size
-            of its images and its classes.
-        classes: Classes of the data. The function must return the same classes.
-        size: Pixels per side of the images of the data. The function must return
-            the same size.
-
-    Returns:
-        The network.
-
-    Raises:
-        InputError: If the function returns no `nn.Module`, or another size or
-            other classes.
-    """
+    """Call a Python function of the user that builds a network."""
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
         raise InputError(
@@ -384,13 +285,7 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
 
 
 def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Module:
-    """Build an architecture of torchvision with random weights.
-
-    Args:
-        architecture: Name such as "resnet18".
-        class_count: Number of classes.
-        size: Pixels per side of the images. Vision transformers depend on it.
-    """
+    """Build an architecture of torchvision with random weights."""
     from torchvision import models
 
     options: dict[str, Any] = dict(_OPTIONS.get(architecture, {}))
@@ -400,13 +295,7 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
 
 
 def _require_logits(network: nn.Module, class_count: int, size: int) -> None:
-    """Raise ValueError if a network does not return logits, shape (2, classes), for two images.
-
-    Args:
-        network: Network, from images in [0, 1] to logits.
-        class_count: Number of classes.
-        size: Pixels per side of the images.
-    """
+    """Raise ValueError if a network does not return logits, shape (2, classes), for two images."""
     with eval_mode(network), torch.no_grad():
         logits = network(torch.zeros(2, 3, size, size))
     if logits.shape != (2, class_count):
@@ -423,19 +312,6 @@ def describe(
     """Describe a network by the arguments with which `build_network` builds it again.
 
     The description is stored with the weights of the network.
-
-    Args:
-        network: The network.
-        classes: Names of the classes.
-        size: Pixels per side of the images.
-        encoding: Encoding of the renders that the network is trained with:
-            "srgb" or "linear".
-        **shape: Settings of the architecture, such as its name and its depth.
-
-    Returns:
-        Description that can be written as JSON. If the network has the
-        attributes `mean` and `std`, with which it normalizes images, the
-        description has them, too.
     """
     description = {
         "version": VERSION,

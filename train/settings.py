@@ -513,27 +513,13 @@ class NetworkSettings(Settings):
 
 
 def normalized_light_values(value: Any) -> dict[str, float] | None:
-    """Convert a value of the setting `normalize_light` to a mapping, as files record it.
-
-    Args:
-        value: True for the defaults, a mapping of some of the fields
-            white_balance, percentile, level and gamma, or None to leave the
-            light of images as it is.
-
-    Returns:
-        All fields by name. None if the light is not normalized.
-    """
+    """Convert a value of the setting `normalize_light` to a mapping, as files record it."""
     light = read_normalized_light(value)
     return None if light is None else asdict(light)
 
 
 def class_texts(classes: Any) -> Any:
-    """Convert class names such as 0, which YAML reads as numbers, to texts.
-
-    Args:
-        classes: Value of the setting `classes`. Only a list of names changes.
-            None and the name of a file stay the same.
-    """
+    """Convert class names such as 0, which YAML reads as numbers, to texts."""
     if not isinstance(classes, list):
         return classes
     return [str(name) if is_whole(name) else name for name in classes]
@@ -678,18 +664,7 @@ class ExperimentSettings(NetworkSettings):
 
 
 def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:
-    """Read a list of objects in the settings of a scene.
-
-    Args:
-        items: The objects. Each is a file, "solid:NAME", or a mapping with
-            fields of `ObjectSettings`.
-        label: Class of the objects that name no class.
-        key: Key of the list in the settings, such as "scene.meshes".
-
-    Returns:
-        Settings of each object. The key of the first object is the key of the
-        list followed by "[0]".
-    """
+    """Read a list of objects in the settings of a scene."""
     objects = {}
     for index, item in enumerate(items):
         item_key = f"{key}[{index}]"
@@ -698,19 +673,7 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
-    """Read one object in the settings of a scene.
-
-    Args:
-        item: File, "solid:NAME", or mapping with fields of `ObjectSettings`.
-        label: Class of the object if it names no class.
-        key: Key of the object in the settings, for error messages.
-
-    Returns:
-        Settings of the object.
-
-    Raises:
-        InputError: If the mapping has an unknown field or a wrong value.
-    """
+    """Read one object in the settings of a scene."""
     values = item if isinstance(item, dict) else {"mesh": item}
     values = {"label": label, **values}
     # The name of a class can be a number, which YAML reads as one.
@@ -720,51 +683,19 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
 
 def solid_name(mesh: str) -> str:
-    """Return the name of a generated mesh: NAME of "solid:NAME" or "solid:NAME:SEED".
-
-    Args:
-        mesh: Path of a file, or one of these texts.
-
-    Returns:
-        The name. Empty for a file.
-    """
+    """Return the name of a generated mesh: NAME of "solid:NAME" or "solid:NAME:SEED"."""
     words = mesh.split(":")
     is_solid = words[0] == "solid" and len(words) > 1
     return words[1] if is_solid else ""
 
 
 def simplified(name: str) -> str:
-    """Simplify a name, so that names that differ only in spelling compare equal.
-
-    Args:
-        name: Name of a class, of a solid or of a file.
-
-    Returns:
-        Name in lower case and in Unicode's form NFC, in which "_" and "-" are replaced by spaces.
-
-    >>> simplified("Sweet_pepper")
-    'sweet pepper'
-    """
+    """Simplify a name, so that names that differ only in spelling compare equal."""
     return " ".join(composed(name).lower().replace("_", " ").replace("-", " ").split())
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:
-    """List the names of the positive classes in the setting `label`.
-
-    Args:
-        label: Name of a class, or a list of several names. A whole number is the
-            name of a class, too.
-
-    Returns:
-        The names as texts.
-
-    Raises:
-        InputError: If a name is neither a text nor a whole number, if there is
-            no name, or if a name occurs twice.
-
-    >>> label_names("orange")
-    ['orange']
-    """
+    """List the names of the positive classes in the setting `label`."""
     is_one_name = isinstance(label, str) or is_whole(label)
     listed = [label] if is_one_name else label
     if not isinstance(listed, Sequence):
@@ -792,14 +723,6 @@ def published(run: Path) -> Path:
 
     The library is installed with the folder pretrained/, which has networks and
     test images. A clone of the repository has this folder, too.
-
-    Args:
-        run: Any path.
-
-    Returns:
-        `run` itself if it exists, or if it does not begin with pretrained/.
-        Otherwise the same path in the installation or in the clone, if it
-        exists there.
     """
     candidates = [run]
     if run.parts[:1] == ("pretrained",):
@@ -813,15 +736,7 @@ def published(run: Path) -> Path:
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value in nested settings with its dotted key, such as "train.epochs".
-
-    Args:
-        node: Settings as nested dictionaries.
-        prefix: Text before each key, such as "train.".
-
-    Yields:
-        Pairs such as ("train.epochs", 150).
-    """
+    """Yield each value in nested settings with its dotted key, such as "train.epochs"."""
     for key, value in node.items():
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")
@@ -830,13 +745,7 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
-    """Return a copy of nested settings in which a function has replaced each text.
-
-    Args:
-        value: Nested dictionaries and lists of texts and other values. Keys of
-            dictionaries, numbers and other values stay the same.
-        change: Function that returns the new text for a text.
-    """
+    """Return a copy of nested settings in which a function has replaced each text."""
     if isinstance(value, dict):
         return {key: mapped(item, change) for key, item in value.items()}
     if isinstance(value, list):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -192,15 +193,7 @@ class Adversary(ShortRepr):
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
-    """Return a copy of an object with the shape, the colors and the gloss after an attack.
-
-    Args:
-        item: Object before the attack. Its mesh has N vertices and F faces.
-        changed: Conditions of one example after the attack: vertices (N, 3), added albedo (F, 3)
-            with the rotation of the hue (F,), and gloss (F, 3). A field that is None changes
-            nothing.
-        encoding: Encoding of the colors of textures, such as "srgb".
-    """
+    """Return a copy of an object with the shape, the colors and the gloss after an attack."""
     mesh = item.mesh
     albedo_scale = item.albedo_scale
     if changed.albedo is not None:
@@ -229,14 +222,6 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
 
     In the scene for Mitsuba, negative radiance is replaced by 0. Environment
     maps (.hdr and .exr) are written only if the light is nowhere negative.
-
-    Args:
-        adversary: The adversary.
-        folder: The folder to write.
-
-    Returns:
-        A dictionary with the key "negative_light", the fraction of the energy
-        of the environment light that is negative.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = adversary.shown
@@ -272,13 +257,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
 def _describe(
     adversary: Adversary, local_light_names: list[str], background: float | str
 ) -> dict[str, Any]:
-    """Return the content of adversary.json, which has all that is in no other file.
-
-    Args:
-        adversary: The adversary.
-        local_light_names: Names of the local lights, each of which has a file.
-        background: Value of all pixels of the background, or the name of its file.
-    """
+    """Return the content of adversary.json, which has all that is in no other file."""
     shown = adversary.shown
     return {
         "label": str(shown.label),
@@ -297,22 +276,13 @@ def _describe(
 
 def save_lights(
     folder: Path,
-    light: Tensor,
+    light: Float[Tensor, "_ 3"],
     basis: Basis,
     when: str = "",
 ) -> list[tuple[Any, Tensor]]:
     """Write the environment light to light.json, and each local light to a file of its name.
 
     Local lights are the projector and the lamps.
-
-    Args:
-        folder: The folder to write.
-        light: RGB coefficients of all lights, shape (size of the basis, 3).
-        basis: Basis of all lights.
-        when: Suffix of the name of each file, such as "_before".
-
-    Returns:
-        Basis and coefficients of each light, the environment light first.
     """
     lights: list[tuple[Any, Tensor]] = []
     for rows, basis_of_light in parts_of(basis):
@@ -324,16 +294,8 @@ def save_lights(
     return lights
 
 
-def _write_background(background: Tensor, folder: Path) -> float | str:
-    """Write a background to an image file, except if all its values are the same.
-
-    Args:
-        background: RGB or gray image in [0, 1], shape (3 or 1, size, size).
-        folder: Folder of the adversary.
-
-    Returns:
-        The value of all pixels, or the name of the written file.
-    """
+def _write_background(background: Float[Tensor, "_ size size"], folder: Path) -> float | str:
+    """Write a background to an image file, except if all its values are the same."""
     gray = float(background.flatten()[0])
     if (background == gray).all():
         return gray
@@ -342,16 +304,11 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
     return BACKGROUND
 
 
-def _write_views(images: Tensor, folder: Path, name: str) -> None:
+def _write_views(images: Float[Tensor, "V 3 size size"], folder: Path, name: str) -> None:
     """Write the images of the V views of an adversary.
 
     NAME.npy has the exact values of all views. NAME_0.png, NAME_1.png and so on have one view
     each, with 8 bits per channel.
-
-    Args:
-        images: Images in [0, 1], shape (V, 3, size, size).
-        folder: Folder of the adversary.
-        name: NAME, such as "before".
     """
     write_numbers(folder / f"{name}.npy", _exact_numpy(images))
     for view, image in enumerate(to_bytes(images)):
@@ -395,15 +352,7 @@ def reload(folder: str | Path) -> Adversary:
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
-    """Read the files of an adversary.
-
-    Args:
-        folder: Folder that `write_adversary` wrote.
-        description: Content of its file adversary.json.
-
-    Raises:
-        InputError: If a file is missing or damaged, or a camera is inside of the mesh.
-    """
+    """Read the files of an adversary."""
     settings = ImageSettings(**description["image"])
     angle_unit = description.get(ANGLE_UNIT)
     cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
@@ -439,13 +388,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 
 
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Create a camera from its fields in adversary.json.
-
-    Args:
-        description: Fields of a pinhole, perspective or orthographic camera by their names. The
-            names tell the class of the camera.
-        angle_unit: Unit of the angles. None in files of earlier versions.
-    """
+    """Create a camera from its fields in adversary.json."""
     described = angles_in_degrees(description, angle_unit)
     # Earlier versions of the library wrote `clip_range` under the name "reach".
     if "reach" in described:
@@ -457,15 +400,7 @@ def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
 
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
-    """Read the attacked object of an adversary.
-
-    Args:
-        folder: Folder that `write_adversary` wrote.
-        description: Content of its file adversary.json.
-
-    Raises:
-        InputError: If the mesh cannot be read, or a number is out of range.
-    """
+    """Read the attacked object of an adversary."""
     from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
 
     mesh = load_mesh(folder / MESH, gloss=bool(description.get("gloss")))
@@ -484,15 +419,7 @@ def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
-    """Read images from a .npy file.
-
-    Args:
-        path: The file.
-        shape: Shape that the images must have.
-
-    Raises:
-        InputError: If the file is missing or damaged, or has another shape.
-    """
+    """Read images from a .npy file."""
     require_file(path, "write the adversary again")
     try:
         images = torch.from_numpy(read_numbers(path))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch.nn.functional as F
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -25,16 +26,7 @@ PAUSE = 1200
 def draw_frames(
     images: Sequence[Tensor], balls: Sequence[Tensor], captions: Sequence[str]
 ) -> list[Image.Image]:
-    """Draw the frames of an animation: an image with a caption, and a white ball beside it.
-
-    Args:
-        images: Image of each frame in [0, 1], each of shape (3, size, size).
-        balls: White ball in the light of each frame, each of shape (3, SIDE, SIDE).
-        captions: Line of text below each image.
-
-    Returns:
-        Frames, all of the same size.
-    """
+    """Draw the frames of an animation: an image with a caption, and a white ball beside it."""
     frames = []
     for image, ball, caption in zip(images, balls, captions, strict=True):
         frames.append(draw_grid([[_tile(image, caption), _tile(ball, "light")]]))
@@ -45,20 +37,12 @@ def frame_times(frame_count: int) -> list[int]:
     """Return for how many milliseconds each frame of an animation is shown.
 
     The first and the last frame are shown longer than the others.
-
-    Args:
-        frame_count: Number of frames, at least 2.
     """
     return [PAUSE, *[FRAME_TIME] * (frame_count - 2), PAUSE]
 
 
-def _tile(image: Tensor, caption: str) -> Tile:
-    """Return an image with a caption of one line, as a tile of a grid.
-
-    Args:
-        image: Image in [0, 1], shape (3, size, size).
-        caption: The caption.
-    """
+def _tile(image: Float[Tensor, "3 size size"], caption: str) -> Tile:
+    """Return an image with a caption of one line, as a tile of a grid."""
     shown = image.detach().cpu().float()
     if image.shape[-1] > MAX_SIDE:
         size = (MAX_SIDE, MAX_SIDE)

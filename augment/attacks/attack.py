@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings
@@ -319,29 +320,15 @@ class AttackResult(ShortRepr):
         times = animation.frame_times(frame_count)
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
-    def _values_between(self, fraction: float) -> Tensor:
-        """Interpolate linearly between the attack values before and after the attack.
-
-        Args:
-            fraction: 0 for the values before the attack, 1 for those after it.
-
-        Returns:
-            D values of each of the E examples, shape (E, D).
-        """
+    def _values_between(self, fraction: float) -> Float[Tensor, "E D"]:
+        """Interpolate linearly between the attack values before and after the attack."""
         start = self.problem.start
         return start + fraction * (self.descent.values.to(start) - start)
 
-    def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
-        """Render a view with values that are interpolated between before and after the attack.
-
-        Args:
-            fraction: 0 for the image before the attack, 1 for the image after it.
-            example: Index of the example.
-            view: Index of the view.
-
-        Returns:
-            Image, shape (3, size, size).
-        """
+    def _image_between(
+        self, fraction: float, example: int, view: int
+    ) -> Float[Tensor, "3 size size"]:
+        """Render a view with values that are interpolated between before and after the attack."""
         if fraction == 0:
             return self.images_in_views_before[example, view]
         if fraction == 1:
@@ -351,16 +338,8 @@ class AttackResult(ShortRepr):
         images = self.problem.images(self._values_between(fraction), examples)
         return images[0, view]
 
-    def _ball_between(self, fraction: float, example: int) -> Tensor:
-        """Render a white ball in light that is interpolated between before and after the attack.
-
-        Args:
-            fraction: 0 for the light before the attack, 1 for the light after it.
-            example: Index of the example.
-
-        Returns:
-            Image of the ball, shape (3, size, size).
-        """
+    def _ball_between(self, fraction: float, example: int) -> Float[Tensor, "3 size size"]:
+        """Render a white ball in light that is interpolated between before and after the attack."""
         examples = self.problem.all_examples[[example]]
         conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
         # `conditions` contain one example only, at index 0.
@@ -375,26 +354,13 @@ class AttackResult(ShortRepr):
 
 
 def _require_index(name: str, index: int, count: int) -> None:
-    """Raise InputError unless an index is a whole number from 0 to count - 1.
-
-    Args:
-        name: Name of the argument that has the index, for the message.
-        index: The index.
-        count: Number of things that the index selects from.
-    """
+    """Raise InputError unless an index is a whole number from 0 to count - 1."""
     require_whole(name, index)
     require_range(name, index, 0, count - 1)
 
 
 def require_result(result: object) -> None:
-    """Check that a value is the result of an attack.
-
-    Args:
-        result: The value, which must be an `AttackResult`.
-
-    Raises:
-        InputError: If the value has another type.
-    """
+    """Check that a value is the result of an attack."""
     require_kind("result", result, AttackResult, "the result of norm_balls.attack")
 
 
@@ -503,17 +469,7 @@ def _attack(
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Attack a classifier whose arguments have been checked. See `attack`.
-
-    Args:
-        classifier: The classifier to attack.
-        scene: The scene, with E examples of V views.
-        target: Class, or one class for each view, as which the images shall be classified. None
-            accepts any misclassification.
-        settings: Attacked parameters and steps. None changes the light without a limit.
-        seed: Seed of the restarts and of the noise.
-        force: Whether examples that are misclassified before the attack are accepted.
-    """
+    """Attack a classifier whose arguments have been checked. See `attack`."""
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     has_gradients = classifier.is_differentiable(scene.lights)
@@ -573,16 +529,7 @@ def _attack(
 def with_optimizer(
     settings: AttackSettings, classifier: Classifier, has_gradients: bool
 ) -> AttackSettings:
-    """Choose random search for a classifier without gradients, and warn.
-
-    Args:
-        settings: Settings of the attack. An optimizer that they name is kept.
-        classifier: The classifier to attack.
-        has_gradients: Whether its logits are differentiable in the pixels.
-
-    Returns:
-        The given settings, or a copy with random search as the optimizer.
-    """
+    """Choose random search for a classifier without gradients, and warn."""
     if settings.optimizer is not None or has_gradients:
         return settings
     chosen = replace(settings, optimizer=RANDOM_SEARCH)
@@ -597,23 +544,12 @@ def with_optimizer(
 
 def _count_queries(
     descent: DescentResult,
-    images: Tensor,
-    predicted: Tensor,
+    images: Float[Tensor, "E V 3 size size"],
+    predicted: Float[Tensor, "E V"],
     criterion: Criterion,
     settings: AttackSettings,
-) -> Tensor:
-    """Count the different images of each example that an attack showed to the classifier.
-
-    Args:
-        descent: Result of the descent, which counted its own images.
-        images: Images after the attack, shape (E, V, 3, size, size).
-        predicted: Predicted classes of these images, shape (E, V).
-        criterion: Source and target class of each view.
-        settings: Settings of the attack.
-
-    Returns:
-        Number of images, shape (E,), int64.
-    """
+) -> Int[Tensor, " E"]:
+    """Count the different images of each example that an attack showed to the classifier."""
     view_count = images.shape[1]
     queries = descent.queries.clone()
     # `final_images` may render images again that differ from those of the descent. The
@@ -634,13 +570,6 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     The change is the rms error of the irradiance over all normals and channels,
     divided by the rms irradiance of the given environment light. The largest
     change of all examples counts.
-
-    Args:
-        given: Scene whose environment light may have negative radiance.
-        physical: The same scene after `build_problem` has removed the negative
-            radiance.
-        stacklevel: Argument of `warnings.warn`: number of calls up to the line
-            that the warning names.
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
@@ -656,17 +585,10 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
 
 
 @torch.no_grad()
-def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
-    """Compute the logits of all views of examples, batch by batch.
-
-    Args:
-        model: Classifier with its preprocessing. It is in eval mode meanwhile.
-        images: Images in [0, 1] of V views of E examples, shape (E, V, 3, H, W).
-        batch_size: Number of images of a batch. It is reduced if memory runs out.
-
-    Returns:
-        Logits of the C classes with the dtype of the images, shape (E, V, C).
-    """
+def logits_of(
+    model: nn.Module, images: Float[Tensor, "E V 3 H W"], batch_size: int
+) -> Float[Tensor, "E V C"]:
+    """Compute the logits of all views of examples, batch by batch."""
     all_images = images.flatten(0, 1)
     batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
     with eval_mode(model):
@@ -675,42 +597,19 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     return logits.unflatten(0, images.shape[:2]).to(images.dtype)
 
 
-def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tensor:
-    """Return the true class of each view as an index of the classifier.
-
-    Args:
-        scene: The scene, with E examples of V views.
-        logits: Logits of the images. The result is put on their device.
-        classifier: The classifier that has the classes.
-
-    Returns:
-        Indices of classes, shape (E, V), int64.
-
-    Raises:
-        InputError: If the classifier lacks a class of the scene.
-    """
+def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:
+    """Return the true class of each view as an index of the classifier."""
     labels = [classifier.label(label) for label in scene.labels]
     return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)
 
 
 def require_clean_correct(
     scene: Scene,
-    logits: Tensor,
-    source: Tensor,
+    logits: Float[Tensor, "E V C"],
+    source: Bool[Tensor, "E V"],
     classifier: Classifier,
 ) -> None:
-    """Check that every image of a scene is classified correctly.
-
-    Args:
-        scene: The scene, with E examples of V views.
-        logits: Logits of the images, shape (E, V, C).
-        source: True class of each image, shape (E, V).
-        classifier: The classifier that has the classes.
-
-    Raises:
-        InputError: If an image is misclassified. The sentence names the five
-            most probable classes of the first such image.
-    """
+    """Check that every image of a scene is classified correctly."""
     misclassified = (logits.argmax(2) != source).nonzero().tolist()
     if not misclassified:
         return
@@ -733,26 +632,11 @@ def require_clean_correct(
 
 def target_labels(
     target: str | int | Sequence[str | int] | None,
-    source: Tensor,
-    logits: Tensor,
+    source: Bool[Tensor, "E V"],
+    logits: Float[Tensor, "E V C"],
     classifier: Classifier,
-) -> Tensor | None:
-    """Return the target class of each view as an index of the classifier.
-
-    Args:
-        target: A class, a list with a class for each view, or "least_likely".
-            None for an untargeted attack.
-        source: True class of each view, shape (E, V).
-        logits: Logits before the attack, shape (E, V, C).
-        classifier: The classifier that has the classes.
-
-    Returns:
-        Indices of classes, shape (E, V), int64. None for an untargeted attack.
-
-    Raises:
-        InputError: If the classifier lacks a class, if the list does not have
-            one class for each view, or if a target is the true class.
-    """
+) -> Int[Tensor, "E V"] | None:
+    """Return the target class of each view as an index of the classifier."""
     if target is None:
         return None
     if isinstance(target, str) and target == LEAST_LIKELY:
@@ -784,43 +668,22 @@ def _targets(target: object) -> list[str | int]:
 
 
 def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Tensor]:
-    """Draw the initial attack values of restarts from the norm-balls.
-
-    Args:
-        problem: The attacked parameters, each with a radius.
-        count: Number of restarts.
-        seed: Seed of the attack.
-
-    Yields:
-        D random values of each of the E examples, shape (E, D). Each item
-        belongs to one restart.
-    """
+    """Draw the initial attack values of restarts from the norm-balls."""
     for number in range(1, count + 1):
         yield problem.sample(generator(seed, number, "restart"))
 
 
 def final_images(
     problem: AttackProblem,
-    values: Tensor,
-    examples: Tensor,
-    images: Tensor,
-) -> Tensor:
+    values: Float[Tensor, "A D"],
+    examples: Int[Tensor, " A"],
+    images: Float[Tensor, "A V 3 size size"],
+) -> Float[Tensor, "A V 3 size size"]:
     """Return the images after a descent, with the shadows and bounces of the attacked shape.
 
     A descent that changes shape, colors or gloss computes shadows and bounces
     once, for the original shape. This function renders its images again. The
     images of all other descents are returned as they are.
-
-    Args:
-        problem: The attacked scene and the parameters that were changed.
-        values: D attack values of each of A examples, shape (A, D).
-        examples: Index of each of the A examples, which are objects with their views, in the
-            scene, shape (A,).
-        images: Images that the descent rendered with these values,
-            shape (A, V, 3, size, size).
-
-    Returns:
-        Images, shape (A, V, 3, size, size).
     """
     scene = problem.scene
     conditions = problem.conditions(values, examples)
@@ -839,35 +702,19 @@ def final_images(
 
 def fooled_in_views(
     model: nn.Module,
-    images: Tensor,
-    predicted: Tensor,
-    examples: Tensor,
+    images: Float[Tensor, "A V 3 H W"],
+    predicted: Int[Tensor, "A V"],
+    examples: Int[Tensor, " A"],
     criterion: Criterion,
     settings: AttackSettings,
     seed: int,
-) -> Tensor:
+) -> Float[Tensor, "A V"]:
     """Decide which views count as a success of an attack.
 
     A view is a success if it meets the criterion without noise and with each of
     `NOISE_DRAWS` draws of sensor noise. The noise of an example depends only on
     the seed and on the index of the example. An attack that tries many images
     therefore cannot succeed by drawing the noise again.
-
-    Args:
-        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
-            [0, 1] to logits.
-        images: Images in [0, 1] without noise, shape (A, V, 3, H, W).
-        predicted: Predicted classes of these images, shape (A, V), int64.
-        examples: Index of each of the A examples, on which its noise depends,
-            shape (A,), int64.
-        criterion: Source and target classes of the A examples.
-        settings: Settings of the attack. With `sensor_noise=0`, only the images
-            without noise count.
-        seed: Seed of the noise.
-
-    Returns:
-        Mask of the views that are a success, shape (A, V), on the device of
-        `predicted`.
     """
     is_fooled = criterion.reached_in_views(predicted)
     # Noise is tested only in examples with a view that is fooled without noise.
@@ -890,17 +737,8 @@ def fooled_in_views(
     return is_fooled
 
 
-def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
-    """Return the names and the probabilities of the predicted classes, for a JSON file.
-
-    Args:
-        logits: Logits of images in any number of dimensions, shape (..., C).
-        classes: Names of the C classes.
-
-    Returns:
-        Dictionary of nested lists of shape (...). "predicted" has the names of
-        the predicted classes, and "confidence" their probabilities.
-    """
+def predictions(logits: Float[Tensor, "... C"], classes: Sequence[str]) -> dict[str, Any]:
+    """Return the names and the probabilities of the predicted classes, for a JSON file."""
     highest = logits.softmax(-1).max(-1)
     names = np.asarray(classes)[highest.indices.cpu().numpy()]
     return {"predicted": names.tolist(), "confidence": highest.values.tolist()}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -108,14 +109,7 @@ def save(
 
 
 def require_renderers(names: Sequence[str]) -> None:
-    """Check that the renderers of the argument `verify` are known and installed.
-
-    Args:
-        names: Names of renderers: "reload" or "mitsuba".
-
-    Raises:
-        InputError: If a name is unknown, or if Mitsuba is not installed.
-    """
+    """Check that the renderers of the argument `verify` are known and installed."""
     for name in names:
         require_choice("verify", name, RENDERERS)
     if MITSUBA in names:
@@ -125,16 +119,7 @@ def require_renderers(names: Sequence[str]) -> None:
 
 
 def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """Write the figure and the folder of each example.
-
-    Args:
-        result: The attack on E examples.
-        paths: Folder of each of the E examples. The figure of an example has the name of its
-            folder with the suffix ".png".
-
-    Returns:
-        Numbers of each example for attack.jsonl, without the key "versions".
-    """
+    """Write the figure and the folder of each example."""
     problem = result.problem
     scene = problem.scene
     conditions_before = problem.conditions(problem.start, problem.all_examples)
@@ -158,12 +143,7 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
 
 
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
-    """Return the successes, costs and predictions of one example for attack.jsonl.
-
-    Args:
-        result: The attack.
-        example: Index of the example.
-    """
+    """Return the successes, costs and predictions of one example for attack.jsonl."""
     descent = result.descent
     classes = result.classifier.classes
     before = predictions(result.logits_in_views_before[example], classes)
@@ -202,15 +182,6 @@ def _versions(
 
     The versions are the images as floats, with 8 bits, as JPEG, and as each
     renderer renders them from the saved files.
-
-    Args:
-        result: The attack on E examples.
-        paths: Folder with the files of each example.
-        renderers: Names of the renderers that read these files.
-
-    Returns:
-        For each name of a version, a list with a dictionary for each example:
-        its successes, predictions, and differences from the floats.
     """
     # Images of V views of each of the E examples, shape (E, V, 3, size, size).
     images = result.images_in_views.cpu()
@@ -232,18 +203,10 @@ def _versions(
     return numbers
 
 
-def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
-    """Classify another version of the attacked images, such as renders of Mitsuba.
-
-    Args:
-        result: The result of the attack on E examples of V views.
-        images: The other version of the images after the attack, shape
-            (E, V, 3, size, size).
-
-    Returns:
-        For each example, a dictionary with successes, predictions, and
-        differences from the images of the result.
-    """
+def _numbers_of_version(
+    result: AttackResult, images: Float[Tensor, "E V 3 size size"]
+) -> list[dict[str, Any]]:
+    """Classify another version of the attacked images, such as renders of Mitsuba."""
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     predicted = logits.argmax(2)
     success_in_views = fooled_in_views(
@@ -277,16 +240,7 @@ def render_again(
     renderers: Sequence[str],
     rasterizer: Rasterizer,
 ) -> dict[str, Tensor]:
-    """Render the V views of an example from its saved files alone.
-
-    Args:
-        folder: Folder of the example.
-        renderers: Names of the renderers: "reload" (this library), "mitsuba" or both.
-        rasterizer: Rasterizer with which "reload" renders.
-
-    Returns:
-        Images in [0, 1] of each renderer by its name, shape (V, 3, size, size).
-    """
+    """Render the V views of an example from its saved files alone."""
     adversary = reload(folder)
     images = {}
     if "reload" in renderers:
@@ -310,10 +264,6 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     and, if the attack changed the light, a white ball in the light before and
     after. In the difference, unchanged values are gray, and the largest change
     of all views is black or white.
-
-    Args:
-        result: The result of an attack.
-        example: Index of the example.
     """
     before = result.images_in_views_before[example]
     after = result.images_in_views[example]
@@ -334,16 +284,7 @@ def figure(result: AttackResult, example: int) -> Image.Image:
 
 
 def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
-    """Draw a white ball in the light before and after an attack, as each camera sees it.
-
-    Args:
-        result: The attack.
-        example: Index of the example.
-
-    Returns:
-        Two columns of a figure by their titles. A column has a picture for each of the V
-        cameras. If the attack did not change the light, the dictionary is empty.
-    """
+    """Draw a white ball in the light before and after an attack, as each camera sees it."""
     problem = result.problem
     scene = problem.scene
     examples = problem.all_examples[[example]]
@@ -368,18 +309,10 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
     }
 
 
-def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[str, ...]]:
-    """Return the captions of the V views of an example in the figure of an attack.
-
-    Args:
-        result: The attack.
-        logits: Logits of all examples, shape (E, V, C).
-        example: Index of the example.
-
-    Returns:
-        The lines of each caption. The first line has the probability and the name of the
-        predicted class. If this class is wrong, a second line has those of the true class.
-    """
+def _captions(
+    result: AttackResult, logits: Float[Tensor, "E V C"], example: int
+) -> list[tuple[str, ...]]:
+    """Return the captions of the V views of an example in the figure of an attack."""
     classes = result.classifier.classes
     labels = result.criterion.source[example].tolist()
     captions = []

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary
@@ -128,14 +129,7 @@ def check(result: AttackResult) -> dict[str, Any]:
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:
-    """Return reasons to doubt the strength of an attack.
-
-    Args:
-        checks: The result of `check`.
-
-    Returns:
-        A sentence for each reason, such as that random search does better.
-    """
+    """Return reasons to doubt the strength of an attack."""
     success = checks["success"]
     lost_to_noise = checks["success_without_noise"] - success
     reasons = []
@@ -308,15 +302,8 @@ def _as_classifier(
     value_range: tuple[float, float],
     argument: str,
 ) -> Classifier:
-    """Convert a plain network to a classifier like the attacked one. Return a classifier as it is.
-
-    Args:
-        network: Classifier or plain network.
-        result: Result of an attack. A plain network must have the image size, the classes and
-            the device of the attacked classifier.
-        normalization: Normalization of images for a plain network, as in `attack`.
-        value_range: Values of black and white that a plain network takes.
-        argument: Name of the network in error messages.
+    """Convert a plain network to a classifier like the attacked one. Return a classifier as it
+    is.
     """
     if isinstance(network, Classifier):
         return network
@@ -341,15 +328,6 @@ def require_transferable(
     """Check that the result of an attack can be rendered from other views and on other meshes.
 
     For example, changed pixels belong to one view, and changed vertices belong to one mesh.
-
-    Args:
-        parameters: Names of the attacked parameters.
-        azimuths: Degrees by which cameras are to be turned.
-        objects: Other meshes that are to be rendered.
-
-    Raises:
-        InputError: If other views or other meshes are given, and the values of a parameter
-            belong to one view or one mesh.
     """
     for name in parameters:
         kind = parameter_class(name)
@@ -360,16 +338,7 @@ def require_transferable(
 
 
 def _refuse_transfer(argument: str, parameter: str, others: str) -> NoReturn:
-    """Raise the error that an attacked parameter does not fit other views or meshes.
-
-    Args:
-        argument: Name of the argument that has the other views or meshes.
-        parameter: Name of the attacked parameter.
-        others: "views" or "meshes".
-
-    Raises:
-        InputError: Always.
-    """
+    """Raise the error that an attacked parameter does not fit other views or meshes."""
     raise InputError(
         f"{argument}: attacked {parameter} cannot be transferred to other {others}: "
         f"remove {argument}, or attack another parameter",
@@ -387,16 +356,12 @@ class Successes:
             noise, shape (E,), bool.
     """
 
-    with_noise: Tensor
-    without_noise: Tensor
+    with_noise: Bool[Tensor, " E"]
+    without_noise: Bool[Tensor, " E"]
 
     @staticmethod
     def before(result: AttackResult) -> Successes:
-        """Return the masks of the examples that meet the criterion before an attack.
-
-        Args:
-            result: The result of the attack.
-        """
+        """Return the masks of the examples that meet the criterion before an attack."""
         # The masks are copied, because `add` changes them.
         return Successes(result.success_before.clone(), result.success_before.clone())
 
@@ -413,23 +378,15 @@ class Successes:
         self,
         result: AttackResult,
         problem: AttackProblem,
-        values: Tensor,
-        examples: Tensor,
-        images: Tensor,
+        values: Float[Tensor, "A D"],
+        examples: Int[Tensor, " A"],
+        images: Float[Tensor, "A V 3 H W"],
     ) -> None:
         """Add the examples that meet the criterion with some attack values.
 
         An example is first judged by its given images. If they meet the
         criterion, it is rendered again with exact shadows and bounces, and
         these images decide, without and with sensor noise.
-
-        Args:
-            result: The attack, with its criterion and classifier.
-            problem: Scene and parameters to which the values belong.
-            values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples among all E, shape (A,).
-            images: Images that the problem rendered with these values, shape
-                (A, V, 3, H, W).
         """
         is_reached = result.criterion.select(examples).reached(_predicted(result, images))
         candidates = torch.nonzero(is_reached).squeeze(1)
@@ -452,13 +409,8 @@ class Successes:
         self.with_noise[candidate_examples] |= fooled.all(1)
 
 
-def _predicted(result: AttackResult, images: Tensor) -> Tensor:
-    """Return the classes that the attacked classifier predicts, shape (A, V).
-
-    Args:
-        result: The attack.
-        images: Images of V views of A examples, shape (A, V, 3, H, W).
-    """
+def _predicted(result: AttackResult, images: Float[Tensor, "A V 3 H W"]) -> Tensor:
+    """Return the classes that the attacked classifier predicts, shape (A, V)."""
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     return logits.argmax(2)
 
@@ -468,17 +420,7 @@ def _success_by_draws(
     found: Successes,
     draw: Callable[[], Tensor],
 ) -> Successes:
-    """Search for successes by random draws of the attack values.
-
-    Args:
-        result: The attack with which the draws are compared. The number of draws depends on the
-            number of its steps or queries.
-        found: Successes so far. Only the other examples are searched.
-        draw: Function that draws D values for each of the E examples, shape (E, D).
-
-    Returns:
-        A copy of `found` with the additional successes.
-    """
+    """Search for successes by random draws of the attack values."""
     found = found.clone()
     for _ in progress(range(_count_draws(result)), "random search"):
         examples = found.unsuccessful
@@ -496,9 +438,6 @@ def _count_draws(result: AttackResult) -> int:
 
     It is the largest number of steps of an attack with gradients. An attack without gradients is
     compared with draws that show as many images to the classifier.
-
-    Args:
-        result: The attack.
     """
     settings = result.settings
     if settings.uses_gradients:
@@ -515,13 +454,6 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
     An attack without gradients is repeated with 3 and 10 times as many queries.
     Only the examples without a success so far are attacked again, each from its
     start.
-
-    Args:
-        result: Result of the attack.
-
-    Returns:
-        Successes by the number of steps or queries: those of the attack, and
-        those of the repetitions. Successes with fewer steps are included.
     """
     settings = result.settings
     successes = Successes(result.success, result.success_without_noise)
@@ -567,13 +499,7 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
 
 
 def _scaled(settings: StepSettings, scale: float) -> StepSettings:
-    """Return a copy of the settings of a parameter with a scaled norm-ball.
-
-    Args:
-        settings: Norm-ball and steps of the parameter.
-        scale: Factor of the radius and of the step size. If the settings have no radius, it
-            becomes the radius, and the step size stays as it is.
-    """
+    """Return a copy of the settings of a parameter with a scaled norm-ball."""
     if settings.radius is None:
         return replace(settings, radius=scale)
     return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
@@ -582,18 +508,10 @@ def _scaled(settings: StepSettings, scale: float) -> StepSettings:
 def _descend_further(
     result: AttackResult,
     problem: AttackProblem,
-    values: Tensor,
+    values: Float[Tensor, "E D"],
     found: Successes,
 ) -> None:
-    """Continue the descent of the examples without a success, in larger norm-balls.
-
-    Args:
-        result: The attack, with its classifier and settings.
-        problem: The scene, and its attacked parameters with the larger norm-balls.
-        values: D values that each of the E examples has reached, shape (E, D). They are replaced
-            by the values at the end of the descent.
-        found: Successes so far. New ones are added in place.
-    """
+    """Continue the descent of the examples without a success, in larger norm-balls."""
     examples = found.unsuccessful
     if not len(examples):
         return
@@ -611,18 +529,7 @@ def _descend_further(
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
-    """Select the successes among the N examples that are correct before the attack.
-
-    Args:
-        method: Name of the search that found the successes, "adversarial" or "random".
-        found: Successes of all E examples.
-        result: The attack.
-
-    Returns:
-        Two masks of the N examples, shape (N,). The key "adversarial" or "random" has the
-        successes with sensor noise, and the same key with the ending "_without_noise" has those
-        without noise.
-    """
+    """Select the successes among the N examples that are correct before the attack."""
     is_clean = result.clean_correct
     return {
         method: found.with_noise[is_clean].cpu(),
@@ -648,11 +555,7 @@ class _Adversaries:
 
     @staticmethod
     def of(result: AttackResult) -> _Adversaries:
-        """Collect the examples that were correct before an attack and for which it succeeded.
-
-        Args:
-            result: The attack.
-        """
+        """Collect the examples that were correct before an attack and for which it succeeded."""
         problem = result.problem
         is_adversary = result.clean_correct & result.success
         examples = torch.nonzero(is_adversary).flatten().tolist()
@@ -667,26 +570,13 @@ class _Adversaries:
         return _Adversaries(result, examples, before, after)
 
     def changed(self, change: Callable[[Adversary], Adversary]) -> _Adversaries:
-        """Return a copy whose examples have other cameras, objects or image sizes.
-
-        Args:
-            change: Function that returns a changed copy of an example. It is applied to the
-                examples before and after the attack.
-        """
+        """Return a copy whose examples have other cameras, objects or image sizes."""
         before = [change(adversary) for adversary in self.before]
         after = [change(adversary) for adversary in self.after]
         return replace(self, before=before, after=after)
 
     def classify(self, classifier: Classifier) -> dict[str, Any]:
-        """Render the examples before and after the attack, and classify the images.
-
-        Args:
-            classifier: Classifier that has the classes of the examples.
-
-        Returns:
-            The entries "clean_correct", "success", "predicted" and others that `transfer`
-            describes.
-        """
+        """Render the examples before and after the attack, and classify the images."""
         settings = self.result.settings
         criterion = self._criterion_for(classifier)
         logits_before = self._logits(self._render(self.before, classifier.size), classifier)
@@ -715,9 +605,6 @@ class _Adversaries:
         """Return the source and target classes of the A examples for another classifier.
 
         The other classifier may have the classes in another order, so classes are found by name.
-
-        Args:
-            classifier: The other classifier.
         """
         view_count = self.result.problem.scene.views
         attacked_classes = self.result.classifier.classes
@@ -735,29 +622,13 @@ class _Adversaries:
         ]
         return Criterion(source, self._labels(targets, classifier))
 
-    def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
-        """Convert class names to indices of a classifier.
-
-        Args:
-            names: For each of the A examples, the class names of its V views.
-            classifier: The classifier.
-
-        Returns:
-            Indices, shape (A, V).
-        """
+    def _labels(self, names: list[list[str]], classifier: Classifier) -> Int[Tensor, "A V"]:
+        """Convert class names to indices of a classifier."""
         indices = [classifier.label(name) for views in names for name in views]
         return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
 
-    def _render(self, adversaries: list[Adversary], size: int) -> Tensor:
-        """Render the V views of adversaries.
-
-        Args:
-            adversaries: The A adversaries. The size of their images is `size`.
-            size: Pixels per side of the images.
-
-        Returns:
-            Images in [0, 1], shape (A, V, 3, size, size).
-        """
+    def _render(self, adversaries: list[Adversary], size: int) -> Float[Tensor, "A V 3 size size"]:
+        """Render the V views of adversaries."""
         scene = self.result.problem.scene
         if not adversaries:
             return self.result.images_in_views.new_empty(0, scene.views, 3, size, size)
@@ -766,16 +637,10 @@ class _Adversaries:
             images.append(adversary.render_views(scene.rasterizer))
         return torch.stack(images).to(self.result.images_in_views)
 
-    def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
-        """Compute the logits of images with the preprocessing of the attack.
-
-        Args:
-            images: Images of V views of A examples, shape (A, V, 3, size, size).
-            classifier: Classifier of C classes.
-
-        Returns:
-            Logits on the CPU, shape (A, V, C).
-        """
+    def _logits(
+        self, images: Float[Tensor, "A V 3 size size"], classifier: Classifier
+    ) -> Float[Tensor, "A V C"]:
+        """Compute the logits of images with the preprocessing of the attack."""
         settings = self.result.settings
         if not len(images):
             return torch.empty(0, images.shape[1], len(classifier.classes))
@@ -784,12 +649,7 @@ class _Adversaries:
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:
-    """Return a copy of an adversary whose images have another size.
-
-    Args:
-        adversary: The adversary. Its background and its pixel offsets are resized.
-        size: Pixels per side of the images of the copy.
-    """
+    """Return a copy of an adversary whose images have another size."""
     if adversary.settings.size == size:
         return adversary
     background = _with_size(adversary.background[None], size)[0].clamp(0, 1)
@@ -798,22 +658,12 @@ def _resized(adversary: Adversary, size: int) -> Adversary:
     return replace(adversary, settings=settings, background=background, pixels=pixels)
 
 
-def _with_size(images: Tensor, size: int) -> Tensor:
-    """Resize images by bilinear interpolation with antialiasing.
-
-    Args:
-        images: Images, shape (N, C, H, W).
-        size: Pixels per side of the resized images.
-    """
+def _with_size(images: Float[Tensor, "N C H W"], size: int) -> Tensor:
+    """Resize images by bilinear interpolation with antialiasing."""
     return F.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    """Return a copy of an adversary whose cameras are turned around the vertical axis.
-
-    Args:
-        adversary: The adversary.
-        angle: Angle in degrees, which is added to the azimuth of each camera.
-    """
+    """Return a copy of an adversary whose cameras are turned around the vertical axis."""
     cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
     return replace(adversary, cameras=tuple(cameras))

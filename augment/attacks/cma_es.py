@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.descent import Criterion, DescentResult, State
@@ -47,17 +48,12 @@ class Population:
     """
 
     strategy: Any
-    start: Tensor
-    scale: Tensor
-    drawn: np.ndarray = field(init=False)
+    start: Float[Tensor, " D"]
+    scale: Float[Tensor, " D"]
+    drawn: Float[np.ndarray, "P D"] = field(init=False)
 
-    def ask(self) -> Tensor:
-        """Draw the P candidates of a step.
-
-        Returns:
-            D attack values of each candidate, which may be outside of the norm-ball, shape
-            (P, D).
-        """
+    def ask(self) -> Float[Tensor, "P D"]:
+        """Draw the P candidates of a step."""
         self.drawn = np.stack(self.strategy.ask())
         return self._unprojected()
 
@@ -65,16 +61,12 @@ class Population:
         """Return the attack values of the points that were drawn last, shape (P, D)."""
         return self.start + self.scale * torch.from_numpy(self.drawn).to(self.scale)
 
-    def tell(self, values: Tensor, costs: Tensor) -> None:
+    def tell(self, values: Float[Tensor, "P D"], costs: Float[Tensor, " P"]) -> None:
         """Adapt the strategy to the costs of the P candidates that were drawn last.
 
         A candidate outside of the norm-ball was evaluated at the nearest values inside. A penalty
         is added to its cost: the interquartile range of the costs times the mean squared distance
         to these values, in units of `scale`.
-
-        Args:
-            values: Values at which the candidates were evaluated, shape (P, D).
-            costs: Cost of each candidate, shape (P,).
         """
         offsets = self._unprojected() - values
         # Distance of each value from the norm-ball in units of `scale`, shape (P, D).
@@ -102,17 +94,10 @@ class CMAES(GradientFree):
     populations: dict[int, Population] = field(default_factory=dict, init=False)
     generations: dict[int, Tensor] = field(default_factory=dict, init=False)
 
-    def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Attack A examples from one set of initial values, with new evolution strategies.
-
-        Args:
-            criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the scene, shape (A,).
-            start: Initial values, shape (A, D).
-
-        Returns:
-            Result of the A examples.
-        """
+    def run(
+        self, criterion: Criterion, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]
+    ) -> DescentResult:
+        """Attack A examples from one set of initial values, with new evolution strategies."""
         # Strategies of an earlier run started from other values.
         self.populations.clear()
         self.generations.clear()
@@ -122,18 +107,11 @@ class CMAES(GradientFree):
         """Return how many candidates of each example a step evaluates.
 
         For D values, these are 4 + ⌊3 ln D⌋, the default of `cma`.
-
-        Args:
-            state: State of the search, with D values of each example.
         """
         return 4 + int(3 * math.log(state.values.shape[1]))
 
     def _step(self, state: State) -> None:
-        """Draw the next candidates of each active example, and project them to the norm-balls.
-
-        Args:
-            state: State of the search. Its step counts are updated.
-        """
+        """Draw the next candidates of each active example, and project them to the norm-balls."""
         for row in state.active_rows.tolist():
             if row not in self.populations:
                 self.populations[row] = self._begin(state, row)
@@ -144,12 +122,7 @@ class CMAES(GradientFree):
         state.result.steps[state.active_rows] += 1
 
     def _begin(self, state: State, row: int) -> Population:
-        """Start the evolution strategy of an example at its accepted values.
-
-        Args:
-            state: State of the search.
-            row: Row of the example in the state.
-        """
+        """Start the evolution strategy of an example at its accepted values."""
         example = state.examples[[row]]
         value_count = state.values.shape[1]
         strategy = start_strategy(
@@ -160,28 +133,16 @@ class CMAES(GradientFree):
         [scale] = self.problem.search_scale(example)
         return Population(strategy, state.values[row].clone(), scale)
 
-    def _candidates(self, state: State) -> Tensor:
-        """Return the candidates to evaluate next.
-
-        Args:
-            state: State of the search, with N active examples.
-
-        Returns:
-            D attack values of P candidates of each active example, shape (N, P, D). In the first
-            evaluation, the only candidate of an example has its initial values.
-        """
+    def _candidates(self, state: State) -> Float[Tensor, "N P D"]:
+        """Return the candidates to evaluate next."""
         if not self.generations:
             return super()._candidates(state)
         return torch.stack([self.generations[row] for row in state.active_rows.tolist()])
 
-    def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Adapt the evolution strategy of each active example to the costs of its candidates.
-
-        Args:
-            state: State of the search, with N active examples.
-            candidates: D attack values of P candidates of each active example, shape (N, P, D).
-            costs: Cost of each candidate, shape (N, P).
-        """
+    def _learn(
+        self, state: State, candidates: Float[Tensor, "N P D"], costs: Float[Tensor, "N P"]
+    ) -> None:
+        """Adapt the evolution strategy of each active example to the costs of its candidates."""
         # No strategy drew the initial values, which are evaluated before the first step.
         if not self.generations:
             return
@@ -190,19 +151,7 @@ class CMAES(GradientFree):
 
 
 def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
-    """Start an evolution strategy at 0 with standard deviation 1.
-
-    Args:
-        value_count: Number of values of a point.
-        population_size: Number of points that the strategy draws in each step.
-        seed: Seed of its random numbers. The global generator of NumPy is not used.
-
-    Returns:
-        `cma.CMAEvolutionStrategy`.
-
-    Raises:
-        InputError: If `cma` is not installed.
-    """
+    """Start an evolution strategy at 0 with standard deviation 1."""
     try:
         cma: Any = importlib.import_module("cma")
     except ImportError as error:

@@ -38,6 +38,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, add_sensor_noise
@@ -50,8 +51,6 @@ from renderer.short_repr import ShortRepr
 MIN_GRADIENT = 1e-30
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-
     from augment.attack_settings import AttackSettings
     from augment.attacks.problem import AttackProblem
 
@@ -72,26 +71,13 @@ class Criterion:
         target: Target class of each view, one row for each example. NO_CLASS
             makes the attack on a view untargeted. None makes the attack on all
             views untargeted.
-
-    Example:
-        >>> criterion = Criterion(source=torch.tensor([[0, 0]]))
-        >>> criterion.reached(torch.tensor([[2, 1]])), criterion.reached(torch.tensor([[2, 0]]))
-        (tensor([True]), tensor([False]))
     """
 
     source: Int[Tensor, "E V"]
     target: Int[Tensor, "E V"] | None = None
 
     def select(self, examples: Tensor | slice) -> Criterion:
-        """Return the criterion of some of the examples.
-
-        Args:
-            examples: Rows of the selected examples in `source` and `target`,
-                as indices or as a slice.
-
-        Returns:
-            Source and target classes of the selected examples.
-        """
+        """Return the criterion of some of the examples."""
         if self.target is None:
             return Criterion(self.source[examples])
         return Criterion(self.source[examples], self.target[examples])
@@ -103,11 +89,7 @@ class Criterion:
         return Criterion(self.source.flatten(), self.target.flatten())
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
-        """Return a mask of the examples that reach the criterion in all their views.
-
-        Args:
-            predicted: Predicted class of each of the V views of each example.
-        """
+        """Return a mask of the examples that reach the criterion in all their views."""
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
@@ -115,9 +97,6 @@ class Criterion:
 
         A view reaches it if its predicted class is the target class or, without
         a target, is not the source class.
-
-        Args:
-            predicted: Predicted class of each of the V views of each example.
         """
         is_misclassified = predicted != self.source
         if self.target is None:
@@ -175,9 +154,6 @@ class DescentResult(ShortRepr):
 
         Apart from the number of rows, each tensor has the shape, the dtype and
         the device of the same tensor of this result.
-
-        Args:
-            example_count: Number of examples, and of rows of each tensor.
         """
         tensors = {}
         for item in fields(self):
@@ -185,27 +161,17 @@ class DescentResult(ShortRepr):
             tensors[item.name] = tensor.new_empty(example_count, *tensor.shape[1:])
         return DescentResult(**tensors)
 
-    def write(self, rows: Tensor, group: DescentResult) -> None:
-        """Copy the result of a group of examples into the given rows of this result.
-
-        Args:
-            rows: Row of each example of the group, shape (A,).
-            group: Result of the A examples of the group.
-        """
+    def write(self, rows: Float[Tensor, " A"], group: DescentResult) -> None:
+        """Copy the result of a group of examples into the given rows of this result."""
         for item in fields(self):
             getattr(self, item.name)[rows] = getattr(group, item.name)
 
-    def add_restart(self, rows: Tensor, restart: DescentResult) -> None:
+    def add_restart(self, rows: Float[Tensor, " A"], restart: DescentResult) -> None:
         """Add a restart, which attacks some examples again from other initial values.
 
         Its steps and passes are added to the counts. Where the restart
         succeeds, its values, images, cost and predictions replace those of the
         example.
-
-        Args:
-            rows: Row of each restarted example in this result, shape (A,).
-                None of these examples has succeeded before with sensor noise.
-            restart: Result of the restart of these A examples.
         """
         is_success = restart.success
         successful_rows = rows[is_success]
@@ -243,23 +209,13 @@ class Descent:
     seed: int
 
     def run_with_restarts(
-        self, criterion: Criterion, examples: Tensor, start: Tensor, restarts: Iterable[Tensor]
+        self,
+        criterion: Criterion,
+        examples: Int[Tensor, " A"],
+        start: Float[Tensor, "A D"],
+        restarts: Iterable[Tensor],
     ) -> DescentResult:
-        """Attack A examples from one or more initial values, until they succeed.
-
-        Args:
-            criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the scene,
-                shape (A,).
-            start: First initial values, shape (A, D).
-            restarts: Further initial values, each of shape (A, D). They are
-                used for the examples that have not succeeded, or whose success
-                does not survive sensor noise. They are not used if their share
-                of the queries is less than one evaluation.
-
-        Returns:
-            Result of the A examples.
-        """
+        """Attack A examples from one or more initial values, until they succeed."""
         result = self.run(criterion, examples, start)
         limit = self.settings.query_limit_of_start
         if limit is not None and limit < self._passes_of_candidate(criterion):
@@ -288,12 +244,6 @@ class Descent:
         """Return the rows of the successes of a start that must also survive sensor noise.
 
         A success whose start has too few queries left for the noisy images counts without them.
-
-        Args:
-            result: Result of one start.
-
-        Returns:
-            Indices of rows. Empty if there is no sensor noise.
         """
         is_checked = result.success & bool(self.settings.sensor_noise)
         limit = self.settings.query_limit_of_start
@@ -303,20 +253,13 @@ class Descent:
         return is_checked.nonzero().squeeze(1)
 
     @torch.enable_grad()
-    def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
+    def run(
+        self, criterion: Criterion, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]
+    ) -> DescentResult:
         """Attack A examples from one set of initial values.
 
         Each example takes steps until it reaches its criterion with the
         required margin, or has used up its steps or queries.
-
-        Args:
-            criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the scene,
-                shape (A,).
-            start: Initial values, shape (A, D).
-
-        Returns:
-            Result of the A examples.
         """
         state = State.at_start(criterion, examples, start, self.settings.batch_size)
         with frozen_eval_mode(self.model):
@@ -337,12 +280,7 @@ class Descent:
         return state.result
 
     def _count_passes(self, state: State, evaluation: Evaluation) -> None:
-        """Count the images that an evaluation showed to the classifier.
-
-        Args:
-            state: State of the descent. The counts of its active examples are increased.
-            evaluation: Evaluation of the candidates of the active examples.
-        """
+        """Count the images that an evaluation showed to the classifier."""
         pass_count = evaluation.candidate_count * self._passes_of_candidate(state.criterion)
         state.result.queries[state.active_rows] += pass_count
         if evaluation.gradient is not None:
@@ -353,19 +291,12 @@ class Descent:
 
         These are all views of the example, each as it is and in each of its
         random transformations.
-
-        Args:
-            criterion: Source and target classes of the views.
         """
         view_count = criterion.source.shape[1]
         return view_count * (1 + self.settings.eot.draws)
 
     def _drop_examples_without_budget(self, state: State) -> None:
-        """Make examples inactive whose next step would exceed the limit of queries.
-
-        Args:
-            state: State of the descent. Its active examples are updated.
-        """
+        """Make examples inactive whose next step would exceed the limit of queries."""
         limit = self.settings.query_limit_of_start
         if limit is None or not len(state.active_rows):
             return
@@ -374,22 +305,11 @@ class Descent:
         state.active_rows = state.active_rows[is_affordable]
 
     def _candidates_per_step(self, state: State) -> int:
-        """Return how many candidates of each example a step evaluates.
-
-        Args:
-            state: State of the descent. Only subclasses use it.
-        """
+        """Return how many candidates of each example a step evaluates."""
         return 1
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify one candidate of each active example.
-
-        Args:
-            state: State of the descent, with N active examples and their candidates.
-
-        Returns:
-            Images and scores of the N candidates, and the gradients of their costs.
-        """
+        """Render and classify one candidate of each active example."""
         candidate = state.candidate[state.active_rows].requires_grad_(True)
         criterion = state.criterion.select(state.active_rows)
         rendered = self.problem.render(candidate, state.examples[state.active_rows])
@@ -408,20 +328,9 @@ class Descent:
         )
 
     def _score(
-        self, images: Tensor, criterion: Criterion, batch_size: BatchSize
+        self, images: Float[Tensor, "N V 3 H W"], criterion: Criterion, batch_size: BatchSize
     ) -> tuple[Score, Tensor]:
-        """Compute the costs, logit gaps and predictions of N examples, batch by batch.
-
-        Args:
-            images: Rendered images of the V views of each example, shape
-                (N, V, 3, H, W).
-            criterion: Source and target classes of the N examples.
-            batch_size: Number of images that the classifier sees at a time.
-
-        Returns:
-            The score of each example, and the gradient of its cost with respect
-            to its images, shape (N, V, 3, H, W).
-        """
+        """Compute the costs, logit gaps and predictions of N examples, batch by batch."""
         view_count = images.shape[1]
         all_images = images.flatten(0, 1)
         all_gradients = torch.empty_like(all_images)
@@ -432,26 +341,15 @@ class Descent:
 
     def _score_batch(
         self,
-        all_images: Tensor,
+        all_images: Float[Tensor, "_ 3 H W"],
         criterion: Criterion,
-        all_gradients: Tensor,
+        all_gradients: Float[Tensor, "_ 3 H W"],
         batch_rows: slice,
     ) -> Score:
         """Compute the cost, logit gap and prediction of each image of a batch.
 
         The gradient of the cost with respect to the batch is written to its
         rows of `all_gradients`.
-
-        Args:
-            all_images: The images of all examples and views, shape
-                (N · V, 3, H, W).
-            criterion: Source and target class of each image, shape (N · V,).
-            all_gradients: Gradients of the costs with respect to all images,
-                shape (N · V, 3, H, W).
-            batch_rows: Rows of the batch among the N · V images.
-
-        Returns:
-            Score of each image of the batch.
         """
         batch = all_images[batch_rows].detach().requires_grad_(True)
         classes = criterion.select(batch_rows)
@@ -471,16 +369,7 @@ class Descent:
         return Score.of_logits(cost.detach(), logits.detach(), expected_logits.detach(), classes)
 
     def _decide(self, state: State, evaluation: Evaluation) -> Decision:
-        """Decide what happens to the candidates of the active examples.
-
-        Args:
-            state: State of the descent, with N active examples.
-            evaluation: Images and scores of their N candidates.
-
-        Returns:
-            Whether each example is finished, whether its next step starts from
-            its candidate, and whether the candidate becomes its result.
-        """
+        """Decide what happens to the candidates of the active examples."""
         active_rows = state.active_rows
         is_success = evaluation.is_criterion_met
         cost = evaluation.score.cost
@@ -505,10 +394,6 @@ class Descent:
 
         Without backtracking, these are all candidates. With backtracking, these are the
         candidates that lower the cost.
-
-        Args:
-            state: State of the descent, with the costs before the last step.
-            evaluation: Scores of one candidate for each of the N active examples.
         """
         is_cheaper = evaluation.score.cost < state.cost[state.active_rows]
         if self.settings.backtracking:
@@ -517,23 +402,14 @@ class Descent:
 
     def _finished_despite_noise(
         self,
-        is_finished: Tensor,
+        is_finished: Bool[Tensor, " N"],
         state: State,
         evaluation: Evaluation,
-    ) -> Tensor:
+    ) -> Float[Tensor, " N"]:
         """Return a mask of the finished examples that remain successes with sensor noise.
 
         Only examples with a noise margin are checked. The images that the classifier sees for this
         are counted as queries.
-
-        Args:
-            is_finished: Mask of the active examples that are finished if noise is
-                ignored, shape (N,).
-            state: State of the descent, with N active examples.
-            evaluation: Images and scores of the N candidates.
-
-        Returns:
-            Mask of the active examples, shape (N,).
         """
         has_margin = self._noise_margin(evaluation.score.is_overconfident) > 0
         # Indices of the checked examples among the N active examples.
@@ -557,7 +433,9 @@ class Descent:
         )
 
     @torch.no_grad()
-    def _is_robust_to_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
+    def _is_robust_to_noise(
+        self, images: Float[Tensor, "A V 3 H W"], examples: Int[Tensor, " A"], criterion: Criterion
+    ) -> Float[Tensor, " A"]:
         """Return a mask of the examples whose logit gaps change little with sensor noise.
 
         The logit gap tells by how much a view reaches the criterion. It is
@@ -565,14 +443,6 @@ class Descent:
         the smallest of these gaps must be at least `_noise_margin` times the
         difference between the largest and the smallest. This noise differs from
         the noise that later decides whether a success counts.
-
-        Args:
-            images: Images of V views of the A examples, shape (A, V, 3, H, W).
-            examples: Index of each example in the scene, shape (A,).
-            criterion: Source and target classes of the A examples.
-
-        Returns:
-            Mask, shape (A,).
         """
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
@@ -601,9 +471,6 @@ class Descent:
 
         The step starts from the accepted values, which the state keeps until
         the candidate is evaluated.
-
-        Args:
-            state: State of the descent. Its candidates and step counts are updated.
         """
         active_rows = state.active_rows
         state.candidate[active_rows] = self.problem.take_step(
@@ -633,23 +500,16 @@ class Score:
             example, it is whether any of its views is.
     """
 
-    cost: Tensor
-    gap: Tensor
+    cost: Float[Tensor, " N"]
+    gap: Float[Tensor, " N"]
     predicted: Tensor
-    is_overconfident: Tensor
+    is_overconfident: Bool[Tensor, " N"]
 
     @classmethod
     def of_logits(
-        cls, cost: Tensor, logits: Tensor, expected_logits: Tensor, classes: Criterion
+        cls, cost: Tensor, logits: Float[Tensor, "N C"], expected_logits: Tensor, classes: Criterion
     ) -> Score:
-        """Return the scores of N images.
-
-        Args:
-            cost: Cost of each image.
-            logits: Logits of the images, shape (N, C).
-            expected_logits: Logits averaged over random transformations of the images.
-            classes: Source and target class of each image.
-        """
+        """Return the scores of N images."""
         return cls(
             cost=cost,
             gap=logit_gap(expected_logits, classes.source, classes.target),
@@ -659,17 +519,7 @@ class Score:
 
     @classmethod
     def of_examples(cls, batches: Sequence[Score], view_count: int) -> Score:
-        """Combine the scores of single images to scores of examples.
-
-        Args:
-            batches: Scores of batches of images, in order. The views of an
-                example follow each other.
-            view_count: Number of views of each example.
-
-        Returns:
-            For each example, the sum of the costs, the smallest logit gap, and
-            the predictions of all views.
-        """
+        """Combine the scores of single images to scores of examples."""
         cost = torch.cat([score.cost for score in batches]).unflatten(0, (-1, view_count))
         gap = torch.cat([score.gap for score in batches]).unflatten(0, (-1, view_count))
         predicted = torch.cat([score.predicted for score in batches]).unflatten(0, (-1, view_count))
@@ -704,11 +554,11 @@ class Evaluation:
             evaluated. The other attributes describe the best of them.
     """
 
-    values: Tensor
-    images: Tensor
+    values: Float[Tensor, "N D"]
+    images: Float[Tensor, "N V 3 H W"]
     score: Score
-    is_criterion_met: Tensor
-    gradient: Tensor | None = None
+    is_criterion_met: Bool[Tensor, " N"]
+    gradient: Float[Tensor, "N D"] | None = None
     candidate_count: int = 1
 
     @property
@@ -762,29 +612,25 @@ class State:
     """
 
     criterion: Criterion
-    examples: Tensor
+    examples: Int[Tensor, " A"]
     batch_size: BatchSize
-    active_rows: Tensor
-    values: Tensor
-    gradient: Tensor
-    cost: Tensor
-    length: Tensor
-    candidate: Tensor
+    active_rows: Float[Tensor, " N"]
+    values: Float[Tensor, "A D"]
+    gradient: Float[Tensor, "A D"]
+    cost: Float[Tensor, " A"]
+    length: Float[Tensor, "A 1"]
+    candidate: Float[Tensor, "A D"]
     result: DescentResult = field(init=False)
 
     @classmethod
     def at_start(
-        cls, criterion: Criterion, examples: Tensor, start: Tensor, batch_size: int
+        cls,
+        criterion: Criterion,
+        examples: Int[Tensor, " A"],
+        start: Float[Tensor, "A D"],
+        batch_size: int,
     ) -> State:
-        """Create the state before the first evaluation, with the initial values as candidates.
-
-        Args:
-            criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the scene,
-                shape (A,).
-            start: Initial values, shape (A, D).
-            batch_size: Number of images that the classifier sees at a time.
-        """
+        """Create the state before the first evaluation, with the initial values as candidates."""
         values = start.detach().clone()
         return cls(
             criterion=criterion,
@@ -803,10 +649,6 @@ class State:
 
         The result has 0 steps and no success. A call of `record` must follow,
         which treats the initial values like every candidate.
-
-        Args:
-            evaluation: Evaluation of the initial values of the A examples, which
-                are all active.
         """
         zeros = torch.zeros_like(self.active_rows)
         self.result = DescentResult(
@@ -824,12 +666,7 @@ class State:
         )
 
     def record(self, evaluation: Evaluation, decision: Decision) -> None:
-        """Carry out the decisions about the candidates of the N active examples.
-
-        Args:
-            evaluation: Images, scores and gradients of the candidates.
-            decision: Decisions about the candidates.
-        """
+        """Carry out the decisions about the candidates of the N active examples."""
         self.length[self.active_rows] *= decision.length_factor[:, None]
         accepted, kept, unfinished = _indices_of_masks(
             decision.is_accepted,
@@ -841,13 +678,7 @@ class State:
         self.active_rows = self.active_rows[unfinished]
 
     def _accept(self, accepted: Tensor, evaluation: Evaluation) -> None:
-        """Let the next step of some examples start from their evaluated candidates.
-
-        Args:
-            accepted: Indices of these candidates among the N of the evaluation.
-            evaluation: Values, gradients and scores of the candidates of the N
-                active examples.
-        """
+        """Let the next step of some examples start from their evaluated candidates."""
         rows = self.active_rows[accepted]
         self.values[rows] = evaluation.values[accepted]
         if evaluation.gradient is not None:
@@ -855,13 +686,7 @@ class State:
         self.cost[rows] = evaluation.score.cost[accepted]
 
     def _keep(self, kept: Tensor, evaluation: Evaluation) -> None:
-        """Make the candidates of some examples their present results.
-
-        Args:
-            kept: Indices of these candidates among the N of the evaluation.
-            evaluation: Values, images and scores of the candidates of the N
-                active examples.
-        """
+        """Make the candidates of some examples their present results."""
         rows = self.active_rows[kept]
         self.result.values[rows] = evaluation.values[kept]
         self.result.images[rows] = evaluation.images[kept]
@@ -875,9 +700,6 @@ def _indices_of_masks(*masks: Tensor) -> list[Tensor]:
 
     All masks are copied from the GPU to the CPU at once, because each copy
     waits until the GPU is idle.
-
-    Args:
-        masks: Masks, each of shape (N,).
     """
     device = masks[0].device
     masks_on_cpu = torch.stack(masks).cpu()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from PIL import Image
 from torch import Tensor, nn
 
@@ -43,37 +44,20 @@ def _round_to_bytes(images: Tensor) -> Tensor:
 
 
 def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
-    """Return a classifier that rounds images to 8 bits, if `settings.quantized` asks for it.
-
-    Args:
-        settings: Settings of the attack.
-        classifier: A model from images in [0, 1] to logits.
-
-    Returns:
-        A model from images in [0, 1] to logits. It is the given classifier if
-        `settings.quantized` is False.
-    """
+    """Return a classifier that rounds images to 8 bits, if `settings.quantized` asks for it."""
     return Quantized(classifier) if settings.quantized else classifier
 
 
 def add_sensor_noise(
-    images: Tensor, deviation: float, examples: Tensor, *key: int | str
+    images: Float[Tensor, "A V 3 H W"],
+    deviation: float,
+    examples: Int[Tensor, " A"],
+    *key: int | str,
 ) -> Iterator[Tensor]:
     """Add sensor noise to images and round them to 8 bits, as a camera does.
 
     This is repeated `NOISE_DRAWS` times with different noise. The noise of an
     example depends only on the key and on the index of the example.
-
-    Args:
-        images: Images in [0, 1] of V views of A examples, shape (A, V, 3, H, W).
-        deviation: Standard deviation of the Gaussian noise, in units of 1/255.
-        examples: Index of each example in its scene, shape (A,), int64.
-        key: Numbers and names that identify the random numbers, such as the
-            seed of an attack and "noise".
-
-    Yields:
-        Noisy images in [0, 1], rounded to multiples of 1/255, with the shape
-        and dtype of `images`.
     """
     generators = [generator(*key, example) for example in examples.tolist()]
     for _ in range(NOISE_DRAWS):
@@ -100,18 +84,10 @@ class ExpectationOverTransformations:
         self.settings = settings
         self._draws = draws
 
-    def __call__(self, model: nn.Module, images: Tensor, logits: Tensor) -> Tensor:
-        """Average the log-probabilities of images and of their random transformations.
-
-        Args:
-            model: Classifier with its preprocessing.
-            images: Images in [0, 1], shape (N, 3, H, W).
-            logits: Logits that the model returned for these images, shape (N, C).
-
-        Returns:
-            Average log-probabilities, shape (N, C). With 0 transformations, the
-            logits are returned as they are.
-        """
+    def __call__(
+        self, model: nn.Module, images: Float[Tensor, "N 3 H W"], logits: Float[Tensor, "N C"]
+    ) -> Float[Tensor, "N C"]:
+        """Average the log-probabilities of images and of their random transformations."""
         if not self.settings.draws:
             return logits
         log_probabilities = [logits.log_softmax(1)]
@@ -120,19 +96,13 @@ class ExpectationOverTransformations:
             log_probabilities.append(transformed_logits.log_softmax(1))
         return torch.stack(log_probabilities).mean(0)
 
-    def _transformed(self, images: Tensor) -> Tensor:
+    def _transformed(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
         """Transform each image at random.
 
         A transformation shifts, rotates and scales the image, changes the
         exposure, adds noise and compresses the image as JPEG. The quality of
         the compression is the same for all images of a call. Everything else
         differs between images.
-
-        Args:
-            images: Images in [0, 1], shape (N, 3, H, W).
-
-        Returns:
-            Transformed images in [0, 1], shape (N, 3, H, W).
         """
         settings = self.settings
         # Two shifts, a rotation and a relative change of size for each image, shape (N, 4).
@@ -152,15 +122,8 @@ class ExpectationOverTransformations:
 
 
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function to images, with the gradient of the identity (straight-through estimator).
-
-    Args:
-        images: Images, of any shape.
-        change: A function from images to images of the same shape. It need not be
-            differentiable.
-
-    Returns:
-        Changed images. Their gradient passes to `images` as it is.
+    """Apply a function to images, with the gradient of the identity (straight-through
+    estimator).
     """
     # The difference is computed from detached images, so it has no gradient.
     detached = images.detach()
@@ -168,16 +131,8 @@ def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tens
     return images + difference
 
 
-def as_jpeg(images: Tensor, quality: int) -> Tensor:
-    """Compress images as JPEG and decompress them.
-
-    Args:
-        images: Images in [0, 1] on the CPU, shape (..., 3, H, W).
-        quality: Quality of the compression, from 1 to 100.
-
-    Returns:
-        Images in [0, 1], shape (..., 3, H, W), float32.
-    """
+def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "... 3 H W"]:
+    """Compress images as JPEG and decompress them."""
     decompressed = []
     for image in to_bytes(images).flatten(0, -4):
         file = io.BytesIO()
@@ -188,22 +143,14 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
     return to_unit(torch.stack(decompressed)).view(images.shape)
 
 
-def _moved(images: Tensor, movements: Tensor) -> Tensor:
+def _moved(
+    images: Float[Tensor, "N 3 H W"], movements: Float[Tensor, "N 4"]
+) -> Float[Tensor, "N 3 H W"]:
     """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
     Each new pixel takes its value from a position in the given image. The
     movement is that of these positions, so the content of the image moves in
     the opposite direction.
-
-    Args:
-        images: Images, shape (N, 3, H, W).
-        movements: Movement of the positions of each image, shape (N, 4): the
-            shift across and the shift down as fractions of the image size, the
-            rotation in radians, and a number g. Distances of the positions from
-            the center of the image are multiplied by 1 + g.
-
-    Returns:
-        Moved images, shape (N, 3, H, W).
     """
     across, down, angle, growth = movements.unbind(1)
     cos = (1 + growth) * angle.cos()

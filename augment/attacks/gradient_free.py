@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attacks.descent import Criterion, Descent, DescentResult, Evaluation, Score, State
@@ -29,32 +30,18 @@ class GradientFree(Descent):
     draws: dict[int, torch.Generator] = field(default_factory=dict, init=False)
 
     @torch.no_grad()
-    def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Attack A examples from one set of initial values, without gradients.
-
-        Args:
-            criterion: Source and target classes of the A examples.
-            examples: Index of each attacked example in the scene, shape (A,).
-            start: Initial values, shape (A, D).
-
-        Returns:
-            Result of the A examples.
-        """
+    def run(
+        self, criterion: Criterion, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]
+    ) -> DescentResult:
+        """Attack A examples from one set of initial values, without gradients."""
         # This method exists for its decorator `no_grad`: `Descent.run` enables gradients.
         return super().run(criterion, examples, start)
 
-    def _draw_normal(self, state: State, count: int) -> Tensor:
+    def _draw_normal(self, state: State, count: int) -> Float[Tensor, "N count D"]:
         """Draw vectors of normal numbers for each active example.
 
         Each example has a generator of its own, so that its numbers do not
         depend on the other examples.
-
-        Args:
-            state: State of the search, with N active examples of D values.
-            count: Number of vectors for each example.
-
-        Returns:
-            Numbers with mean 0 and standard deviation 1, shape (N, count, D).
         """
         shape = (count, state.values.shape[1])
         numbers = []
@@ -65,14 +52,7 @@ class GradientFree(Descent):
         return torch.stack(numbers).to(state.values)
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify several candidates of each active example.
-
-        Args:
-            state: State of the search, with N active examples.
-
-        Returns:
-            Images and score of the best candidate of each of the N examples.
-        """
+        """Render and classify several candidates of each active example."""
         # P candidates of D values for each example, shape (N, P, D).
         candidates = self._candidates(state)
         count = candidates.shape[1]
@@ -93,41 +73,23 @@ class GradientFree(Descent):
             candidate_count=count,
         )
 
-    def _candidates(self, state: State) -> Tensor:
-        """Return the candidates to evaluate next. By default, each example has one.
-
-        Args:
-            state: State of the search, with N active examples.
-
-        Returns:
-            D attack values of P candidates of each active example, shape (N, P, D).
-        """
+    def _candidates(self, state: State) -> Float[Tensor, "N P D"]:
+        """Return the candidates to evaluate next. By default, each example has one."""
         return state.candidate[state.active_rows][:, None]
 
-    def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
-        """Adapt the search to the costs of the candidates. By default, do nothing.
-
-        Args:
-            state: State of the search, with N active examples.
-            candidates: D attack values of P candidates of each active example, shape (N, P, D).
-            costs: Cost of each candidate, shape (N, P).
-        """
+    def _learn(
+        self, state: State, candidates: Float[Tensor, "N P D"], costs: Float[Tensor, "N P"]
+    ) -> None:
+        """Adapt the search to the costs of the candidates. By default, do nothing."""
 
     def _score_values(
-        self, values: Tensor, examples: Tensor, criterion: Criterion, state: State
+        self,
+        values: Float[Tensor, "A D"],
+        examples: Int[Tensor, " A"],
+        criterion: Criterion,
+        state: State,
     ) -> tuple[Tensor, Score]:
-        """Render and classify candidates, in groups that fit in memory.
-
-        Args:
-            values: Attack values of A candidates, shape (A, D).
-            examples: Index of the example to which each candidate belongs, shape (A,).
-            criterion: Source and target classes of the A candidates.
-            state: State of the search, which has the batch size.
-
-        Returns:
-            Images of the V views of each candidate, shape (A, V, 3, H, W), and the scores of the
-            candidates.
-        """
+        """Render and classify candidates, in groups that fit in memory."""
         image_groups = []
         scores = []
         for group in torch.arange(len(values)).split(self.problem.group_size):
@@ -139,33 +101,17 @@ class GradientFree(Descent):
         return torch.cat(image_groups), Score.of_examples(scores, view_count)
 
     def _score_images(
-        self, images: Tensor, criterion: Criterion, batch_size: BatchSize
+        self, images: Float[Tensor, "A V 3 H W"], criterion: Criterion, batch_size: BatchSize
     ) -> list[Score]:
-        """Classify images batch by batch.
-
-        Args:
-            images: Images of V views of A candidates, shape (A, V, 3, H, W).
-            criterion: Source and target classes of the A candidates.
-            batch_size: Number of images of a batch.
-
-        Returns:
-            Scores of the images of each batch. The images are in the order of their candidates.
-        """
+        """Classify images batch by batch."""
         all_images = images.flatten(0, 1)
         score_part = partial(self._score_part, all_images, criterion.flatten())
         return list(batch_size.map(score_part, len(all_images)))
 
-    def _score_part(self, all_images: Tensor, criterion: Criterion, rows: slice) -> Score:
-        """Compute the cost, the logit gap and the prediction of each image of a batch.
-
-        Args:
-            all_images: All images, shape (N, 3, H, W).
-            criterion: Source and target class of each of the N images.
-            rows: The images of the batch among the N images.
-
-        Returns:
-            Scores of the images of the batch.
-        """
+    def _score_part(
+        self, all_images: Float[Tensor, "N 3 H W"], criterion: Criterion, rows: slice
+    ) -> Score:
+        """Compute the cost, the logit gap and the prediction of each image of a batch."""
         batch = all_images[rows]
         classes = criterion.select(rows)
         # The network may compute in half precision.
@@ -175,29 +121,17 @@ class GradientFree(Descent):
         return Score.of_logits(cost, logits, expected_logits, classes)
 
     def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
-        """Return a mask of the candidates that lower the cost of their examples, shape (N,).
-
-        Args:
-            state: State of the search, with the costs before the last step.
-            evaluation: Scores of one candidate for each of the N active examples.
-        """
+        """Return a mask of the candidates that lower the cost of their examples, shape (N,)."""
         return evaluation.score.cost < state.cost[state.active_rows]
 
 
-def _best_candidates(cost: Tensor, is_met: Tensor, count: int) -> Tensor:
+def _best_candidates(
+    cost: Float[Tensor, " _"], is_met: Bool[Tensor, " _"], count: int
+) -> Int[Tensor, " N"]:
     """Choose the best candidate of each of N examples.
 
     It is the candidate of lowest cost among those that reach the criterion. If
     none reaches the criterion, it is the candidate of lowest cost.
-
-    Args:
-        cost: Cost of each candidate. The candidates of an example follow each
-            other, shape (N · count,).
-        is_met: Mask of the candidates that reach the criterion, shape (N · count,).
-        count: Number of candidates of each example.
-
-    Returns:
-        Index of the best candidate of each example among all N · count, shape (N,).
     """
     # One row for each example, one column for each of its candidates.
     costs = cost.unflatten(0, (-1, count))

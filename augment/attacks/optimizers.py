@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
@@ -35,8 +36,8 @@ def descend(
     settings: AttackSettings,
     phases: Phases | None = None,
     *,
-    examples: Tensor | None = None,
-    start: Tensor | None = None,
+    examples: Int[Tensor, " A"] | None = None,
+    start: Float[Tensor, "A D"] | None = None,
     restarts: Iterable[Tensor] = (),
     seed: int = 0,
 ) -> DescentResult:
@@ -45,29 +46,6 @@ def descend(
     The examples are attacked in groups of at most `problem.group_size`, so that
     the gradients fit in memory. The model runs in evaluation mode, and its state
     is restored afterwards.
-
-    Args:
-        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
-            [0, 1] to logits (N, C).
-        problem: Scene, and the parameters of it that are attacked.
-        criterion: Source and target classes of the A attacked examples.
-        settings: Optimizer and its budget, margin, backtracking, batch size,
-            and the random transformations of EOT (expectation over
-            transformations).
-        phases: Timer to which the seconds of the classifier passes are added.
-            None for no timer.
-        examples: Index of each attacked example in the scene, shape (A,).
-            None attacks all examples.
-        start: Initial attack values, shape (A, D). None starts at
-            `problem.start`.
-        restarts: Further initial values, each of shape (A, D). They are tried
-            in turn for the examples that have not succeeded.
-        seed: Seed of the EOT transformations, of the sensor noise that
-            successes must survive, and of the optimizers that draw random
-            numbers.
-
-    Returns:
-        Result of the A examples.
     """
     if examples is None:
         examples = torch.arange(len(problem.start), device=problem.start.device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -19,28 +20,15 @@ AFTER_COLOR = "#e45756"
 
 
 def draw_attack(
-    before: Tensor,
-    ball: Tensor,
-    after: Tensor,
-    probabilities_before: Tensor,
-    probabilities_after: Tensor,
+    before: Float[Tensor, "3 size size"],
+    ball: Float[Tensor, "3 size size"],
+    after: Float[Tensor, "3 size size"],
+    probabilities_before: Float[Tensor, " C"],
+    probabilities_after: Float[Tensor, " C"],
     classes: Sequence[str],
     true_class: int,
 ) -> Figure:
-    """Draw one view before and after an attack, with the light and the most probable classes.
-
-    Args:
-        before: Image before the attack, in [0, 1], shape (3, size, size).
-        ball: White ball in the light after the attack, shape (3, size, size).
-        after: Image after the attack, in [0, 1], shape (3, size, size).
-        probabilities_before: Probability of each class before the attack, shape (C,).
-        probabilities_after: Probability of each class after the attack, shape (C,).
-        classes: Names of the C classes.
-        true_class: Index of the class that the images show.
-
-    Returns:
-        The figure. `figure.savefig(path)` writes it.
-    """
+    """Draw one view before and after an attack, with the light and the most probable classes."""
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     axes_before, axes_light, axes_after, axes_bars = figure.subplots(
         1, 4, width_ratios=[1, 1, 1, 1.2]
@@ -52,14 +40,8 @@ def draw_attack(
     return figure
 
 
-def _show(axes: Axes, image: Tensor, title: str) -> None:
-    """Draw an image with a title above it.
-
-    Args:
-        axes: Part of the figure to draw in.
-        image: Image, shape (3, size, size).
-        title: The title.
-    """
+def _show(axes: Axes, image: Float[Tensor, "3 size size"], title: str) -> None:
+    """Draw an image with a title above it."""
     # NumPy has no bfloat16.
     pixels = image.permute(1, 2, 0).clamp(0, 1).float().numpy()
     axes.imshow(pixels, interpolation="nearest")
@@ -67,29 +49,20 @@ def _show(axes: Axes, image: Tensor, title: str) -> None:
     axes.axis("off")
 
 
-def _most_probable(probabilities: Tensor, classes: Sequence[str]) -> str:
-    """Return a text with the most probable class and its probability.
-
-    Args:
-        probabilities: Probability of each class, shape (C,).
-        classes: Names of the C classes.
-    """
+def _most_probable(probabilities: Float[Tensor, " C"], classes: Sequence[str]) -> str:
+    """Return a text with the most probable class and its probability."""
     probability, index = probabilities.max(0)
     return f"{classes[int(index)]} {float(probability):.0%}"
 
 
 def _draw_probabilities(
-    axes: Axes, before: Tensor, after: Tensor, classes: Sequence[str], true_class: int
+    axes: Axes,
+    before: Float[Tensor, " C"],
+    after: Float[Tensor, " C"],
+    classes: Sequence[str],
+    true_class: int,
 ) -> None:
-    """Draw the probabilities of the true class and the most probable classes as pairs of bars.
-
-    Args:
-        axes: Part of the figure to draw in.
-        before: Probability of each class before the attack, shape (C,).
-        after: Probability of each class after the attack, shape (C,).
-        classes: Names of the C classes.
-        true_class: Index of the true class, which is always shown.
-    """
+    """Draw the probabilities of the true class and the most probable classes as pairs of bars."""
     shown_count = min(SHOWN_CLASSES, len(classes))
     # Order the classes by the larger of their two probabilities.
     by_probability = before.maximum(after).topk(shown_count).indices

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
@@ -32,12 +33,7 @@ class AttackProblem:
     """
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
-        """Join the initial values of all parameters.
-
-        Args:
-            scene: Scene to attack.
-            parameters: Parameters to change, made for this scene.
-        """
+        """Join the initial values of all parameters."""
         self.scene = scene
         self.parameters = parameters
         self.group_size = scene.group_size
@@ -46,49 +42,26 @@ class AttackProblem:
         self.all_examples = torch.arange(len(scene), device=self.start.device)
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
-    def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
-        """Convert attack values to the light, shapes and colors with which examples are rendered.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions of the A examples, differentiable with respect to the
-            values. What no parameter changes is that of the scene.
+    def conditions(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Conditions:
+        """Convert attack values to the light, shapes and colors with which examples are
+        rendered.
         """
         conditions = self.scene.conditions(examples)
         for parameter, parameter_values in self.split_by_parameter(values):
             conditions = parameter.apply(parameter_values, conditions, examples)
         return conditions
 
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Render the V views of each example with the given attack values.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Images in [0, 1], shape (A, V, 3, size, size), differentiable with
-            respect to the values.
-        """
+    def render(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Render the V views of each example with the given attack values."""
         return self.scene.render(self.conditions(values, examples), examples)
 
     @torch.no_grad()
-    def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
-        """Render the V views of examples without gradients, `group_size` examples at a time.
-
-        Args:
-            values: D attack values of each of all E examples, shape (E, D).
-            examples: Index of each example to render, shape (A,). None renders
-                all examples.
-
-        Returns:
-            Images in [0, 1], shape (A, V, 3, size, size).
-        """
+    def images(
+        self, values: Float[Tensor, "E D"], examples: Int[Tensor, " A"] | None = None
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Render the V views of examples without gradients, `group_size` examples at a time."""
         if examples is None:
             examples = self.all_examples
         size = self.scene.settings.size
@@ -105,25 +78,12 @@ class AttackProblem:
 
     def take_step(
         self,
-        values: Tensor,
-        gradient: Tensor,
-        examples: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        """Take a step of projected gradient descent with each parameter.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D).
-            gradient: Gradient of the cost with respect to the values,
-                shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-            length: Factor of the step of each example, shape (A, 1).
-
-        Returns:
-            Values after the step, which are feasible and lie in the
-            norm-balls, shape (A, D).
-        """
+        values: Float[Tensor, "A D"],
+        gradient: Float[Tensor, "A D"],
+        examples: Int[Tensor, " A"],
+        length: Float[Tensor, "A 1"],
+    ) -> Float[Tensor, "A D"]:
+        """Take a step of projected gradient descent with each parameter."""
         gradient_parts = gradient.split(self._value_counts, dim=1)
         moved = []
         for (parameter, value_part), gradient_part in zip(
@@ -132,52 +92,29 @@ class AttackProblem:
             moved.append(parameter.take_step(value_part, gradient_part, examples, length))
         return torch.cat(moved, dim=1)
 
-    def search_scale(self, examples: Tensor) -> Tensor:
-        """Return how much random search should change each attack value at first.
-
-        Args:
-            examples: Index of each of A examples in the scene, shape (A,).
-
-        Returns:
-            Standard deviation of the first random changes of each value, shape
-            (A, D). See `Parameter.search_scale`.
-        """
+    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+        """Return how much random search should change each attack value at first."""
         scales = [parameter.search_scale(examples) for parameter in self.parameters]
         return torch.cat(scales, dim=1).to(self.start)
 
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+    def project(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A D"]:
         """Find the nearest values that are feasible and lie in the norm-balls.
 
         The values of each parameter are projected separately.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Projected values, shape (A, D).
         """
         parts = self.split_by_parameter(values)
         projected = [parameter.project(part, examples) for parameter, part in parts]
         return torch.cat(projected, dim=1)
 
-    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+    def sample(
+        self, generator: torch.Generator, reached: Float[Tensor, "E D"] | None = None
+    ) -> Float[Tensor, "E D"]:
         """Draw random feasible attack values for all examples.
 
         A parameter with a radius draws from its norm-ball. A parameter without
         one draws changes that are as long as those of an attack.
-
-        Args:
-            generator: CPU generator of the random numbers.
-            reached: Values that an attack reached, shape (E, D). Needed if a
-                parameter has no radius.
-
-        Returns:
-            Random values, shape (E, D).
-
-        Raises:
-            InputError: If a parameter has no radius and `reached` is None.
         """
         if reached is None:
             samples = [parameter.sample(generator) for parameter in self.parameters]
@@ -186,31 +123,14 @@ class AttackProblem:
             samples = [parameter.sample(generator, part) for parameter, part in parts]
         return torch.cat([sample.to(self.start) for sample in samples], dim=1)
 
-    def split_by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
-        """Split the attack values of examples into the values of each parameter.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D).
-
-        Returns:
-            Pairs of a parameter and its values. A parameter with d of the D
-            values has shape (A, d).
-        """
+    def split_by_parameter(self, values: Float[Tensor, "A D"]) -> list[tuple[Parameter, Tensor]]:
+        """Split the attack values of examples into the values of each parameter."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
-    """Prepare an attack on a scene.
-
-    Args:
-        settings: Settings of the attack, with the parameters to attack.
-        scene: The scene to attack.
-
-    Returns:
-        The scene and its attacked parameters. If `settings.allow_negative` is False, negative
-        radiance is first removed from the light of the scene.
-    """
+    """Prepare an attack on a scene."""
     if not settings.allow_negative:
         scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
     parameters = []

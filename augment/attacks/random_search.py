@@ -33,11 +33,7 @@ class RandomSearch(GradientFree):
     """
 
     def _step(self, state: State) -> None:
-        """Compute the next candidate of each active example by a random change of its values.
-
-        Args:
-            state: State of the search. Its candidates and step counts are updated.
-        """
+        """Compute the next candidate of each active example by a random change of its values."""
         rows = state.active_rows
         examples = state.examples[rows]
         # Standard deviation of each change, shape (N, D) for N active examples.
@@ -48,16 +44,7 @@ class RandomSearch(GradientFree):
         state.result.steps[rows] += 1
 
     def _decide(self, state: State, evaluation: Evaluation) -> Decision:
-        """Decide which candidates are accepted, and adapt the length of the next changes.
-
-        Args:
-            state: State of the search, with N active examples.
-            evaluation: Scores of their N candidates.
-
-        Returns:
-            Decisions of `Descent`, with a longer change after an accepted candidate and a
-            shorter change after a rejected one.
-        """
+        """Decide which candidates are accepted, and adapt the length of the next changes."""
         decision = super()._decide(state, evaluation)
         factor = torch.where(decision.is_accepted, GROWTH, SHRINKAGE)
         return replace(decision, length_factor=factor)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
@@ -59,19 +60,6 @@ def find_scene(
     the built-in environments and in uniform light, with several exposures, and
     also in front of a light gray background. It ends when the classifier gives
     the true class a probability of at least `CONFIDENCE_TO_STOP` in all images.
-
-    Args:
-        classifier: The classifier to attack.
-        settings: Settings of the scene with which the search starts.
-        attack: Settings of the attack.
-        build: A function from settings of a scene to the scene.
-        cameras: Number of cameras to try.
-        draws: CPU generator of the random cameras.
-
-    Returns:
-        Settings of the scene with the highest confidence. These are the given
-        settings if the classifier is right in all their images, or if no other
-        scene is recognized.
     """
     [confidence] = _confidences(build(settings), attack, classifier)
     # `_confidences` returns 0 if an image is misclassified.
@@ -94,15 +82,6 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
 
     If the only background is a gray value, each camera is used twice: with this
     background and with a light gray one.
-
-    Args:
-        settings: Settings of the scene.
-        cameras: Number of cameras. The first is the camera of the scene, and the
-            others are random.
-        draws: CPU generator of the random cameras.
-
-    Yields:
-        Settings of a scene to try.
     """
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
@@ -121,10 +100,6 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
     """Return a copy of a scene's settings with a camera at a random place.
 
     The field of view stays the same, or the camera stays orthographic.
-
-    Args:
-        settings: Settings of the scene.
-        draws: CPU generator of the random numbers.
     """
     polar, azimuth, width = torch.rand(3, generator=draws).tolist()
     lowest_polar, highest_polar = POLAR
@@ -146,19 +121,7 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
 def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """Find the light and the exposure in which a classifier recognizes a scene best.
-
-    Args:
-        scene: Scene that was built from the settings.
-        settings: Settings of the scene.
-        attack: Settings of the attack.
-        classifier: Classifier to attack.
-
-    Returns:
-        The highest confidence, and the settings with the light and the exposure that give it.
-        A confidence is the lowest probability of the true class in all images, or 0 if an image
-        is misclassified.
-    """
+    """Find the light and the exposure in which a classifier recognizes a scene best."""
     names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
     degree = harmonics_of(scene.basis).degree
     candidates = []
@@ -176,17 +139,8 @@ def _best_light(
     return float(highest), candidates[index]
 
 
-def _under_lights(scene: Scene, skies: Tensor) -> Scene:
-    """Return a scene that repeats all examples in each of several environment lights.
-
-    Args:
-        scene: Scene of E examples.
-        skies: RGB harmonic coefficients of N environment lights, shape (N, K, 3).
-
-    Returns:
-        Scene of N · E examples. Example n · E + e is example e in light n. Projector and lamps
-        are those of the given scene.
-    """
+def _under_lights(scene: Scene, skies: Float[Tensor, "N K 3"]) -> Scene:
+    """Return a scene that repeats all examples in each of several environment lights."""
     count = len(skies)
     # Environment light of each new example, shape (N · E, K, 3).
     environment = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
@@ -203,20 +157,11 @@ def _confidences(
     attack: AttackSettings,
     classifier: Classifier,
     groups: int = 1,
-) -> Tensor:
+) -> Float[Tensor, " groups"]:
     """Compute how surely a classifier recognizes each group of examples before an attack.
 
     The confidence of an image is the probability of its true class, or 0 if the image is
     misclassified. The confidence of a group is the lowest one of its images.
-
-    Args:
-        scene: Scene of E examples.
-        attack: Settings of the attack.
-        classifier: Classifier to attack.
-        groups: Number of groups. Each has E / groups successive examples.
-
-    Returns:
-        Confidence of each group, shape (groups,).
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)

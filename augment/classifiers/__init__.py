@@ -71,26 +71,14 @@ class Source(NamedTuple):
 
 
 def _efficientnet_lite(version: int) -> Source:
-    """Return the functions that load or build a classifier EfficientNet-Lite.
-
-    Args:
-        version: Number of the classifier in its family: 0, 1 or 2.
-    """
+    """Return the functions that load or build a classifier EfficientNet-Lite."""
     load = partial(load_efficientnet_lite, version)
     build = partial(build_efficientnet_lite, version)
     return Source(load, build)
 
 
 def _load_python(name: str, weights: Path | None) -> Classifier:
-    """Load a classifier by a Python function that the user wrote.
-
-    Args:
-        name: Function, such as "package.module:function". It loads its own weights.
-        weights: File of weights, which must be None.
-
-    Raises:
-        InputError: If a file of weights is given.
-    """
+    """Load a classifier by a Python function that the user wrote."""
     if weights is not None:
         raise InputError(
             f"weights={weights} cannot be combined with python:{name}, a function that "
@@ -178,17 +166,7 @@ def load_classifier(
 
 
 def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
-    """Load a classifier by name, without the normalization of light, and without any message.
-
-    Args:
-        name: Name of a source with its model, or path of a file with a network.
-        path: File of weights. None for the weights of the source.
-        facts: Classes, image size and normalization that the user gave.
-        trust_code: Whether the name may be that of a program.
-
-    Raises:
-        InputError: If the name is unknown, or an argument does not fit the source.
-    """
+    """Load a classifier by name, without the normalization of light, and without any message."""
     source, colon, model = name.partition(":")
     if source + colon in SOURCES:
         arguments: list[Any] = [model, path] if colon else [path]
@@ -224,14 +202,6 @@ def build_classifier(
 
     A Python function of the user chooses weights and size itself, and a file
     contains its weights. These classifiers are loaded as they are.
-
-    Args:
-        name: Name of a classifier, as for `load_classifier`.
-        size: Pixels per side of the images.
-        classes: Names of the classes. None for those of the source.
-        normalization: Mean and standard deviation of the channels, before the
-            network of a file. All other sources have their own normalization.
-        trust_code: Whether the name may be that of a program, as for `load_classifier`.
     """
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:

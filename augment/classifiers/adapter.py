@@ -13,10 +13,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
@@ -33,9 +34,6 @@ from renderer.errors import (
 )
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
@@ -94,22 +92,12 @@ class NetworkCall:
         self.probability_rows: int | None = 0
 
     def __call__(
-        self, network: Callable[[Tensor], Tensor], images: Tensor, classes: int | None = None
-    ) -> Tensor:
-        """Compute the logits of images, and check them.
-
-        Args:
-            network: Any function from images to logits.
-            images: RGB images in [0, 1], shape (N, 3, H, W).
-            classes: Number of classes C. None if unknown.
-
-        Returns:
-            Logits, shape (N, C).
-
-        Raises:
-            InputError: If the network fails, or does not return one row of
-                logits for each image.
-        """
+        self,
+        network: Callable[[Tensor], Tensor],
+        images: Float[Tensor, "N 3 H W"],
+        classes: int | None = None,
+    ) -> Float[Tensor, "N C"]:
+        """Compute the logits of images, and check them."""
         shape = tuple(images.shape)
         try:
             logits = network(images)
@@ -132,19 +120,12 @@ class NetworkCall:
         return logits
 
     def _failure(
-        self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception
+        self,
+        network: Callable[[Tensor], Tensor],
+        images: Float[Tensor, "N 3 H W"],
+        error: Exception,
     ) -> str:
-        """Return the message of the error for a network that failed on images.
-
-        Args:
-            network: The network.
-            images: Images with which the network was called, shape (N, 3, H, W).
-            error: Error that the network raised.
-
-        Returns:
-            A sentence with the error and a remedy. If the weights of the network have another
-            dtype than the images, the remedy is to convert one of them.
-        """
+        """Return the message of the error for a network that failed on images."""
         weights = network.parameters() if isinstance(network, nn.Module) else iter(())
         dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
@@ -155,15 +136,8 @@ class NetworkCall:
             return f"{reason}: its weights are {of_weights}, {remedy}"
         return f"{reason}: give the size of its images, or use a network that takes such images"
 
-    def _require_no_probabilities(self, logits: Tensor) -> None:
-        """Check that the network does not return probabilities instead of logits.
-
-        Args:
-            logits: Outputs of the network for a batch, shape (N, C).
-
-        Raises:
-            InputError: If all outputs so far look like probabilities.
-        """
+    def _require_no_probabilities(self, logits: Float[Tensor, "N C"]) -> None:
+        """Check that the network does not return probabilities instead of logits."""
         if self.probability_rows is None or not len(logits):
             return
         if not are_probabilities(logits):
@@ -178,16 +152,8 @@ class NetworkCall:
             )
 
 
-def are_probabilities(outputs: Tensor) -> bool:
-    """Return whether outputs of a network are probabilities.
-
-    Args:
-        outputs: Outputs for N images and C classes, shape (N, C).
-
-    Returns:
-        Whether all values are in [0, 1] and each row sums to 1 up to rounding to
-        three decimals. Outputs with a single class do not count as probabilities.
-    """
+def are_probabilities(outputs: Float[Tensor, "N C"]) -> bool:
+    """Return whether outputs of a network are probabilities."""
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
     values = outputs.detach()
@@ -409,18 +375,7 @@ class Classifier(nn.Module):
 
 
 def as_images(name: str, images: object) -> Tensor:
-    """Convert images to a tensor of floating-point numbers.
-
-    Args:
-        name: Name of the argument, for errors.
-        images: Tensor, NumPy array or nested list.
-
-    Returns:
-        The images.
-
-    Raises:
-        InputError: If the images are bytes, or not numbers.
-    """
+    """Convert images to a tensor of floating-point numbers."""
     if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
         raise InputError(
             f"{name} is {describe(images)}: use floating-point RGB in [0, 1], such as {name} / 255"
@@ -429,17 +384,7 @@ def as_images(name: str, images: object) -> Tensor:
 
 
 def require_unit_range(name: str, *extremes: Tensor) -> None:
-    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`.
-
-    Args:
-        name: Name of the argument with the images, for the error.
-        extremes: The lowest and the highest value of the images. Empty if there
-            are no images.
-
-    Raises:
-        InputError: If a value is NaN or far from [0, 1]. This happens with
-            bytes and with normalized images.
-    """
+    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`."""
     if not extremes:
         return
     low, high = torch.stack(extremes).tolist()
@@ -451,16 +396,7 @@ def require_unit_range(name: str, *extremes: Tensor) -> None:
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
-    """Convert a list of names of classes to a tuple of strings.
-
-    Args:
-        name: Name of the argument with the list, for errors.
-        classes: List of names in the order of the logits.
-
-    Raises:
-        InputError: If `classes` is not a list of strings. A single string is
-            refused, too.
-    """
+    """Convert a list of names of classes to a tuple of strings."""
     names = as_list(
         name, classes, str, "a list of the names of the classes, in the order of the logits"
     )
@@ -512,15 +448,8 @@ class ArrayFunction(Wrapper):
         self.takes_tensors = takes_tensors
         self.has_probabilities: bool | None = None
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Compute the scores of images, or their logarithms if they are probabilities.
-
-        Args:
-            images: Images in [0, 1], shape (N, 3, H, W).
-
-        Returns:
-            Scores with the dtype and the device of the images, shape (N, C).
-        """
+    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N C"]:
+        """Compute the scores of images, or their logarithms if they are probabilities."""
         detached = images.detach()
         given = detached if self.takes_tensors else detached.cpu().float().numpy()
         scores = torch.as_tensor(np.asarray(self.network(given))).to(images)
@@ -655,17 +584,7 @@ class NormalizedLight(Wrapper):
 
 
 def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
-    """Return a network that normalizes the light of images and then calls a given network.
-
-    Args:
-        network: Network that takes RGB images in [0, 1].
-        value: How the light is normalized: True for the defaults, a mapping with fields of
-            `NormalizedLightSettings`, or such settings. With None or False, the given network
-            is returned.
-
-    Raises:
-        InputError: If the network normalizes light already, or if the value is something else.
-    """
+    """Return a network that normalizes the light of images and then calls a given network."""
     settings = read_normalized_light(value)
     if settings is None:
         return network
@@ -692,18 +611,7 @@ def without_normalized_light(network: Any) -> Any:
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
-    """Return the index of a class.
-
-    Args:
-        classes: Names of all classes.
-        name: Name of the class, or its index as a number or as text.
-        subject: Start of the error: the argument that has the name, such as
-            "label", or what lacks the class, such as "classifier NAME".
-
-    Raises:
-        InputError: If there is no such class. The message suggests similar
-            names.
-    """
+    """Return the index of a class."""
     require_kind("label", name, str | int, "the name of a class, or its index")
     text = composed(str(name))
     names = [*map(composed, classes)]
@@ -733,51 +641,17 @@ def _are_indices(classes: Sequence[str]) -> bool:
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:
-    """Return the three names that are most similar to a misspelled name, as one text.
-
-    Args:
-        name: Name that was given.
-        choices: Valid names.
-
-    Returns:
-        The most similar names, such as "a, b, c".
-    """
+    """Return the three names that are most similar to a misspelled name, as one text."""
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
 def load_python(name: str) -> Classifier:
-    """Load a classifier by a Python function that the user wrote.
-
-    Args:
-        name: Function as "package.module:function" or "package.module.function".
-            It returns a network, the size of its images and the names of its
-            classes, see `call_python`.
-
-    Raises:
-        InputError: If there is no such function, or if the function or its
-            module raises or returns something else.
-    """
+    """Load a classifier by a Python function that the user wrote."""
     return Classifier(*call_python(name), f"python:{name}")
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
-    """Call a Python function that the user wrote to load a network, and check its result.
-
-    Args:
-        name: "package.module:function" or "package.module.function". The module
-            is in the current folder or installed.
-
-    Returns:
-        Three values:
-        - the network, which maps RGB images (N, 3, size, size) in [0, 1] to
-          logits,
-        - the pixels per side of its images,
-        - the names of its classes in the order of the logits.
-
-    Raises:
-        InputError: If there is no such function, or if the function or its
-            module raises or returns something else.
-    """
+    """Call a Python function that the user wrote to load a network, and check its result."""
     separator = ":" if ":" in name else "."
     module_name, _, function_name = name.rpartition(separator)
     current_folder = str(Path.cwd())

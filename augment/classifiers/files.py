@@ -63,9 +63,6 @@ def is_network_file(name: str) -> bool:
 
     The suffix decides. Only for .pt and similar suffixes, which files of weights
     have, too, the file must also exist and be TorchScript.
-
-    Args:
-        name: Name of a classifier, which may be a path.
     """
     path = Path(name)
     if path.suffix.lower() in TORCHSCRIPT:
@@ -74,23 +71,7 @@ def is_network_file(name: str) -> bool:
 
 
 def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = False) -> Classifier:
-    """Load a classifier from a file that contains its network.
-
-    Args:
-        name: Path of a file of TorchScript, `torch.export` (.pt2) or ONNX
-            (.onnx). The network maps images (N, 3, size, size) to logits.
-        facts: Classes, size and normalization. If no size is given, the size is
-            read from the file. If the file does not tell it, it is 224. If no
-            normalization is given, the network gets images in [0, 1].
-        trust_code: Whether the file may be a program, which can run any code.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If the file is missing, contains something else or is a
-            program that is not trusted, or if classes or size do not fit.
-    """
+    """Load a classifier from a file that contains its network."""
     path = Path(name)
     require_file(path, "give the path of a file that contains a network")
     content = _read(path, trust_code)
@@ -113,30 +94,12 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = Fals
 def build_file(
     name: str, size: int, facts: NetworkFacts = NO_FACTS, trust_code: bool = False
 ) -> Classifier:
-    """Load a classifier from a file, for images of another size.
-
-    Args:
-        name: Path of the file, see `load_file`.
-        size: Pixels per side of the images.
-        facts: Classes and normalization.
-        trust_code: Whether the file may be a program, which can run any code.
-
-    Returns:
-        The classifier.
-    """
+    """Load a classifier from a file, for images of another size."""
     return load_file(name, replace(facts, size=size), trust_code)
 
 
 def _read(path: Path, trust_code: bool) -> Content:
-    """Read a file with a network, in the format that the suffix of its name tells.
-
-    Args:
-        path: File of TorchScript, `torch.export` or ONNX.
-        trust_code: Whether it may be TorchScript or `torch.export`.
-
-    Raises:
-        InputError: If the file is not trusted, is damaged or has another format.
-    """
+    """Read a file with a network, in the format that the suffix of its name tells."""
     if path.suffix.lower() == EXPORTED or is_torchscript(path):
         _require_trust(path, trust_code)
     readers = {EXPORTED: _read_exported, ONNX: read_onnx}
@@ -165,14 +128,7 @@ def _require_trust(path: Path, trust_code: bool) -> None:
 
 
 def _read_torchscript(path: Path) -> Content:
-    """Read a file of TorchScript, which `torch.jit.save` wrote.
-
-    Args:
-        path: The file.
-
-    Raises:
-        InputError: If the file contains weights only, or a pickled module.
-    """
+    """Read a file of TorchScript, which `torch.jit.save` wrote."""
     if not is_torchscript(path):
         advice = advice_for_pickles(path)
         if advice is None:
@@ -210,14 +166,7 @@ class Scripted(Wrapper):
 
 
 def _read_exported(path: Path) -> Content:
-    """Read a network that `torch.export.save` wrote to a file.
-
-    Args:
-        path: The file. Its network has one input, the images.
-
-    Raises:
-        InputError: If the file has members that run code when they are read.
-    """
+    """Read a network that `torch.export.save` wrote to a file."""
     _require_plain_members(path)
     program = torch.export.load(path)
     [name] = program.graph_signature.user_inputs
@@ -305,18 +254,7 @@ class InBatches(Wrapper):
 
 
 def read_onnx(path: Path) -> Content:
-    """Read a file of ONNX with onnxruntime, on the CPU.
-
-    Args:
-        path: File with one input, images (N, 3, H, W) of float32. Its first
-            output is the logits.
-
-    Returns:
-        Network without gradients, and the shape of its images.
-
-    Raises:
-        InputError: If onnxruntime is not installed.
-    """
+    """Read a file of ONNX with onnxruntime, on the CPU."""
     try:
         onnxruntime: Any = importlib.import_module("onnxruntime")
     except ImportError as error:

@@ -13,14 +13,7 @@ from augment.distributed import rank
 
 
 def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
-    """Log the size and the normalization of the images of a network, once for each text.
-
-    Args:
-        name: Name of the network.
-        network: Function from images in [0, 1] to logits.
-        size: Pixels per side of the images.
-        assumed: Arguments that neither the user nor the network gave: "size", "normalization".
-    """
+    """Log the size and the normalization of the images of a network, once for each text."""
     text = f"network {name}: images of {size} × {size} pixels, "
     text += normalization_of(network) or "values in [0, 1], not normalized before the network"
     if assumed:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.settings import NormalizedLightSettings
 from renderer.image import clamp, decode, encode
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
 DARKEST_ENCODED = 1 / 255
@@ -34,19 +31,6 @@ def normalize_light(
     3. Encoding: the sRGB curve, and then the exponent `gamma`.
 
     The result is differentiable almost everywhere.
-
-    Args:
-        images: RGB images in [0, 1], sRGB-encoded, shape (N, 3, H, W).
-        settings: Settings of the three steps.
-
-    Returns:
-        RGB images in [0, 1], same shape. Black images stay black.
-
-    Example:
-        >>> import torch
-        >>> dark = torch.full((1, 3, 8, 8), 0.2)
-        >>> normalize_light(dark, NormalizedLightSettings(level=1.0)).unique().round(decimals=4)
-        tensor([1.])
     """
     linear = decode(clamp(images), "srgb")
     balanced = linear * _balance(linear, settings.white_balance)
@@ -55,33 +39,18 @@ def normalize_light(
     return _apply_gamma(encoded, settings.gamma)
 
 
-def _balance(linear: Tensor, degree: float) -> Tensor:
-    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree.
-
-    Args:
-        linear: Linear images, shape (N, 3, H, W).
-        degree: Exponent. 1 gives all channels the same mean, and 0 leaves the channels as they
-            are.
-
-    Returns:
-        Factor of each channel of each image, shape (N, 3, 1, 1).
-    """
+def _balance(linear: Float[Tensor, "N 3 H W"], degree: float) -> Float[Tensor, "N 3 1 1"]:
+    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree."""
     channel_means = linear.mean((2, 3), keepdim=True)
     mean = channel_means.mean(1, keepdim=True)
     ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
     return ratio**degree
 
 
-def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
-    """Compute the factors of the exposure, which map a percentile of an image to a given value.
-
-    Args:
-        linear: Linear images, shape (N, 3, H, W).
-        settings: The percentile of all values of an image, and the `level` to which it is mapped.
-
-    Returns:
-        Factor of each image, shape (N, 1, 1, 1).
-    """
+def _exposure(
+    linear: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings
+) -> Float[Tensor, "N 1 1 1"]:
+    """Compute the factors of the exposure, which map a percentile of an image to a given value."""
     values = linear.flatten(1)
     # The percentile is the value with this rank among the sorted values. Ranks start at 1.
     rank = math.ceil(settings.percentile / 100 * values.shape[1])
@@ -90,16 +59,8 @@ def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
     return factors.view(-1, 1, 1, 1)
 
 
-def _apply_gamma(encoded: Tensor, gamma: float) -> Tensor:
-    """Raise the values of images to a power, except that the curve is a line near black.
-
-    Args:
-        encoded: sRGB-encoded images in [0, 1], shape (N, 3, H, W).
-        gamma: The exponent.
-
-    Returns:
-        Images of the same shape.
-    """
+def _apply_gamma(encoded: Float[Tensor, "N 3 H W"], gamma: float) -> Tensor:
+    """Raise the values of images to a power, except that the curve is a line near black."""
     if gamma == 1:
         return encoded
     # x^gamma is x · x^(gamma - 1). The second factor is constant below `DARKEST_ENCODED`, because

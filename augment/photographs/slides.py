@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from augment.scene.patterns import (
@@ -39,26 +40,12 @@ def draw_slides(
     count: int,
     size: int,
     draws: torch.Generator,
-    photographs: Tensor | None = None,
-) -> Tensor:
+    photographs: UInt8[Tensor, "N 3 H W"] | None = None,
+) -> Float[Tensor, "count 3 size size"]:
     """Draw random slides, which are pictures that a projector shows.
 
     A slide has a two-color pattern, Voronoi cells, a smooth field or a
     photograph.
-
-    Args:
-        count: Number of slides.
-        size: Pixels per side.
-        draws: CPU generator of the random numbers.
-        photographs: Photographs that slides may show, uint8,
-            shape (N, 3, H, W). None for slides without photographs.
-
-    Returns:
-        Linear light in [0, 1], on the CPU, shape (count, 3, size, size).
-
-    Example:
-        >>> draw_slides(2, 8, torch.Generator().manual_seed(0)).shape
-        torch.Size([2, 3, 8, 8])
     """
     families: list[Callable[[int, int, torch.Generator], Tensor]]
     families = [draw_patterns, draw_cells, draw_fields]
@@ -76,19 +63,11 @@ def draw_slides(
     return slides
 
 
-def draw_cells(count: int, size: int, draws: torch.Generator) -> Tensor:
+def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "count 3 size size"]:
     """Draw pictures of Voronoi cells, each cell in a random color.
 
     The centers of the cells are random points. A pixel belongs to the cell
     whose center is nearest.
-
-    Args:
-        count: Number of pictures.
-        size: Pixels per side.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Linear light in [0, 1], shape (count, 3, size, size).
     """
     cell_counts = torch.randint(MIN_CELLS, MAX_CELLS + 1, (count,), generator=draws)
     # Draw `MAX_CELLS` centers for each picture, and move those that are not needed far away.
@@ -109,17 +88,10 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Tensor:
     return shown.transpose(1, 2).unflatten(2, (size, size))
 
 
-def draw_fields(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """Draw pictures of smooth random light, which differs between the three channels.
-
-    Args:
-        count: Number of pictures.
-        size: Pixels per side.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Linear light in [0, 1], shape (count, 3, size, size).
-    """
+def draw_fields(
+    count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 3 size size"]:
+    """Draw pictures of smooth random light, which differs between the three channels."""
     fields = []
     for _ in range(count):
         node_count = int(torch.randint(MIN_NODES, MAX_NODES + 1, (), generator=draws))
@@ -128,34 +100,22 @@ def draw_fields(count: int, size: int, draws: torch.Generator) -> Tensor:
     return torch.cat(fields)
 
 
-def interpolate_smoothly(values: Tensor, size: int) -> Tensor:
+def interpolate_smoothly(
+    values: Float[Tensor, "N C n n"], size: int
+) -> Float[Tensor, "N C size size"]:
     """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
 
     Interpolated values may be outside of the range of the given values.
-
-    Args:
-        values: Values at n × n grid points, in C channels, shape (N, C, n, n).
-        size: Pixels per side of the images.
-
-    Returns:
-        Values at the pixels, shape (N, C, size, size).
     """
     return F.interpolate(values, (size, size), mode="bicubic", align_corners=True)
 
 
-def draw_projected(photographs: Tensor, count: int, size: int, draws: torch.Generator) -> Tensor:
+def draw_projected(
+    photographs: UInt8[Tensor, "N 3 H W"], count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 3 size size"]:
     """Choose photographs, and rotate, scale and saturate them at random.
 
     Beyond its border, a photograph is mirrored.
-
-    Args:
-        photographs: Photographs to choose from, uint8, shape (N, 3, H, W).
-        count: Number of pictures.
-        size: Pixels per side of the pictures.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Linear light in [0, 1], on the CPU, shape (count, 3, size, size).
     """
     # Index of the random photograph that each of the pictures shows, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)

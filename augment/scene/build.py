@@ -169,15 +169,7 @@ def build_scene(
 
 
 def _require_known(options: Mapping[str, Any]) -> None:
-    """Check that `build_scene` got known options only: fields of two classes of settings.
-
-    Args:
-        options: Options by their names. They must be fields of `SceneSettings` or of
-            `RendererSettings`.
-
-    Raises:
-        InputError: If an option is unknown.
-    """
+    """Check that `build_scene` got known options only: fields of two classes of settings."""
     known = SCENE_OPTIONS | RENDERER_OPTIONS
     unknown = sorted(options.keys() - known)
     if unknown:
@@ -186,14 +178,7 @@ def _require_known(options: Mapping[str, Any]) -> None:
 
 
 def _as_meshes(meshes: object) -> list[Any]:
-    """Check the argument `meshes` of `build_scene`, and return it as a list.
-
-    Args:
-        meshes: Value that must be a list of `ObjectSettings`, or of pairs of a mesh and a label.
-
-    Raises:
-        InputError: If the value is something else.
-    """
+    """Check the argument `meshes` of `build_scene`, and return it as a list."""
     expected = "a list of pairs such as ('solid:orange', 'orange'), or of nb.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
@@ -217,15 +202,7 @@ def _as_meshes(meshes: object) -> list[Any]:
 def _load_member(
     member: ObjectSettings | tuple[MeshSource, str | int], vertices: int
 ) -> SceneObject:
-    """Load an object from a member of the argument `meshes` of `build_scene`.
-
-    Args:
-        member: Settings of the object, or a pair of a mesh and a label.
-        vertices: The mesh is subdivided until it has more vertices than this number.
-
-    Returns:
-        The object.
-    """
+    """Load an object from a member of the argument `meshes` of `build_scene`."""
     if isinstance(member, ObjectSettings):
         return load_object(member, vertices)
     mesh, label = member
@@ -237,19 +214,7 @@ def _load_member(
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
-    """Check the arguments `cameras`, `views` and `normalize` of `build_scene`.
-
-    Args:
-        cameras: Cameras that the user gave, or None.
-        views: Number of views.
-        normalize: Whether each mesh is moved and scaled to span [-1, 1].
-
-    Returns:
-        The given cameras, without gradients. The list is empty if `cameras` is None.
-
-    Raises:
-        InputError: If the arguments contradict each other.
-    """
+    """Check the arguments `cameras`, `views` and `normalize` of `build_scene`."""
     if cameras is None:
         if not normalize:
             raise InputError(
@@ -270,12 +235,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
 
 
 def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:
-    """Place cameras on a circle around the object, as the settings of a scene say.
-
-    Args:
-        settings: Width of the view, polar angle, azimuth of the first camera and field of view.
-        count: Number of cameras.
-    """
+    """Place cameras on a circle around the object, as the settings of a scene say."""
     return orbit_cameras(count, settings.width, settings.polar, settings.azimuth, settings.fov)
 
 
@@ -285,20 +245,7 @@ def _build_lights(
     degree: int | None,
     roughness: float | None = None,
 ) -> tuple[Basis, Tensor]:
-    """Join the environment lighting with the projector and the lamps of the settings.
-
-    Args:
-        settings: Settings of the scene.
-        environment: Name of the environment lighting, or its RGB coefficients,
-            shape (K, 3).
-        degree: Degree with which a named lighting is loaded.
-        roughness: Roughness of the smoothest surface of the scene, for which a
-            named lighting is loaded. None if no surface has gloss.
-
-    Returns:
-        The basis of all lights and their RGB coefficients, shape
-        (size of the basis, 3).
-    """
+    """Join the environment lighting with the projector and the lamps of the settings."""
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
     local_settings = [getattr(settings, name) for name in LOCAL_LIGHTS]
@@ -307,19 +254,7 @@ def _build_lights(
 
 
 def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
-    """Build a local light, which is a projector or a group of lamps.
-
-    Args:
-        settings: Settings of the light, such as `ProjectorSettings`.
-
-    Returns:
-        The basis of the light, and its RGB coefficients, shape (size, 3): the
-        pixels of a projector or the powers of lamps.
-
-    Raises:
-        InputError: If a file cannot be read, or if values contradict each
-            other.
-    """
+    """Build a local light, which is a projector or a group of lamps."""
     for name, kind in LOCAL_LIGHTS.items():
         if type(settings) is LOCAL_LIGHT_SETTINGS[name]:
             return kind.from_settings(settings)
@@ -327,24 +262,7 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
-    """Load the backgrounds of a scene.
-
-    Args:
-        choices: B gray values in [0, 1] or image files.
-        size: Pixels per side of the backgrounds.
-
-    Returns:
-        RGB images in [0, 1], shape (B, 3, size, size), or gray images, shape
-        (B, 1, size, size), if all backgrounds are gray.
-
-    Raises:
-        InputError: If there is no background, if a gray value is out of
-            bounds, or if an image cannot be read.
-
-    Example:
-        >>> load_backgrounds([0.2, 0.8], 16).shape
-        torch.Size([2, 1, 16, 16])
-    """
+    """Load the backgrounds of a scene."""
     expected = "a list of gray values in [0, 1] or image files"
     choices = as_list("backgrounds", choices, object, expected)
     if not choices:

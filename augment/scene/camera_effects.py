@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.scene.image_files import draw_image_files
@@ -27,34 +28,13 @@ def draw_camera_effects(
     image: ImageSettings,
     draws: torch.Generator,
     device: torch.device | str = "cpu",
-    points: Tensor | None = None,
+    points: Float[Tensor, "2 count size size"] | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """Draw the effects of a camera and of a projector for the images of each example.
 
     The linear light of an image is multiplied by a random pattern, as of a
     projector, and by a random white balance. Then the image is blurred, and
     noise is added.
-
-    Args:
-        settings: Ranges of the effects.
-        count: Number of examples.
-        image: Size and encoding of the images.
-        draws: Generator of the random numbers.
-        device: Device of the images.
-        points: Coordinates x and y of the point of the pattern that each pixel
-            of each example shows, in [-1, 1], shape (2, count, size, size). By
-            default, the pattern fills the image, as if the camera projected it.
-
-    Returns:
-        A differentiable function that applies the effects. Its arguments are
-        the images of V views of A examples, shape (A, V, 3, size, size), and the
-        indices of these examples, shape (A,). It returns the changed images.
-
-    Example:
-        >>> draws = torch.Generator().manual_seed(0)
-        >>> effects = draw_camera_effects(CameraEffectSettings(), 5, ImageSettings(8), draws)
-        >>> effects(torch.rand(2, 1, 3, 8, 8), torch.tensor([0, 4])).shape
-        torch.Size([2, 1, 3, 8, 8])
     """
     # Relative light of the projector at each pixel, shape (count, 3, size, size).
     patterns = draw_patterns(count, image.size, draws, points)
@@ -80,20 +60,12 @@ def draw_camera_effects(
 
 
 def _with_photographs(
-    patterns: Tensor, folder: str, draws: torch.Generator, points: Tensor | None
+    patterns: Float[Tensor, "count 3 size size"],
+    folder: str,
+    draws: torch.Generator,
+    points: Float[Tensor, "2 count size size"] | None,
 ) -> Tensor:
-    """Replace some of the patterns that a projector shows by photographs.
-
-    Args:
-        patterns: Linear light of the patterns in [0, 1], shape (count, 3, size, size).
-        folder: Folder of the photographs.
-        draws: Generator of the random numbers.
-        points: Coordinates x and y of the point of the pattern that each pixel shows, in
-            [-1, 1], shape (2, count, size, size). None if the pattern fills the image.
-
-    Returns:
-        The patterns and photographs, of the same shape.
-    """
+    """Replace some of the patterns that a projector shows by photographs."""
     count, _, size, _ = patterns.shape
     is_replaced = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY
     replaced_count = int(is_replaced.sum())
@@ -121,38 +93,27 @@ class _CameraEffects:
         encoding: Encoding of the images, such as "srgb".
     """
 
-    gains: Tensor
-    blurs: Tensor
-    noises: Tensor
+    gains: Float[Tensor, "E 3 size size"]
+    blurs: Float[Tensor, " E"]
+    noises: Float[Tensor, "E 3 size size"]
     encoding: str
 
-    def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
-        """Apply the effects to images.
-
-        Args:
-            images: Image values of V views of A examples, shape (A, V, 3, size, size).
-            examples: Index of each of the A examples among all E, shape (A,).
-
-        Returns:
-            Changed images in [0, 1], shape (A, V, 3, size, size).
-        """
+    def __call__(
+        self, images: Float[Tensor, "A V 3 size size"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Apply the effects to images."""
         gained = decode(images, self.encoding) * self.gains[examples, None]
         blurred = _blur(gained, self.blurs[examples])
         encoded = encode(clamp(blurred), self.encoding)
         return clamp(encoded + self.noises[examples, None])
 
 
-def _blur(images: Tensor, deviations: Tensor) -> Tensor:
+def _blur(
+    images: Float[Tensor, "A V 3 size size"], deviations: Float[Tensor, " A"]
+) -> Float[Tensor, "A V 3 size size"]:
     """Blur the images of each example by a Gaussian of its own width.
 
     The pixels at the border of an image are repeated beyond the border.
-
-    Args:
-        images: V images of each of A examples, shape (A, V, 3, size, size).
-        deviations: Standard deviation of the Gaussian of each example in pixels, shape (A,).
-
-    Returns:
-        Blurred images, shape (A, V, 3, size, size).
     """
     count = len(images)
     size = images.shape[-1]

@@ -72,12 +72,7 @@ class Smoothest(NamedTuple):
         return required_degree(self.roughness) if self.roughness < MATTE else 0
 
     def warn(self, subject: str, degree: int) -> None:
-        """Warn that the degree of the lighting is too low for the highlights of the surface.
-
-        Args:
-            subject: Start of the sentence about the degree, such as "degree=6".
-            degree: Degree of the lighting.
-        """
+        """Warn that the degree of the lighting is too low for the highlights of the surface."""
         surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
         needed = f"which takes light of degree {self.degree}"
         error = highlight_error(degree, self.roughness)
@@ -92,18 +87,7 @@ def reached_gloss(
     material: MaterialSettings | None = None,
     layer: SpecularLayerSettings | None = None,
 ) -> Smoothest:
-    """Find the smoothest surface that objects have, or get by an attack or a random variation.
-
-    Args:
-        objects: The objects of a scene. The surfaces of their props count, too.
-        material: Settings of an attack on the material, which may lower the
-            roughness as far as its norm-ball permits. None for no such attack.
-        layer: Settings of a variation that draws the gloss of the objects at
-            random. None for no such variation.
-
-    Returns:
-        The lowest roughness, and the object that has or can reach it.
-    """
+    """Find the smoothest surface that objects have, or get by an attack or a random variation."""
     lowest = Smoothest(MATTE, "")
     for item in objects:
         initial_roughness = smallest_roughness(item.mesh)
@@ -118,17 +102,7 @@ def reached_gloss(
 def _reached_roughness(
     item: SceneObject, material: MaterialSettings | None, layer: SpecularLayerSettings | None
 ) -> float:
-    """Compute the lowest roughness that an attack or a random variation can give to an object.
-
-    Args:
-        item: Object. Its props and its table keep their gloss and do not count.
-        material: Settings of an attack on the material, or None.
-        layer: Settings of a variation that draws the gloss of the object, or None.
-
-    Returns:
-        The lowest roughness. It is `MATTE` if neither an attack nor a variation changes the
-        gloss.
-    """
+    """Compute the lowest roughness that an attack or a random variation can give to an object."""
     has_specular_layer = layer is not None and any(layer.specular_factor)
     is_attacked = material is not None and any(
         (material.roughness, material.metallic, material.specular_factor)
@@ -163,14 +137,6 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
     If the user gives none, it is the lowest degree that shows the highlights of
     all surfaces, but at least 6. Warnings are given if it is above 6, if memory
     limits it, or if the user gives a degree that is too low.
-
-    Args:
-        smoothest: The smoothest surface, also after attacks and variations.
-        given: The degree that the user asked for, or None.
-        pixels: Number of pixels of all views of all objects.
-
-    Returns:
-        The degree, from 0 to 40.
     """
     if given is None:
         degree = _affordable_degree(smoothest, pixels)
@@ -194,16 +160,7 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
 
 
 def _affordable_degree(smoothest: Smoothest, pixels: int) -> int:
-    """Find the degree of lighting that the smoothest surface needs, as far as memory permits.
-
-    Args:
-        smoothest: The smoothest surface, also after attacks and variations.
-        pixels: Number of pixels of all views of all objects.
-
-    Returns:
-        The needed degree, or the highest degree whose transfer operators (matrices from light
-        to image) fit in memory. It is at least `DEGREE`.
-    """
+    """Find the degree of lighting that the smoothest surface needs, as far as memory permits."""
     degree = max(DEGREE, smoothest.degree)
     cpu = torch.device("cpu")
     while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
@@ -217,10 +174,6 @@ def warn_of_low_degree(name: str, light: Tensor) -> None:
     The irradiance is compared with that of the same lighting of degree 8. The
     warning is given if the rms difference, over normals and channels, is more
     than 5 % of the rms irradiance.
-
-    Args:
-        name: Name of the lighting, as `load_light` takes it.
-        light: RGB coefficients that were loaded, shape ((degree + 1)², 3).
     """
     degree = math.isqrt(len(light)) - 1
     if degree >= REFERENCE_DEGREE // 2:
@@ -242,15 +195,6 @@ def with_needed_degree(
     Attacks and variations may make surfaces smoother, so that their highlights
     need a higher degree. Only a degree that `build_scene` chose is raised. If
     the user gave the degree or the coefficients, a warning is given instead.
-
-    Args:
-        scene: The scene.
-        material: Settings of an attack on the material, or None.
-        layer: Settings of a variation that draws the gloss of the objects at
-            random, or None.
-
-    Returns:
-        A scene with more coefficients of the same lighting, or the given scene.
     """
     smoothest = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.scene.objects import SceneObject
@@ -49,8 +50,8 @@ class FrozenView(NamedTuple):
             `added_transfer` was computed, shape (3, size²).
     """
 
-    added_transfer: Tensor
-    albedo_sums: Tensor
+    added_transfer: Float[Tensor, "3 K size²"]
+    albedo_sums: Float[Tensor, "3 size²"]
 
 
 class FrozenTransport:
@@ -67,35 +68,20 @@ class FrozenTransport:
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
-        """Trace the paths of light between the faces of a mesh.
-
-        Args:
-            mesh: The mesh.
-            settings: Settings of the images.
-            albedo_scale: Factor that multiplies the albedo of the mesh.
-            basis: Basis of the light.
-        """
+        """Trace the paths of light between the faces of a mesh."""
         self.mesh = mesh
         self.views: dict[Camera, FrozenView | None] = {}
         self._settings = settings
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
 
-    def is_near(self, vertices: np.ndarray) -> bool:
-        """Return whether a shape is so close to the mesh that it has the same shadows and bounces.
-
-        Args:
-            vertices: Vertices of the shape, which has the faces of the mesh, shape (V, 3).
+    def is_near(self, vertices: Float[np.ndarray, "V 3"]) -> bool:
+        """Return whether a shape is so close to the mesh that it has the same shadows and
+        bounces.
         """
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
-    def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
-        """Compute and keep the radiance that shadows and bounces add to a view of the mesh.
-
-        Args:
-            camera: The camera of the view.
-            fragments: The S samples of the mesh that the camera sees.
-            albedo: Albedo of the mesh at the samples, shape (S, 3).
-        """
+    def add(self, camera: Camera, fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> None:
+        """Compute and keep the radiance that shadows and bounces add to a view of the mesh."""
         # None says that shadows and bounces add nothing to the view.
         self.views[camera] = None
         if not self._transport:
@@ -116,21 +102,15 @@ class FrozenTransport:
         self.views[camera] = FrozenView(all_pixels.to(albedo), albedo_sums)
 
     def radiance(
-        self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
-    ) -> Tensor:
+        self,
+        camera: Camera,
+        fragments: Fragments,
+        albedo: Float[Tensor, "S 3"],
+        light: Float[Tensor, "K 3"],
+    ) -> Float[Tensor, "3 P"]:
         """Compute the radiance that shadows and bounces add to a view of a shape.
 
         It is differentiable in albedo and light.
-
-        Args:
-            camera: A camera for which `add` was called.
-            fragments: The S samples of the shape that the camera sees, in P
-                pixels. The shape may differ a little from the mesh.
-            albedo: Albedo at the samples, shape (S, 3).
-            light: RGB coefficients of the environment light, shape (K, 3).
-
-        Returns:
-            Added radiance of the P pixels, shape (3, P).
         """
         view = self.views[camera]
         if view is None:
@@ -146,16 +126,8 @@ class FrozenTransport:
         return added * torch.where(old_sums > 0, ratios, 1).to(light)
 
 
-def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
-    """Sum the albedo of the samples in each pixel of an image.
-
-    Args:
-        fragments: The S samples of an object, and the pixels in which they lie.
-        albedo: Albedo at the samples, shape (S, 3).
-
-    Returns:
-        Sum of each channel in each pixel, shape (3, size²). It is 0 in pixels without samples.
-    """
+def _sum_by_pixel(fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> Float[Tensor, "3 size²"]:
+    """Sum the albedo of the samples in each pixel of an image."""
     # Row-major index of the pixel in which each sample lies, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
     sums = albedo.new_zeros(3, fragments.size**2)
@@ -200,16 +172,7 @@ class DirectRenderer:
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
     def view(self, object_index: int, camera: Camera) -> tuple[Fragments, Tensor]:
-        """Rasterize an object whose vertices have not moved.
-
-        Args:
-            object_index: Index of the object.
-            camera: The camera.
-
-        Returns:
-            The S samples of the object that the camera sees, and the albedo at
-            the samples, shape (S, 3).
-        """
+        """Rasterize an object whose vertices have not moved."""
         key = (object_index, camera)
         view = self._views.get(key)
         if view is None:
@@ -222,10 +185,6 @@ class DirectRenderer:
         """Prepare a view of an unmoved object for the light of projector and lamps.
 
         The result is computed once for each object and camera.
-
-        Args:
-            object_index: Index of the object.
-            camera: The camera.
         """
         key = (object_index, camera)
         if key not in self._local_views:
@@ -240,29 +199,15 @@ class DirectRenderer:
         example: int,
         object_index: int,
         camera: Camera,
-        light: Tensor,
+        light: Float[Tensor, "K 3"],
         changed: Conditions,
-        background: Tensor,
+        background: Float[Tensor, "_ size²"],
     ) -> PixelRadiance:
         """Render a view of an object with changed shape, colors, gloss or lamps.
 
         The result is differentiable in the light and in all changes. With
         `settings.silhouettes`, it is also differentiable in fields of the
         camera that are tensors.
-
-        Args:
-            example: Index of the example. If its shape changes little from call
-                to call, shadows and bounces are computed only once.
-            object_index: Index of the object.
-            camera: The camera.
-            light: RGB coefficients of all lights in the basis, shape (K, 3).
-            changed: Changed vertices, albedo, hue, gloss and lamp positions of
-                the example. The other fields are not used.
-            background: Image values behind the object, shape (3 or 1, size²).
-
-        Returns:
-            The pixels that the object covers, its coverage of each pixel, and
-            the radiance of each pixel.
         """
         item = self.objects[object_index]
         fixed_camera = camera.fixed()
@@ -335,21 +280,9 @@ class DirectRenderer:
         return torch.from_numpy(self.objects[object_index].mesh.corner_normals).to(self.like.device)
 
     def transport_near(
-        self, example: int, object_index: int, camera: Camera, vertices: np.ndarray
+        self, example: int, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
     ) -> FrozenTransport:
-        """Return the shadows and bounces of a shape, or of a kept shape that is close to it.
-
-        Args:
-            example: Index of the example that has the shape. One shape is kept
-                for each example, in addition to the unmoved objects.
-            object_index: Index of the object.
-            camera: The camera.
-            vertices: Vertices of the shape, shape (V, 3).
-
-        Returns:
-            Shadows and bounces that have been computed for the view of the
-            camera.
-        """
+        """Return the shadows and bounces of a shape, or of a kept shape that is close to it."""
         frozen = self._transport_of_object.get(object_index)
         if frozen is None:
             frozen = self._freeze(object_index, self.objects[object_index].mesh)
@@ -367,33 +300,15 @@ class DirectRenderer:
         return frozen
 
     def _freeze(self, object_index: int, mesh: Mesh) -> FrozenTransport:
-        """Trace the shadows and bounces of light on an object.
-
-        Args:
-            object_index: Index of the object.
-            mesh: Mesh of the object, whose vertices may have moved.
-
-        Returns:
-            Radiance that shadows and bounces add to views of the mesh. It has no views yet.
-        """
+        """Trace the shadows and bounces of light on an object."""
         return FrozenTransport(
             mesh, self.settings, self.objects[object_index].albedo_scale, self.basis
         )
 
     def _rasterize(
-        self, object_index: int, camera: Camera, vertices: np.ndarray
+        self, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
     ) -> tuple[Fragments, Tensor]:
-        """Rasterize an object with given vertices.
-
-        Args:
-            object_index: Index of the object.
-            camera: The camera.
-            vertices: Vertices of the object's mesh, which may be moved, shape (V, 3).
-
-        Returns:
-            The S samples of the object that the camera sees, and the albedo at the samples, shape
-            (S, 3).
-        """
+        """Rasterize an object with given vertices."""
         item = self.objects[object_index]
         [fragments] = build_fragments(
             vertices,
@@ -427,19 +342,13 @@ class _IndirectLight:
     object_index: int
     camera: Camera
     fragments: Fragments
-    positions: np.ndarray
+    positions: Float[np.ndarray, "V 3"]
     is_kept: bool
 
-    def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
-        """Compute the radiance that shadows and bounces add to the P pixels of the view.
-
-        Args:
-            albedo: Albedo of the S samples, shape (S, 3).
-            light: RGB coefficients of the environment light, shape (K, 3).
-
-        Returns:
-            Added radiance, shape (3, P).
-        """
+    def radiance(
+        self, albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]
+    ) -> Float[Tensor, "3 P"]:
+        """Compute the radiance that shadows and bounces add to the P pixels of the view."""
         frozen = self.renderer.transport_near(
             self.example, self.object_index, self.camera, self.positions
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.scene.objects import SceneObject
@@ -31,8 +32,8 @@ class FaceMaterials:
             shape (F,).
     """
 
-    face_gloss: Tensor
-    object_mask: Tensor
+    face_gloss: Float[Tensor, "F 3"]
+    object_mask: Float[Tensor, " F"]
 
     def average(self) -> Tensor:
         """Average roughness, metallic and specular factor over the object's faces, shape (3,)."""
@@ -54,14 +55,6 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     They are those of the mesh. If the object is matte (metallic and specular
     factor are zero on all its faces), its faces get the material
     `SPECULAR_LAYER`. Props and table keep their materials.
-
-    Args:
-        item: The object. Its mesh has F faces, those of props and table
-            included.
-
-    Returns:
-        Material of each of the F faces, and the mask of the faces that belong
-        to the object itself.
     """
     object_mask = torch.from_numpy(item.own_faces)
     if item.mesh.gloss is None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
 from renderer.camera import Camera
@@ -142,40 +143,14 @@ class SceneObject:
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """Load an object and its props (meshes beside it).
-
-    Args:
-        item: Settings of the object.
-        vertices: The mesh of the object is subdivided until it has more vertices
-            than this number.
-
-    Returns:
-        The object, moved and scaled to span [-1, 1].
-
-    Raises:
-        InputError: If a mesh cannot be loaded, has colors besides those of the
-            settings, or is a metal without a color.
-
-    Example:
-        >>> load_object(ObjectSettings("solid:orange", "orange")).label
-        'orange'
-    """
+    """Load an object and its props (meshes beside it)."""
     mesh = subdivide(_load(item), vertices)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     return with_props(loaded, [_load_prop(prop) for prop in item.props])
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """Put props, which are meshes that are never attacked, beside an object.
-
-    Args:
-        item: The object.
-        props: Meshes that stand on the plane z = 0. They are moved to the
-            height of the lowest vertex of the object.
-
-    Returns:
-        A copy of the object with the props.
-    """
+    """Put props, which are meshes that are never attacked, beside an object."""
     offset = np.array([0, 0, item.lowest])
     raised = []
     for prop in props:
@@ -186,19 +161,7 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
 
 
 def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """Put a table under an object and its props.
-
-    Args:
-        item: The object. Its `albedo_scale` applies to the table, too.
-        color: Red, green and blue of the table, sRGB-encoded in [0, 1]. None
-            for no table.
-
-    Returns:
-        A copy of the object with the table.
-
-    Raises:
-        InputError: If `color` is not a color.
-    """
+    """Put a table under an object and its props."""
     if color is None:
         return item
     require_color("ground", color)
@@ -218,16 +181,8 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
 
 
 def resample_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Replace a generated solid by another random shape of the same kind, such as another orange.
-
-    Args:
-        item: The object. It is replaced only if its name is that of a solid without a seed, such
-            as "solid:orange". The name "solid:orange:3" asks for one particular shape.
-        seed: Seed of the new shape.
-
-    Returns:
-        A copy of the object with the new shape and the same gloss, props and table, or the given
-        object.
+    """Replace a generated solid by another random shape of the same kind, such as another
+    orange.
     """
     kind, *name_and_seed = item.name.split(":")
     if kind != "solid" or len(name_and_seed) != 1:
@@ -240,17 +195,8 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
     return _with_mesh(item, replace(mesh, gloss=gloss))
 
 
-def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
-    """Rotate an object about the origin. Its props and its table do not rotate.
-
-    Args:
-        item: The object.
-        rotation: Rotation matrix, shape (3, 3).
-
-    Returns:
-        The rotated copy. Its props and its table are at the height of its new
-        lowest vertex.
-    """
+def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObject:
+    """Rotate an object about the origin. Its props and its table do not rotate."""
     # Select the faces of the object itself, which come first, without those of props and table.
     mesh = select_faces(item.mesh, slice(item.own))
     # Round the vertices to float32, as `normalize` does.
@@ -259,40 +205,20 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
-    """Return a copy of an object with another specular material.
-
-    Args:
-        item: Object, which may have props and a table.
-        gloss: Specular material of the object. Props and table keep their own.
-
-    Returns:
-        The copy.
-    """
+    """Return a copy of an object with another specular material."""
     # Select the faces of the object itself, which come first, without those of props and table.
     own_mesh = select_faces(item.mesh, slice(item.own))
     return _with_mesh(item, gloss.on(own_mesh))
 
 
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
-    """Return a copy of an object with another mesh.
-
-    Args:
-        item: Object, which may have props and a table.
-        mesh: New mesh of the object itself, without props and table.
-
-    Returns:
-        The copy. Its props and its table stand at the height of the new lowest vertex.
-    """
+    """Return a copy of an object with another mesh."""
     without_props = replace(item, mesh=mesh, own=None)
     return add_table(with_props(without_props, item.props), item.ground)
 
 
 def _load_prop(item: PropSettings) -> Mesh:
-    """Load the mesh of a prop (a mesh beside an object), and put it on the plane z = 0.
-
-    Args:
-        item: Settings of the prop, with its scale, its azimuth and its position.
-    """
+    """Load the mesh of a prop (a mesh beside an object), and put it on the plane z = 0."""
     mesh = normalize(_load(item))
     angle = math.radians(item.azimuth)
     cosine = math.cos(angle)
@@ -305,14 +231,7 @@ def _load_prop(item: PropSettings) -> Mesh:
 
 
 def _load(item: MeshSettings) -> Mesh:
-    """Load a mesh with the color and the gloss of its settings.
-
-    Args:
-        item: Settings of the mesh.
-
-    Raises:
-        InputError: If the mesh is metallic and has no colors.
-    """
+    """Load a mesh with the color and the gloss of its settings."""
     mesh = _load_with_color(item)
     if item.gloss is None:
         return mesh
@@ -330,14 +249,7 @@ def _load(item: MeshSettings) -> Mesh:
 
 
 def _load_with_color(item: MeshSettings) -> Mesh:
-    """Load a mesh file or generate a solid, and give it the color of its settings, if any.
-
-    Args:
-        item: Settings of the mesh.
-
-    Raises:
-        InputError: If the mesh has colors of its own, and the settings have another.
-    """
+    """Load a mesh file or generate a solid, and give it the color of its settings, if any."""
     kind, _, name = item.mesh.partition(":")
     if kind == "solid":
         mesh = _build_solid(item.mesh, name)
@@ -358,16 +270,7 @@ def _load_with_color(item: MeshSettings) -> Mesh:
 
 
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
-    """Generate the mesh of a solid, such as an orange.
-
-    Args:
-        mesh_name: Full name for error messages, such as "solid:orange:3".
-        name_and_seed: Name of the solid and its seed, such as "orange:3". Without a seed, it is
-            0.
-
-    Raises:
-        InputError: If there is no such solid, or if the seed is not a whole number.
-    """
+    """Generate the mesh of a solid, such as an orange."""
     name, _, seed = name_and_seed.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"{mesh_name} has the seed {seed!r}: give a whole number")
@@ -383,13 +286,6 @@ def _has_colors(mesh: Mesh) -> bool:
 
 
 def _as_gloss(values: Sequence[float]) -> Gloss:
-    """Convert the values of the setting `gloss` to a gloss.
-
-    Args:
-        values: Roughness, then metallic, then specular factor. Values at the end may be left out.
-
-    Returns:
-        The gloss. Values that are left out have the defaults of `Gloss`.
-    """
+    """Convert the values of the setting `gloss` to a gloss."""
     roughness, *others = [float(value) for value in values]
     return Gloss(roughness, *others)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.image import LUMINANCE, decode
@@ -28,79 +29,40 @@ MAX_ZOOM = 2.0
 MAX_SATURATION = 3.0
 
 
-def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tensor:
-    """Find the points on the bright parts of vertical stripes with period 1.
-
-    Args:
-        points: Points, with x in row 0 and y in row 1, shape (2, ...).
-        shift: Shift of the stripes along x: a number, or row 0 of a tensor
-            (2, ...).
-        bright: Fraction of a period that is bright.
-
-    Returns:
-        Mask of the points on bright stripes, shape (...).
-    """
+def stripes(
+    points: Float[Tensor, "2 ..."], shift: Tensor | float, bright: float = 0.5
+) -> Float[Tensor, " ..."]:
+    """Find the points on the bright parts of vertical stripes with period 1."""
     is_bright = (points + shift) % 1 < bright
     # Vertical stripes depend on x only, which is row 0.
     return is_bright[0]
 
 
-def checkers(points: Tensor, shift: Tensor) -> Tensor:
-    """Find the points on the bright squares of a chessboard with period 1.
-
-    Args:
-        points: Points, with x in row 0 and y in row 1, shape (2, ...).
-        shift: Shift of the chessboard along x and y, shape (2, ...).
-
-    Returns:
-        Mask of the points on bright squares, shape (...).
-    """
+def checkers(
+    points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]
+) -> Float[Tensor, " ..."]:
+    """Find the points on the bright squares of a chessboard with period 1."""
     # A square is bright if exactly one of x and y is in the first half of its period.
     is_in_first_half = (points + shift) % 1 < 0.5
     return is_in_first_half.sum(0) == 1
 
 
-def spots(points: Tensor, shift: Tensor) -> Tensor:
-    """Find the points in the discs of a square grid with period 1.
-
-    Args:
-        points: Points, with x in row 0 and y in row 1, shape (2, ...).
-        shift: Shift of the grid along x and y, shape (2, ...).
-
-    Returns:
-        Mask of the points in discs, shape (...).
-    """
+def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Float[Tensor, " ..."]:
+    """Find the points in the discs of a square grid with period 1."""
     # Vector from the center of the disc in the same cell to each point, shape (2, ...).
     from_center = (points + shift) % 1 - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
-def half(points: Tensor, shift: Tensor | float) -> Tensor:
-    """Find the points to the right of the vertical line x = shift - 0.5.
-
-    Args:
-        points: Points, with x in row 0 and y in row 1, shape (2, ...).
-        shift: Shift of the line along x: a number, or row 0 of a tensor
-            (2, ...).
-
-    Returns:
-        Mask of the points to the right of the line, shape (...).
-    """
+def half(points: Float[Tensor, "2 ..."], shift: Tensor | float) -> Float[Tensor, " ..."]:
+    """Find the points to the right of the vertical line x = shift - 0.5."""
     is_greater = points > shift - 0.5
     # The line is vertical, so only the coordinate x counts, which is row 0.
     return is_greater[0]
 
 
-def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
-    """Return ones for all points, which makes a pattern of a single color.
-
-    Args:
-        points: Points, with x in row 0 and y in row 1, shape (2, ...).
-        shift: Not used. All patterns are called with a shift.
-
-    Returns:
-        Ones, shape (...).
-    """
+def solid(points: Float[Tensor, "2 ..."], shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
+    """Return ones for all points, which makes a pattern of a single color."""
     return torch.ones_like(points[0])
 
 
@@ -108,63 +70,31 @@ def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 
 
-def pixel_centers(size: int) -> Tensor:
-    """Return the coordinates of the pixel centers of an image, which spans [-1, 1].
-
-    Args:
-        size: Pixels per side.
-
-    Returns:
-        x (to the right) in row 0 and y (down) in row 1, shape (2, 1, size, size). The second
-        axis is for several images of this size.
-    """
+def pixel_centers(size: int) -> Float[Tensor, "2 1 size size"]:
+    """Return the coordinates of the pixel centers of an image, which spans [-1, 1]."""
     centers = (torch.arange(size) + 0.5) / size * 2 - 1
     return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
 
 
-def turned(points: Tensor, cosine: Tensor | float, sine: Tensor | float) -> Tensor:
-    """Rotate points about the center of the image.
-
-    Args:
-        points: Points, with x to the right in row 0 and y down in row 1, shape
-            (2, ...).
-        cosine: Cosine of the angle. Positive angles are clockwise.
-        sine: Sine of the angle.
-
-    Returns:
-        The rotated points, shape (2, ...).
-    """
+def turned(
+    points: Float[Tensor, "2 ..."], cosine: Tensor | float, sine: Tensor | float
+) -> Float[Tensor, "2 ..."]:
+    """Rotate points about the center of the image."""
     x, y = points
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y])
 
 
-def two_colors(weight: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Blend two colors in each of N images, with a weight for each pixel.
-
-    Args:
-        weight: Weight of the first color in [0, 1], shape (N, 1, H, W).
-        first: Linear RGB of the first color, shape (N, 3, 1, 1).
-        second: Linear RGB of the second color, shape (N, 3, 1, 1).
-
-    Returns:
-        Linear RGB images, shape (N, 3, H, W).
-    """
+def two_colors(
+    weight: Float[Tensor, "N 1 H W"],
+    first: Float[Tensor, "N 3 1 1"],
+    second: Float[Tensor, "N 3 1 1"],
+) -> Float[Tensor, "N 3 H W"]:
+    """Blend two colors in each of N images, with a weight for each pixel."""
     return second + weight * (first - second)
 
 
-def random_colors(draws: Tensor) -> Tensor:
-    """Convert hue and saturation to colors of full brightness (HSV with value 1).
-
-    Args:
-        draws: Hue and saturation in [0, 1] of each of N colors, shape (N, 2).
-
-    Returns:
-        Linear RGB of each color, shape (N, 3, 1, 1). The largest channel is 1.
-
-    Example:
-        >>> random_colors(torch.tensor([[0.0, 0.0], [0.0, 1.0]])).flatten(1).tolist()
-        [[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]]
-    """
+def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
+    """Convert hue and saturation to colors of full brightness (HSV with value 1)."""
     hue, saturation = draws.split(1, dim=1)
     # The sRGB channels of a pure hue are piecewise linear in the hue (HSV, Smith 1978).
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6
@@ -173,26 +103,14 @@ def random_colors(draws: Tensor) -> Tensor:
 
 
 def draw_patterns(
-    count: int, size: int, draws: torch.Generator, points: Tensor | None = None
-) -> Tensor:
+    count: int,
+    size: int,
+    draws: torch.Generator,
+    points: Float[Tensor, "2 count size size"] | None = None,
+) -> Float[Tensor, "count 3 size size"]:
     """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
 
     Kind, colors, angle, period and position are random.
-
-    Args:
-        count: Number of patterns.
-        size: Pixels per side of the images.
-        draws: CPU generator of the random numbers.
-        points: Coordinates x and y of the point of the pattern that each pixel
-            shows, shape (2, count, size, size). By default, the pattern fills
-            the image, which spans [-1, 1].
-
-    Returns:
-        Linear light in [0, 1], shape (count, 3, size, size).
-
-    Example:
-        >>> draw_patterns(2, 8, torch.Generator().manual_seed(0)).shape
-        torch.Size([2, 3, 8, 8])
     """
     if points is None:
         points = pixel_centers(size)
@@ -227,20 +145,14 @@ def draw_patterns(
     return two_colors(weight, first, second)
 
 
-def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.Generator) -> Tensor:
+def draw_photograph_patterns(
+    photographs: Float[Tensor, "N 3 H W"],
+    points: Float[Tensor, "2 N size size"],
+    draws: torch.Generator,
+) -> Float[Tensor, "N 3 size size"]:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
     Beyond its border, a photograph is mirrored.
-
-    Args:
-        photographs: Photographs as linear light in [0, 1], shape (N, 3, H, W).
-        points: Coordinates x and y of the point of the pattern that each pixel
-            shows, shape (2, N, size, size), or (2, 1, size, size) if they are the
-            same for all photographs.
-        draws: CPU generator of the random numbers.
-
-    Returns:
-        Linear light in [0, 1], shape (N, 3, size, size).
     """
     # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
     turn, zoom, relative_saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
@@ -256,14 +168,7 @@ def draw_photograph_patterns(photographs: Tensor, points: Tensor, draws: torch.G
     return (gray + factor * (shown - gray)).clamp(0, 1)
 
 
-def luminance(linear: Tensor) -> Tensor:
-    """Compute the luminance of each pixel.
-
-    Args:
-        linear: Linear RGB images, shape (N, 3, H, W).
-
-    Returns:
-        Luminance, shape (N, 1, H, W).
-    """
+def luminance(linear: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 1 H W"]:
+    """Compute the luminance of each pixel."""
     weights = linear.new_tensor(LUMINANCE)[:, None, None]
     return (linear * weights).sum(1, keepdim=True)

@@ -12,6 +12,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.progress import progress
@@ -36,8 +37,8 @@ class Layer(NamedTuple):
     """
 
     rows: Rows
-    pixels: Tensor
-    composite: Tensor
+    pixels: Int[Tensor, " P"]
+    composite: Float[Tensor, "B 3 P"]
 
 
 class _BuiltStack(NamedTuple):
@@ -55,8 +56,8 @@ class _BuiltStack(NamedTuple):
     """
 
     operators: OperatorStack
-    image_to_stack_image: Tensor
-    background_terms: Tensor
+    image_to_stack_image: Int[Tensor, " N"]
+    background_terms: Float[Tensor, "M C P"]
 
 
 @dataclass(eq=False, repr=False)
@@ -80,8 +81,8 @@ class Relighting:
 
     objects: Sequence[SceneObject]
     views: Sequence[tuple[int, Camera]]
-    image_to_background: Tensor
-    backgrounds: Tensor
+    image_to_background: Int[Tensor, " N"]
+    backgrounds: Float[Tensor, "B _ size²"]
     settings: ImageSettings
     build: Callable[..., Sequence[TransferOperator]]
     attack_bytes: int = 0
@@ -111,18 +112,8 @@ class Relighting:
         self._build_missing(range(self._stack_count))
         return [self._built[index].operators for index in range(self._stack_count)]
 
-    def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
-        """Compute the radiance of a batch of images, differentiable in the light.
-
-        Args:
-            light: RGB coefficients of the light of each image of the batch,
-                shape (A, size of the basis, 3).
-            images: Index of each image of the batch among all N, shape (A,).
-
-        Yields:
-            One layer for each stack of operators, with the radiance of the
-            images of the batch that this stack renders.
-        """
+    def layers(self, light: Float[Tensor, "A _ 3"], images: Int[Tensor, " A"]) -> Iterator[Layer]:
+        """Compute the radiance of a batch of images, differentiable in the light."""
         # Copying waits until the GPU is idle. This happens once for all stacks.
         images = images.cpu()
         # Index of the stack of each image of the batch, shape (A,).
@@ -141,13 +132,8 @@ class Relighting:
             yield Layer(rows, built.operators.pixels, composite)
 
     def _build_missing(self, indices: Iterable[int]) -> None:
-        """Build the stacks of transfer operators with the given indices, if they do not exist yet.
-
-        Args:
-            indices: Indices of stacks.
-
-        Raises:
-            InputError: If all stacks of the scene would not fit in memory.
+        """Build the stacks of transfer operators with the given indices, if they do not exist
+        yet.
         """
         missing = [index for index in indices if index not in self._built]
         if not missing:
@@ -159,14 +145,7 @@ class Relighting:
                 self._require_memory_for_others(self._built[index])
 
     def _require_memory_for_others(self, first: _BuiltStack) -> None:
-        """Check that all other stacks fit in memory, if each is as large as the first one.
-
-        Args:
-            first: The stack that was built first.
-
-        Raises:
-            InputError: If memory is too small.
-        """
+        """Check that all other stacks fit in memory, if each is as large as the first one."""
         operators = first.operators
         stack_bytes = (
             operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
@@ -177,10 +156,8 @@ class Relighting:
         require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
-        """Build a stack of transfer operators, and the backgrounds of the images that it renders.
-
-        Args:
-            index: Index of the stack.
+        """Build a stack of transfer operators, and the backgrounds of the images that it
+        renders.
         """
         first_operator = index * self._operators_per_stack
         end = first_operator + self._operators_per_stack
@@ -207,16 +184,8 @@ class Relighting:
         return _BuiltStack(stack, image_to_stack_image, background_terms)
 
 
-def _as_rows(indices: Tensor, device: torch.device) -> Rows:
-    """Convert row indices to a slice if they are consecutive, because a slice is faster.
-
-    Args:
-        indices: Row indices in increasing order, shape (B,), on the CPU.
-        device: Device of the tensor whose rows are selected.
-
-    Returns:
-        A slice, or the indices on the device.
-    """
+def _as_rows(indices: Int[Tensor, " B"], device: torch.device) -> Rows:
+    """Convert row indices to a slice if they are consecutive, because a slice is faster."""
     first = int(indices[0])
     end = int(indices[-1]) + 1
     if end - first == len(indices):

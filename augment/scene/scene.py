@@ -7,9 +7,10 @@ from dataclasses import replace
 from functools import cached_property, partial
 from inspect import signature
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.memory import attack_bytes
@@ -29,9 +30,6 @@ from renderer.operators.stack import OperatorStack, ScatterLayers
 from renderer.settings import ImageSettings
 from renderer.validation import as_integers, as_list, as_tensor, require_kind
 from renderer.visibility.rasterizer import Rasterizer
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 # Largest total number of pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
@@ -161,10 +159,6 @@ class Scene:
         """Prepare rendering with transfer operators, which are matrices from light to image.
 
         The operators are built when an image first needs them.
-
-        Returns:
-            A renderer of all V views of all E examples. Its image e · V + v is view v of example
-            e.
         """
         views = []
         for example in self.examples:
@@ -354,20 +348,10 @@ class Scene:
             images = clamp(images + conditions.pixels)
         return images
 
-    def _as_examples(self, examples: object, count: int | None = None) -> Tensor:
+    def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:
         """Convert indices of examples to an integer tensor on the device of the lights.
 
         The range of indices on a GPU is not checked, because the CPU would wait for the GPU.
-
-        Args:
-            examples: Indices as a list, an array or a tensor, shape (A,).
-            count: Number of indices that there must be. None for any number.
-
-        Returns:
-            Indices, shape (A,).
-
-        Raises:
-            InputError: If the indices have another shape or are out of range.
         """
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
@@ -385,7 +369,7 @@ class Scene:
             )
         return indices.to(self.lights.device)
 
-    def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
+    def _layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
         """Render the pixels that objects cover, by the fastest method that is exact.
 
         - If shape, albedo or gloss have changed, or if `one_light` is set, each view is rendered
@@ -393,15 +377,6 @@ class Scene:
         - If lamps have moved, transfer operators (matrices from light to image) render all other
           light. The light of the lamps is computed for each view and added.
         - If only the light has changed, transfer operators render all of it.
-
-        Args:
-            conditions: Light, shape and colors of A examples.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Yields:
-            Layers with the pixels of the A · V images. Image a · V + v of them is view v of the
-            example with the index `examples[a]`.
         """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
@@ -413,17 +388,10 @@ class Scene:
             return self._relight_with_moved_lamps(light, conditions.positions, examples)
         return self._relight(light, examples)
 
-    def _relight(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """Render the V views of examples with transfer operators, which map light to images.
-
-        Args:
-            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Yields:
-            One layer for each stack of operators, with the images that the stack renders.
-        """
+    def _relight(
+        self, light: Float[Tensor, "A K 3"], examples: Int[Tensor, " A"]
+    ) -> Iterator[Layer]:
+        """Render the V views of examples with transfer operators, which map light to images."""
         views = torch.arange(self.views, device=examples.device)
         # The renderer numbers the views of all examples of the scene, shape (A · V,).
         images = (examples[:, None] * self.views + views).flatten()
@@ -433,19 +401,12 @@ class Scene:
         return self._relighting.layers(light, images)
 
     def _relight_with_moved_lamps(
-        self, light: Tensor, positions: Tensor, examples: Tensor
+        self,
+        light: Float[Tensor, "A K 3"],
+        positions: Float[Tensor, "A L 3"],
+        examples: Int[Tensor, " A"],
     ) -> Iterator[Layer]:
-        """Render views with transfer operators, and add the light of moved lamps to each view.
-
-        Args:
-            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
-            positions: Positions of the L lamps, shape (A, L, 3).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Yields:
-            One layer for each stack of transfer operators.
-        """
+        """Render views with transfer operators, and add the light of moved lamps to each view."""
         movable_light = self.basis.movable_light
         assert movable_light is not None
         # Rows of the lamps in the K coefficients, and the basis of the lamps.
@@ -471,19 +432,9 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
 
     def _render_directly(
-        self, light: Tensor, conditions: Conditions, examples: Tensor
+        self, light: Float[Tensor, "A K 3"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Iterator[Layer]:
-        """Render each view of examples by rasterization, without transfer operators.
-
-        Args:
-            light: RGB coefficients of all lights, times the exposure, shape (A, K, 3).
-            conditions: Shape, colors and cameras of the A examples. Their light is not used.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Yields:
-            One layer for each of the A · V images.
-        """
+        """Render each view of examples by rasterization, without transfer operators."""
         row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             row_and_view = progress(list(row_and_view), "rendering views")
@@ -510,15 +461,7 @@ _ARGUMENTS = tuple(name for name in signature(Scene).parameters)
 
 
 def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject]) -> None:
-    """Check that there are examples, and that each refers to one of the objects.
-
-    Args:
-        examples: Examples, with indices of objects.
-        objects: The objects.
-
-    Raises:
-        InputError: If there are no examples, or if an index of an object is too large.
-    """
+    """Check that there are examples, and that each refers to one of the objects."""
     if not examples:
         raise InputError("examples is empty: give at least one mesh, one view and one background")
     highest = max(example.object for example in examples)
@@ -529,16 +472,8 @@ def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject
         )
 
 
-def _require_lights(lights: Tensor, basis: Basis) -> None:
-    """Check that lights are finite and have one RGB coefficient for each function of the basis.
-
-    Args:
-        lights: RGB coefficients, shape (..., coefficients, 3).
-        basis: Basis of the lights.
-
-    Raises:
-        InputError: If a value is not finite, or if the shape does not fit the basis.
-    """
+def _require_lights(lights: Float[Tensor, "... coefficients 3"], basis: Basis) -> None:
+    """Check that lights are finite and have one RGB coefficient for each function of the basis."""
     require_bounded(lights=lights)
     if lights.shape[-2:] != (basis.size, 3):
         raise InputError(
@@ -548,15 +483,7 @@ def _require_lights(lights: Tensor, basis: Basis) -> None:
 
 
 def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
-    """Check the shape and the range of backgrounds.
-
-    Args:
-        backgrounds: Values in [0, 1], shape (B, 3, size, size) or (B, 1, size, size).
-        size: Pixels per side of the images.
-
-    Raises:
-        InputError: If the shape differs, or if a value is out of range.
-    """
+    """Check the shape and the range of backgrounds."""
     is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
     if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
         raise InputError(

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
@@ -75,24 +76,13 @@ class _SeenPoints:
         is_on_wall: Mask of the points on the wall, shape (S, P). The others are on the table.
     """
 
-    points: Tensor
-    is_on_wall: Tensor
+    points: Float[Tensor, "S P 3"]
+    is_on_wall: Bool[Tensor, "S P"]
 
 
 @cache_tensors
 def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
-    """Split light in spherical harmonics into the part above and the part below the horizon.
-
-    Args:
-        degree: Degree of the harmonics. There are K = (degree + 1)² of them.
-
-    Returns:
-        Two tensors:
-        - A matrix (K, K). Its product with the coefficients of a light is the coefficients of
-          the part of the light that comes from above the horizon.
-        - Coefficients (K,) of a light that has radiance 1 in all directions below the horizon,
-          and radiance 0 above.
-    """
+    """Split light in spherical harmonics into the part above and the part below the horizon."""
     directions = sphere(NODES)
     # Value of each harmonic in each direction, shape (NODES, K).
     values = Harmonics(degree).radiance(directions)
@@ -106,22 +96,13 @@ def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
     return upper_part, below_horizon
 
 
-def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
+def above_table(
+    lights: Float[Tensor, "E K 3"], lamps: Float[Tensor, "E 3"], albedo: Float[Tensor, "E 3"]
+) -> Float[Tensor, "E K 3"]:
     """Compute the light that reaches an object on an infinite table.
 
     It is the environment light from above, and from below the light that the table reflects.
     The table reflects the environment light from above and the light of a distant lamp.
-
-    Args:
-        lights: RGB coefficients of the environment light of each of E examples in K harmonics,
-            before the table is added, shape (E, K, 3).
-        lamps: Unit direction towards a white distant lamp in each example, shape (E, 3). A
-            surface that faces the lamp has irradiance 1. Zero stands for no lamp.
-        albedo: Linear RGB albedo of the table in each example, shape (E, 3).
-
-    Returns:
-        RGB coefficients of the light that reaches the object, without the direct light of the
-        lamp, shape (E, K, 3).
     """
     harmonics = Harmonics(degree_of(lights[0]))
     upper_part, below_horizon = _split_at_horizon(harmonics.degree)
@@ -142,30 +123,11 @@ def irradiance(
     room: Room,
     camera: Camera,
     image: ImageSettings,
-    sky: Tensor,
-    lamp: Tensor,
+    sky: Float[Tensor, "K 3"],
+    lamp: Float[Tensor, " 3"],
     lights: Sequence[tuple[LocalBasis, Tensor]] = (),
-) -> Tensor:
-    """Compute an image of the irradiance of a table and a wall, with the shadow of an object.
-
-    Args:
-        room: The table, the wall, and the object that casts the shadow.
-        camera: The camera.
-        image: Size of the image, and number of samples of a pixel, over which the irradiance is
-            averaged.
-        sky: RGB coefficients of the environment light in K harmonics, shape (K, 3).
-        lamp: Unit direction towards a white distant lamp, shape (3,). A surface that faces the
-            lamp has irradiance 1. Zero stands for no lamp.
-        lights: Basis of each local light, such as a projector, and its RGB coefficients, shape
-            (size of the basis, 3).
-
-    Returns:
-        Irradiance of what each pixel shows of table or wall, as if the object were invisible,
-        shape (3, size, size).
-
-    Raises:
-        InputError: If Embree is not installed.
-    """
+) -> Float[Tensor, "3 size size"]:
+    """Compute an image of the irradiance of a table and a wall, with the shadow of an object."""
     room_axes = _room_axes(camera)
     # Unit normals of the table and the wall in world axes.
     normals = torch.stack([room_axes[2], room_axes[0]])
@@ -202,17 +164,11 @@ def irradiance(
     return (lit.T.unflatten(1, (image.size, -1)) - blocked_image).clamp(min=0)
 
 
-def _room_axes(camera: Camera) -> Tensor:
+def _room_axes(camera: Camera) -> Float[Tensor, "3 3"]:
     """Return the axes of a room, which is a table and a wall that faces the camera.
 
     Row 0 is the normal of the wall, which is horizontal and points to the side of the camera. Row
     2 is the normal of the table, which is vertical. Row 1 is perpendicular to both.
-
-    Args:
-        camera: The camera.
-
-    Returns:
-        Unit vectors in world axes as rows, shape (3, 3).
     """
     azimuth = math.radians(camera.azimuth)
     sine = math.sin(azimuth)
@@ -221,18 +177,10 @@ def _room_axes(camera: Camera) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _from_lamp(room: Room, seen: _SeenPoints, normals: Tensor, lamp: Tensor) -> Tensor:
-    """Compute the irradiance of points on a table and a wall from a white distant lamp.
-
-    Args:
-        room: Table, wall and object.
-        seen: Points that a camera sees, S in each of P pixels.
-        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
-        lamp: Unit direction towards the lamp, or zero for no lamp, shape (3,).
-
-    Returns:
-        Irradiance of each point, shape (S, P). It is 0 in the shadow of the object.
-    """
+def _from_lamp(
+    room: Room, seen: _SeenPoints, normals: Float[Tensor, "2 3"], lamp: Float[Tensor, " 3"]
+) -> Float[Tensor, "S P"]:
+    """Compute the irradiance of points on a table and a wall from a white distant lamp."""
     # Surface of each point as a row of `normals`: 0 for the table, 1 for the wall, shape (S, P).
     point_to_surface = seen.is_on_wall.long()
     lit = (normals @ lamp).clamp(min=0)[point_to_surface]
@@ -250,22 +198,12 @@ def _from_lamp(room: Room, seen: _SeenPoints, normals: Tensor, lamp: Tensor) -> 
 def _from_local_lights(
     room: Room,
     seen: _SeenPoints,
-    normals: Tensor,
+    normals: Float[Tensor, "2 3"],
     lights: Sequence[tuple[LocalBasis, Tensor]],
-) -> Tensor:
+) -> Float[Tensor, "S P 3"]:
     """Compute the irradiance of points on a table and a wall from projector and lamps.
 
     The object casts shadows.
-
-    Args:
-        room: Table, wall and object.
-        seen: Points that a camera sees, S in each of P pixels.
-        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
-        lights: Basis of each local light, such as a projector, and its RGB coefficients, shape
-            (size of the basis, 3).
-
-    Returns:
-        Irradiance of each point, shape (S, P, 3).
     """
     # One list of all points, shape (S · P, 3).
     points = seen.points.flatten(0, 1)
@@ -283,24 +221,16 @@ def _from_local_lights(
 
 
 def _blocked_sky(
-    room: Room, seen: _SeenPoints, normals: Tensor, directions: Tensor, radiance: Tensor
-) -> Tensor:
+    room: Room,
+    seen: _SeenPoints,
+    normals: Float[Tensor, "2 3"],
+    directions: Float[Tensor, "2 D 3"],
+    radiance: Float[Tensor, "2 D 3"],
+) -> Float[Tensor, "P 3"]:
     """Compute how much irradiance an object takes from a table and a wall by blocking the sky.
 
     From each point, rays are traced in D directions. The radiance of the directions in which a
     ray hits the object is summed.
-
-    Args:
-        room: Table, wall and object.
-        seen: Points that a camera sees, one in each of P pixels.
-        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
-        directions: D unit directions for points of the table, and D for points of the wall, in
-            world axes, shape (2, D, 3).
-        radiance: RGB irradiance that each of these directions contributes if it is not blocked,
-            shape (2, D, 3).
-
-    Returns:
-        Blocked irradiance of the point in each pixel, shape (P, 3).
     """
     points = seen.points[0]
     is_on_wall = seen.is_on_wall[0]
@@ -323,24 +253,13 @@ def _blocked_sky(
 
 
 def project_along_light(
-    room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Tensor
-) -> Tensor:
+    room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Float[Tensor, " 3"]
+) -> Float[Tensor, "2 size size"]:
     """Compute which point of a projected pattern each pixel of an image shows.
 
     A projector far away shines a pattern along parallel rays. A pixel shows a point of the
     object, the table or the wall. The ray of the projector through this point tells which point
     of the pattern lights it.
-
-    Args:
-        room: The table and the wall.
-        mesh: The object.
-        camera: The camera.
-        image: Size of the image.
-        towards: Unit vector from the scene towards the projector, shape (3,).
-
-    Returns:
-        Two coordinates of the point of the pattern for each pixel, shape (2, size, size). They
-        are 0 on the ray through the origin. Their unit is half of the width that the camera sees.
     """
     points = _find_shown_points(room, mesh, camera, image)
     # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
@@ -352,18 +271,10 @@ def project_along_light(
     return coordinates.T.unflatten(1, (image.size, -1))
 
 
-def _find_shown_points(room: Room, mesh: Mesh, camera: Camera, image: ImageSettings) -> Tensor:
-    """Find the points of an object, a table or a wall that the centers of the pixels show.
-
-    Args:
-        room: The table and the wall.
-        mesh: The object.
-        camera: The camera.
-        image: Size of the image, which has P = size² pixels.
-
-    Returns:
-        Positions in world units, shape (P, 3).
-    """
+def _find_shown_points(
+    room: Room, mesh: Mesh, camera: Camera, image: ImageSettings
+) -> Float[Tensor, "P 3"]:
+    """Find the points of an object, a table or a wall that the centers of the pixels show."""
     room_axes = _room_axes(camera)
     # Unit normals of the table (row 0) and the wall (row 1).
     normals = torch.stack([room_axes[2], room_axes[0]])
@@ -388,18 +299,10 @@ def _find_shown_points(room: Room, mesh: Mesh, camera: Camera, image: ImageSetti
     return points
 
 
-def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Tensor:
-    """Find the rays that pass through a sphere around the origin.
-
-    Args:
-        points: Starts of the rays outside of the sphere, shape (..., 3).
-        directions: Unit direction of all rays, shape (3,), or D unit directions for each start,
-            one in each column, shape (3, D).
-        radius: Radius of the sphere.
-
-    Returns:
-        Mask of the rays, shape (...) for one direction, or (..., D) for D directions.
-    """
+def _passes_near_origin(
+    points: Float[Tensor, "... 3"], directions: Tensor, radius: float
+) -> Float[Tensor, " ..."]:
+    """Find the rays that pass through a sphere around the origin."""
     # A ray comes nearest to the origin after the distance -along from its start.
     along = points @ directions
     squared = points.square().sum(-1)
@@ -417,15 +320,6 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
 
     The density of the D = `DIRECTIONS` directions is proportional to the cosine of the angle to
     the normal (Malley's method).
-
-    Args:
-        degree: Degree of the light, which has K = (degree + 1)² harmonics.
-
-    Returns:
-        Three tensors, each with the table at index 0 and the wall at index 1:
-        - Unit directions, shape (2, D, 3).
-        - Values of the harmonics in these directions, shape (2, D, K).
-        - Irradiance of the surface for a coefficient of 1 of each harmonic, shape (2, K).
     """
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
     # Distribute points evenly over the unit disk, along a spiral (Fibonacci lattice). Malley's
@@ -450,16 +344,8 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     return directions, radiance, irradiance
 
 
-def _sky_in_room_axes(sky: Tensor, azimuth: float) -> Tensor:
-    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x.
-
-    Args:
-        sky: RGB coefficients of the light in K harmonics, in world axes, shape (K, 3).
-        azimuth: Azimuth of the normal of the wall in degrees.
-
-    Returns:
-        RGB coefficients of the rotated light, shape (K, 3).
-    """
+def _sky_in_room_axes(sky: Float[Tensor, "K 3"], azimuth: float) -> Float[Tensor, "K 3"]:
+    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x."""
     # The harmonic of band l and order m (from -l to l) has the index l (l + 1) + m. For m > 0,
     # the harmonics of orders m and -m depend on the azimuth φ as cos mφ and sin mφ. A rotation
     # about the vertical mixes only these two.
@@ -472,20 +358,9 @@ def _sky_in_room_axes(sky: Tensor, azimuth: float) -> Tensor:
 
 
 def _find_seen_points(
-    camera: Camera, image: ImageSettings, room: Room, normals: Tensor
+    camera: Camera, image: ImageSettings, room: Room, normals: Float[Tensor, "2 3"]
 ) -> _SeenPoints:
-    """Find where the rays of a camera meet a table or a wall, if no object is in the way.
-
-    Args:
-        camera: The camera.
-        image: Size of the image, which has P = size² pixels, and number of samples along a side
-            of a pixel. Each pixel has S = samples² rays.
-        room: Table and wall.
-        normals: Unit normals of table (row 0) and wall (row 1), shape (2, 3).
-
-    Returns:
-        The point of the first surface that each ray meets.
-    """
+    """Find where the rays of a camera meet a table or a wall, if no object is in the way."""
     right, up = _sample_positions(camera, image)
     # Each ray passes through a point of the plane through the origin that faces the camera. The
     # rows of `axes` point right, up and towards the camera.
@@ -509,15 +384,6 @@ def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Ten
     """Compute where the samples of an image lie in the plane through the origin.
 
     The plane faces the camera.
-
-    Args:
-        camera: The camera.
-        image: Size of the image, which has P = size² pixels, and number of samples along a side
-            of a pixel. Each pixel has S = samples² samples.
-
-    Returns:
-        Distances of the samples from the origin to the right and up, in world units, each of
-        shape (S, P, 1).
     """
     count = image.size * image.samples
     # Distances of the samples of a row or column from the center of the image, in world units.

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.progress import progress
@@ -46,29 +47,6 @@ def vary(
     """Change objects, cameras, lighting and backgrounds of a scene at random.
 
     All views of one example change in the same way.
-
-    Args:
-        scene: Scene to vary.
-        settings: Ranges of the random changes.
-        draws: CPU generator of the random numbers.
-        once: Whether the new examples are rendered in one lighting only. Then
-            they are rendered directly, without matrices from light to image.
-
-    Returns:
-        The new scene, or the given scene if the settings change nothing.
-
-    Raises:
-        InputError: If the folder of backgrounds has no images, or if tables
-            are to be added to a scene that already has tables or several views
-            per example.
-
-    Example:
-        >>> from augment.scene.build import build_scene
-        >>> scene = build_scene([("solid:orange", "orange")], size=16, samples=1)
-        >>> settings = VariationSettings(exposure=[2.0, 2.0])
-        >>> varied = vary(scene, settings, torch.Generator().manual_seed(0))
-        >>> [round(example.exposure, 3) for example in varied.examples]
-        [2.0]
     """
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
@@ -93,19 +71,9 @@ def _vary_geometry(
     settings: VariationSettings,
     draws: torch.Generator,
     once: bool,
-    is_on_table: Tensor,
+    is_on_table: Bool[Tensor, " E"],
 ) -> Scene:
-    """Return a copy of a scene with random cameras, backgrounds and objects.
-
-    Args:
-        scene: Scene of E examples.
-        settings: Ranges of the random changes.
-        draws: Generator of the random numbers.
-        once: Whether each new example is rendered in one lighting only. The copy
-            then renders it directly where that is faster than a transfer
-            operator, which can be used for many lightings.
-        is_on_table: Mask of the examples whose object stands on a table, shape (E,).
-    """
+    """Return a copy of a scene with random cameras, backgrounds and objects."""
     examples = _draw_cameras(scene, settings, draws, is_on_table)
     # Arguments of `Scene` that differ in the copy.
     changed: dict[str, Any] = {}
@@ -134,19 +102,16 @@ def _vary_geometry(
 
 
 def _draw_cameras(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
+    scene: Scene,
+    settings: VariationSettings,
+    draws: torch.Generator,
+    is_on_table: Bool[Tensor, " E"],
 ) -> list[Example]:
     """Return copies of the examples of a scene with randomly changed cameras.
 
     The image is shifted and zoomed, and the camera turns around the object. If the settings
     have a range of fields of view, the camera also gets one of them. All cameras of one example
     get the same changes.
-
-    Args:
-        scene: Scene of E examples.
-        settings: Ranges of the random changes.
-        draws: Generator of the random numbers.
-        is_on_table: Mask of the examples whose cameras must be above a table, shape (E,).
     """
     count = len(scene)
     shifts = _draw_pairs(settings.shift, count, draws)
@@ -174,15 +139,7 @@ def _draw_cameras(
 def _move_camera(
     camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
 ) -> Camera:
-    """Return a copy of a camera that is zoomed, shifted and turned around the object.
-
-    Args:
-        camera: Camera to change.
-        shift: Shift of the object in the image to the right and up, as fractions of the width
-            of the image.
-        scale: Factor by which the object becomes larger in the image.
-        angles: Change of the polar angle and of the azimuth, in degrees.
-    """
+    """Return a copy of a camera that is zoomed, shifted and turned around the object."""
     width = camera.width / scale
     right, up = shift
     polar, azimuth = angles
@@ -196,13 +153,7 @@ def _move_camera(
 
 
 def _turn_camera(camera: Camera, polar: float, azimuth: float) -> Camera:
-    """Return a copy of a camera that is turned around the object.
-
-    Args:
-        camera: Camera to turn.
-        polar: Change of its polar angle in degrees.
-        azimuth: Change of its azimuth in degrees.
-    """
+    """Return a copy of a camera that is turned around the object."""
     return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
 
@@ -222,10 +173,6 @@ def _to_perspective(camera: Camera, fov: float) -> Camera:
     """Return a perspective copy of a camera with a given field of view.
 
     The copy is at such a distance that it sees the same width at the origin as before.
-
-    Args:
-        camera: Orthographic or perspective camera.
-        fov: Field of view in degrees.
     """
     distance = camera.width / 2 / math.tan(math.radians(fov) / 2)
     if isinstance(camera, PerspectiveCamera):
@@ -245,11 +192,6 @@ def _draw_objects(
     """Return copies of objects with a random shape, rotation and gloss.
 
     A random shape is possible for generated solids only: another orange, for example.
-
-    Args:
-        objects: Objects to copy.
-        settings: Which of shape, rotation and gloss are random, and in which ranges.
-        draws: Generator of the random numbers.
     """
     varied = list(objects)
     if settings.instances:
@@ -267,17 +209,10 @@ def _draw_objects(
     return varied
 
 
-def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.ndarray:
-    """Draw rotations about random axes by random angles.
-
-    Args:
-        max_angle: Largest angle in degrees.
-        count: Number of rotations.
-        draws: Generator of the random numbers.
-
-    Returns:
-        Rotation matrices, shape (count, 3, 3).
-    """
+def _draw_rotations(
+    max_angle: float, count: int, draws: torch.Generator
+) -> Float[np.ndarray, "count 3 3"]:
+    """Draw rotations about random axes by random angles."""
     axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
     angles = max_angle * torch.rand(count, 1, generator=draws, dtype=torch.float64)
     # A rotation vector points along the axis, and its length is the angle.
@@ -288,13 +223,7 @@ def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.
 def _draw_glosses(
     settings: SpecularLayerSettings, count: int, draws: torch.Generator
 ) -> list[Gloss]:
-    """Draw glosses with a uniformly distributed roughness and specular factor.
-
-    Args:
-        settings: Lowest and highest roughness and specular factor.
-        count: Number of glosses.
-        draws: Generator of the random numbers.
-    """
+    """Draw glosses with a uniformly distributed roughness and specular factor."""
     # Row 0 is the roughness, row 1 the specular factor. Columns are the lowest and highest value.
     ranges = torch.tensor([settings.roughness, settings.specular_factor], dtype=torch.float64)
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
@@ -318,18 +247,14 @@ class _DrawnLights:
         local: RGB coefficients of projector and lamps, shape (E, L, 3).
     """
 
-    environment: Tensor
-    directions: Tensor
-    local: Tensor
+    environment: Float[Tensor, "E K 3"]
+    directions: Float[Tensor, "E 3"]
+    local: Float[Tensor, "E L 3"]
 
-    def coefficients(self) -> Tensor:
+    def coefficients(self) -> Float[Tensor, "E _ 3"]:
         """Combine environment, directional light, projector and lamps of each example.
 
         Directional lights are white, and a surface that faces them has irradiance 1.
-
-        Returns:
-            RGB coefficients in the basis of the scene: K for the environment, then L for
-            projector and lamps, shape (E, K + L, 3).
         """
         environment = self.environment
         is_directional = self.directions.any(1)
@@ -340,14 +265,10 @@ class _DrawnLights:
             environment = torch.where(mask, added.to(environment) + environment, environment)
         return torch.cat([environment, self.local], dim=1)
 
-    def without_ground(self, is_on_table: Tensor, albedo: Tensor) -> "_DrawnLights":
-        """Return a copy in which the light from below is what a table reflects.
-
-        Args:
-            is_on_table: Mask of the examples with a table, shape (E,).
-            albedo: Linear albedo of the background image of each example, shape
-                (E, C, size, size). The table has the mean albedo of the image.
-        """
+    def without_ground(
+        self, is_on_table: Bool[Tensor, " E"], albedo: Float[Tensor, "E C size size"]
+    ) -> "_DrawnLights":
+        """Return a copy in which the light from below is what a table reflects."""
         environment = self.environment.clone()
         environment[is_on_table] = above_table(
             environment[is_on_table],
@@ -358,18 +279,14 @@ class _DrawnLights:
 
 
 def _vary_lighting(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
+    scene: Scene,
+    settings: VariationSettings,
+    draws: torch.Generator,
+    is_on_table: Bool[Tensor, " E"],
 ) -> Scene:
     """Return a copy of a scene with random lighting and random effects of the camera.
 
     The background of some examples becomes a table and a wall.
-
-    Args:
-        scene: Scene of E examples.
-        settings: Ranges of the random changes.
-        draws: Generator of the random numbers.
-        is_on_table: Mask of the examples whose background becomes a table and a wall, shape
-            (E,).
     """
     exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
     examples = [
@@ -401,28 +318,12 @@ def _vary_lighting(
 def _light_backgrounds(
     scene: Scene,
     lights: _DrawnLights,
-    albedo: Tensor,
+    albedo: Float[Tensor, "E _ size size"],
     settings: VariationSettings,
     draws: torch.Generator,
-    is_on_table: Tensor,
+    is_on_table: Bool[Tensor, " E"],
 ) -> tuple[Tensor, Tensor | None]:
-    """Compute the background images of all examples from their albedo and the random lighting.
-
-    Args:
-        scene: Scene of E examples in the random lighting.
-        lights: The random lighting.
-        albedo: Linear albedo of the backgrounds, shape (E, 1 or 3, size, size).
-        settings: Whether backgrounds are lit, and whether there are tables.
-        draws: Generator of the random numbers.
-        is_on_table: Mask of the examples whose background becomes a table and a wall, shape
-            (E,).
-
-    Returns:
-        Two values:
-        - Background images, shape (E, 3, size, size).
-        - Coordinates x and y of the point of a projected pattern that each pixel of each
-          example shows, shape (2, E, size, size). None if there are no tables.
-    """
+    """Compute the background images of all examples from their albedo and the random lighting."""
     # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
     background_irradiance = albedo.new_ones(3, 1, 1)
     if settings.lit_background:
@@ -437,17 +338,14 @@ def _light_backgrounds(
 
 
 def _draw_lights(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
+    scene: Scene,
+    settings: VariationSettings,
+    draws: torch.Generator,
+    is_on_table: Bool[Tensor, " E"],
 ) -> _DrawnLights:
     """Draw a random environment and a random directional light for each example.
 
     Projector and lamps stay the same. So does the environment if the settings name none.
-
-    Args:
-        scene: Scene of E examples.
-        settings: Environments to choose from, and ranges of the random changes.
-        draws: Generator of the random numbers.
-        is_on_table: Mask of the examples with a table, shape (E,).
     """
     harmonics = harmonics_of(scene.basis)
     # Split the coefficients into those of the environment, and those of projector and lamps.
@@ -468,23 +366,12 @@ def _draw_directional(
     scene: Scene,
     settings: VariationSettings,
     draws: torch.Generator,
-    is_on_table: Tensor,
+    is_on_table: Bool[Tensor, " E"],
 ) -> _DrawnLights:
     """Add a directional light to some examples, and dim their environment lighting.
 
     The directions are random, but differ from the direction of the camera by at most
     `MAX_LIGHT_ANGLE` in polar angle and in azimuth.
-
-    Args:
-        lights: Lighting of the E examples.
-        scene: Scene of the E examples.
-        settings: Fraction of the examples that get a directional light, and range of the
-            factor by which their environment is dimmed.
-        draws: Generator of the random numbers.
-        is_on_table: Mask of the examples with a table, shape (E,).
-
-    Returns:
-        A copy of the lighting with the directional lights.
     """
     low, high = settings.fill_light
     shape = (len(scene), 1, 1)
@@ -512,18 +399,8 @@ def _draw_directional(
 
 def _draw_background_albedo(
     scene: Scene, settings: VariationSettings, draws: torch.Generator
-) -> Tensor:
-    """Convert the background of each example to an albedo, and multiply it by a random color.
-
-    Args:
-        scene: Scene of E examples. The values of a background are taken as its albedo.
-        settings: `background_saturation` is the largest saturation of the random colors. With
-            0, the albedo keeps its color.
-        draws: Generator of the random numbers.
-
-    Returns:
-        Linear albedo of each pixel, shape (E, 1 or 3, size, size).
-    """
+) -> Float[Tensor, "E _ size size"]:
+    """Convert the background of each example to an albedo, and multiply it by a random color."""
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]
     if settings.background_saturation:
@@ -533,15 +410,8 @@ def _draw_background_albedo(
     return albedo
 
 
-def _facing_irradiance(scene: Scene) -> Tensor:
-    """Compute the irradiance of a surface that faces the camera, in the environment light.
-
-    Args:
-        scene: Scene of E examples. The first camera of each example counts.
-
-    Returns:
-        RGB irradiance times the exposure of each example, shape (E, 3, 1, 1).
-    """
+def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
+    """Compute the irradiance of a surface that faces the camera, in the environment light."""
     # The normal of the surface points to the camera.
     directions = [example.cameras[0].axes()[2] for example in scene.examples]
     normals = torch.from_numpy(np.stack(directions))
@@ -554,24 +424,15 @@ def _facing_irradiance(scene: Scene) -> Tensor:
 
 
 def _light_rooms(
-    scene: Scene, lights: _DrawnLights, wall_distances: Sequence[float], is_on_table: Tensor
+    scene: Scene,
+    lights: _DrawnLights,
+    wall_distances: Sequence[float],
+    is_on_table: Bool[Tensor, " E"],
 ) -> tuple[Tensor, Tensor]:
     """Light a table and a wall in some examples, and find where a projected pattern falls.
 
     The pattern falls on table, wall and object along the directional light of
     the example or, if it has none, along the direction of the view.
-
-    Args:
-        scene: Scene of E examples in the random lighting.
-        lights: The random lighting.
-        wall_distances: Distance of the wall behind each object, in world units, E numbers.
-        is_on_table: Mask of the N examples with a table and a wall, shape (E,).
-
-    Returns:
-        Two tensors:
-        - RGB irradiance of table and wall in these N examples, shape (N, 3, size, size).
-        - Coordinates x and y of the point of the pattern that each pixel of each of the E
-          examples shows, shape (2, E, size, size).
     """
     room_examples = torch.nonzero(is_on_table).squeeze(1).tolist()
     environments = lights.environment.cpu().double()
@@ -607,25 +468,13 @@ def _light_rooms(
 
 
 def _draw_log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
-    """Draw numbers whose logarithms are uniformly distributed.
-
-    Args:
-        limits: Smallest and largest number.
-        count: Number of numbers.
-        draws: Generator of the random numbers.
-    """
+    """Draw numbers whose logarithms are uniformly distributed."""
     low, high = (math.log(limit) for limit in limits)
     fractions = torch.rand(count, generator=draws, dtype=torch.float64)
     return (low + (high - low) * fractions).exp().tolist()
 
 
 def _draw_pairs(limit: float, count: int, draws: torch.Generator) -> list[list[float]]:
-    """Draw pairs of numbers uniformly from [-limit, limit].
-
-    Args:
-        limit: Largest magnitude of a number.
-        count: Number of pairs.
-        draws: Generator of the random numbers.
-    """
+    """Draw pairs of numbers uniformly from [-limit, limit]."""
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
     return (limit * (2 * fractions - 1)).tolist()

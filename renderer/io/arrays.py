@@ -12,13 +12,6 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
     """Write an array to an .npy file.
 
     A reader never sees a part of the new file: see `atomic_write`.
-
-    Args:
-        path: File to replace or to create.
-        numbers: Array to write.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     content = io.BytesIO()
     np.save(content, numbers)
@@ -30,16 +23,6 @@ def read_numbers(path: Path) -> np.ndarray:
 
     The file is mapped into memory. A damaged header that claims a huge array
     therefore raises an error instead of allocating memory.
-
-    Args:
-        path: .npy file.
-
-    Returns:
-        Array, float32. Numbers that are too large for float32 become infinite.
-
-    Raises:
-        ValueError: If the file holds no real numbers.
-        Exception: If the header is damaged. NumPy decides about the class.
     """
     array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind not in "fiu" or not array.size:

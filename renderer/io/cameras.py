@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from renderer.camera import PinholeCamera
 from renderer.errors import InputError, require_file
@@ -95,18 +96,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
 
 
 def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
-    """Read the cameras of a COLMAP model from its text files.
-
-    Args:
-        folder: Folder with cameras.txt and images.txt.
-
-    Returns:
-        Cameras by the names of their images.
-
-    Raises:
-        InputError: If a file is missing or damaged, or if a camera has
-            distortion.
-    """
+    """Read the cameras of a COLMAP model from its text files."""
     cameras_path = folder / COLMAP_CAMERAS
     require_file(cameras_path, "give a folder with cameras.txt and images.txt")
     # Intrinsic matrix and image size (width, height)
@@ -159,12 +149,6 @@ def _image_lines(path: Path) -> Iterator[str]:
 
     A second line of an image lists points in the image: x, y and the number of a
     point in space for each. It may be empty or missing.
-
-    Args:
-        path: Path of images.txt.
-
-    Yields:
-        First line of each image.
     """
     require_file(path, "give a folder with cameras.txt and images.txt")
     may_be_points = False
@@ -188,21 +172,8 @@ def _is_points(line: str) -> bool:
     return len(words) % 3 == 0
 
 
-def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
-    """Convert the parameters of a COLMAP camera to an intrinsic matrix.
-
-    Args:
-        model: Name of COLMAP's camera model, such as "PINHOLE".
-        parameters: Numbers in pixels, as text: one or two focal lengths, and then
-            the x and y of the principal point.
-
-    Returns:
-        Intrinsic matrix, shape (3, 3).
-
-    Raises:
-        InputError: If the model has distortion.
-        ValueError: If the number of parameters is wrong.
-    """
+def _colmap_intrinsics(model: str, parameters: list[str]) -> Float[np.ndarray, "3 3"]:
+    """Convert the parameters of a COLMAP camera to an intrinsic matrix."""
     if model not in COLMAP_PARAMETERS:
         known = " and ".join(COLMAP_PARAMETERS)
         raise InputError(
@@ -218,15 +189,8 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     return _intrinsic_matrix(focal_lengths[0], focal_lengths[-1], center_x, center_y)
 
 
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Convert a quaternion to a rotation matrix.
-
-    Args:
-        quaternion: Quaternion (w, x, y, z) of any length, shape (4,).
-
-    Returns:
-        Rotation matrix, shape (3, 3).
-    """
+def _rotation(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
+    """Convert a quaternion to a rotation matrix."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     # The product of this matrix and a vector is the
     # cross product of (x, y, z) and the vector.
@@ -236,36 +200,13 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 def _intrinsic_matrix(
     focal_x: float, focal_y: float, center_x: float, center_y: float
-) -> np.ndarray:
-    """Create the intrinsic matrix of a pinhole camera.
-
-    Args:
-        focal_x: Horizontal focal length in pixels.
-        focal_y: Vertical focal length in pixels.
-        center_x: Distance of the principal point from the left edge of the image
-            in pixels.
-        center_y: Distance of the principal point from the top edge of the image
-            in pixels.
-
-    Returns:
-        Matrix, shape (3, 3).
-    """
+) -> Float[np.ndarray, "3 3"]:
+    """Create the intrinsic matrix of a pinhole camera."""
     return np.array([[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1]])
 
 
 def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
-    """Read the cameras of a transforms.json file of nerfstudio.
-
-    Args:
-        path: Path of the file.
-
-    Returns:
-        Camera of each image by the path of the image, as it is in the file.
-
-    Raises:
-        InputError: If the file is missing or damaged, or if a camera has
-            distortion.
-    """
+    """Read the cameras of a transforms.json file of nerfstudio."""
     require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
     cameras: dict[str, PinholeCamera] = {}
     try:
@@ -291,21 +232,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
 
 
 def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
-    """Read the intrinsic matrix and the image size of an image from transforms.json.
-
-    Args:
-        entries: Entries of the image, such as "fl_x", and those of the whole scene
-            that the image does not have itself.
-
-    Returns:
-        A tuple of
-        - the intrinsic matrix, shape (3, 3);
-        - the width and the height of the image in pixels.
-
-    Raises:
-        InputError: If the camera is not perspective or has distortion, or if
-            the image size is missing.
-    """
+    """Read the intrinsic matrix and the image size of an image from transforms.json."""
     for name in ("camera_model", "camera_type"):
         model = entries.get(name, "PINHOLE")
         if str(model).upper() not in PERSPECTIVE:

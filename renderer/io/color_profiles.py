@@ -42,19 +42,7 @@ Conversion = Callable[[Image.Image], Image.Image]
 
 
 def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | None:
-    """Find how the colors of an image file become sRGB.
-
-    Args:
-        image: Open image, whose pixels need not be loaded.
-        path: File of the image.
-
-    Returns:
-        Function from an image without alpha, of the mode "L", "RGB" or "CMYK", to
-        an RGB image. None if the file is in sRGB.
-
-    Raises:
-        ValueError: If a PNG file has colors of high dynamic range.
-    """
+    """Find how the colors of an image file become sRGB."""
     codes = _coded_colors(Path(path)) if image.format == "PNG" else None
     if codes is not None:
         primaries_code, curve_code = codes

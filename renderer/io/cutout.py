@@ -6,6 +6,7 @@ texel. The border is straight within such a face.
 """
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 # Columns of the values at the corners of faces.
 U, V, ALPHA = 0, 1, 2
@@ -77,10 +78,10 @@ class _AlphaTexture:
 
 
 def cut_out(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corners: np.ndarray,
-    texels: np.ndarray | None,
+    vertices: Float[np.ndarray, "V D"],
+    faces: Int[np.ndarray, "F 3"],
+    corners: Float[np.ndarray, "F 3 C"],
+    texels: UInt8[np.ndarray, "H W"] | None,
     cutoff: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Remove the parts of F faces whose alpha is below a value.
@@ -88,20 +89,6 @@ def cut_out(
     Alpha is the interpolated product of the texture and of the alpha of corners.
     All values are interpolated linearly at new vertices. Faces that share an
     edge also share the new vertices on it.
-
-    Args:
-        vertices: D values at each of V vertices, such as positions, shape (V, D).
-        faces: Vertex indices of the corners, shape (F, 3).
-        corners: Values at the corners of the faces: texture coordinates u and v,
-            alpha, and C - 3 others, shape (F, 3, C).
-        texels: Alpha of the texture, uint8, shape (H, W). None for 1 everywhere.
-        cutoff: Smallest alpha that stays.
-
-    Returns:
-        New vertices, faces and corners. The given ones if nothing is cut out.
-
-    Raises:
-        ValueError: If the result has too many faces.
     """
     given = vertices, faces, corners
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)

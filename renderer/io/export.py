@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
@@ -89,20 +90,10 @@ def export_mesh(
         raise InputError(f"the mesh file {path} cannot be written: {error}") from error
 
 
-def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
-    """Create the content of a .glb file.
-
-    Args:
-        mesh: Mesh with F faces.
-        normals: Unit normals of the three corners of each face,
-            shape (F, 3, 3).
-        cameras: Cameras to write.
-        first: Number of faces at the beginning of the mesh that are written before
-            all other faces, or None.
-
-    Returns:
-        Content of the file.
-    """
+def _glb(
+    mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first: int | None
+) -> bytes:
+    """Create the content of a .glb file."""
     import trimesh
 
     first_count = len(mesh.faces) if first is None else first
@@ -139,20 +130,12 @@ class _PartSurface:
 
 
 def _part_for_trimesh(
-    mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
+    mesh: Mesh,
+    normals: Float[np.ndarray, "F 3 3"],
+    surface: _PartSurface,
+    is_in_part: Bool[np.ndarray, " F"],
 ) -> "trimesh.Trimesh":
-    """Convert the faces of a mesh with one texture and gloss to a mesh of trimesh, with y up.
-
-    Args:
-        mesh: Mesh with F faces.
-        normals: Unit normals of the three corners of each face,
-            shape (F, 3, 3).
-        surface: Texture and gloss that the faces have in common.
-        is_in_part: True for the faces to convert, shape (F,).
-
-    Returns:
-        Mesh of trimesh.
-    """
+    """Convert the faces of a mesh with one texture and gloss to a mesh of trimesh, with y up."""
     import trimesh
     from trimesh.visual.texture import TextureVisuals
 
@@ -181,15 +164,7 @@ def _part_for_trimesh(
 
 
 def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
-    """Create the glTF material of faces with one texture and gloss.
-
-    Args:
-        mesh: Mesh with the textures.
-        surface: Texture and gloss of the faces.
-
-    Returns:
-        Material for trimesh. The specular factor is at the end of its name.
-    """
+    """Create the glTF material of faces with one texture and gloss."""
     from trimesh.visual.material import PBRMaterial
 
     texture = None
@@ -224,10 +199,6 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     All meshes become primitives of one glTF mesh. Colors, normals and specular
     factors get their names in glTF, and the cameras are added. trimesh itself
     would write colors with 8 bits, which is too coarse for dark linear colors.
-
-    Args:
-        tree: JSON object of the file, changed in place.
-        cameras: Cameras to add.
     """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
@@ -260,12 +231,6 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     The principal point of a perspective camera in glTF is the image center. If
     the camera has another one, the image in glTF is larger and contains the image
     of the camera.
-
-    Args:
-        camera: Camera to describe.
-
-    Returns:
-        Entry of the list "cameras" in the JSON object of a glTF file.
     """
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
@@ -284,24 +249,12 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _split_vertices(
-    faces: np.ndarray, corner_values: np.ndarray
+    faces: Int[np.ndarray, "F 3"], corner_values: Float[np.ndarray, "F 3 D"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Repeat vertices until all face corners at a vertex have the same values.
 
     In a mesh, two faces may have different colors at the same vertex. In a file,
     each vertex has only one color, one normal and so on.
-
-    Args:
-        faces: Vertex indices of F faces, shape (F, 3).
-        corner_values: D values at each of the three corners of each face,
-            shape (F, 3, D).
-
-    Returns:
-        A tuple of
-        - the index of the original vertex of each of N new vertices,
-          shape (N,);
-        - the values of the new vertices, shape (N, D);
-        - the faces with indices of new vertices, shape (F, 3).
     """
     # Corners with the same key become one new vertex. The key
     # of a corner is its original vertex, followed by its

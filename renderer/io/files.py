@@ -26,20 +26,6 @@ def replacing(
 
     At the end of the block, the temporary file is moved to `path`. If the block
     raises an error, the temporary file is removed and the old file stays.
-
-    Args:
-        path: File to replace or to create. Its folder must exist. If `path` is a
-            symbolic link, the file that it points to is replaced.
-        durable: True waits until the file is stored on the disk, so that it
-            survives a loss of power. This takes about 20 ms.
-        previous: Path to which the old file is moved. None deletes the old file.
-
-    Yields:
-        Temporary path in the folder of the file.
-
-    Raises:
-        OSError: If the file cannot be written, or is a folder or a device. The
-            error names `path`.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(TEMPORARY.replace("*", uuid4().hex))
@@ -79,17 +65,6 @@ def atomic_write(
 
     The content is written to a temporary file, which then replaces the old file
     (see `replacing`).
-
-    Args:
-        path: File to replace or to create.
-        content: New content. Text is encoded as UTF-8. Characters that cannot be
-            encoded are written as escapes. They occur in names of files.
-        durable: True waits until the file is stored on the disk, so that it
-            survives a loss of power.
-        previous: Path to which the old file is moved. None deletes the old file.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     with replacing(path, durable, previous) as temporary:
@@ -97,12 +72,7 @@ def atomic_write(
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files that a killed process left in a folder.
-
-    Args:
-        folder: Folder to which no other process writes now. The temporary files of
-            a running process would also be removed.
-    """
+    """Remove the temporary files that a killed process left in a folder."""
     for unfinished in folder.glob(TEMPORARY):
         unfinished.unlink(missing_ok=True)
 
@@ -134,14 +104,6 @@ def file_below(folder: Path, name: str) -> Path:
 
     A file from a stranger must not read the user's other files. Its folder is
     therefore never left, also not by a symbolic link.
-
-    Args:
-        folder: Folder of the file that has the name.
-        name: Relative path with / or \\ between its parts, such as
-            "textures/peel.png".
-
-    Raises:
-        ValueError: If the path leaves the folder, or if the file does not exist.
     """
     relative_path = name.replace("\\", "/")
     root = folder.resolve()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from renderer.image import encode
 from renderer.io.cutout import cut_out
@@ -61,19 +62,15 @@ class _Primitive:
         joints: Attributes JOINTS_n and WEIGHTS_n of the vertices.
     """
 
-    positions: np.ndarray
-    faces: np.ndarray
-    corners: np.ndarray
+    positions: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    corners: Float[np.ndarray, "F 3 9"]
     material: Material
     joints: dict[str, np.ndarray]
 
 
 def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
-    """Read the parts of a .gltf or .glb file in the axes of its scene.
-
-    Raises:
-        Exception: Any exception, if the file is damaged or not supported.
-    """
+    """Read the parts of a .gltf or .glb file in the axes of its scene."""
     file = GltfFile(mesh_file)
     for feature in ignored_features(file.tree):
         mesh_file.ignore(feature)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from renderer.image import decode, encode
@@ -73,14 +74,14 @@ class Material:
         gloss_texture: Factors of roughness and metallic, uint8, shape (H, W, 2), or None.
     """
 
-    color: np.ndarray
+    color: Float[np.ndarray, " 4"]
     mode: str = "OPAQUE"
     cutoff: float = 0.5
     placement: Placement | None = None
-    texture: np.ndarray | None = None
-    alpha: np.ndarray | None = None
-    gloss: np.ndarray | None = None
-    gloss_texture: np.ndarray | None = None
+    texture: UInt8[np.ndarray, "H W 3"] | None = None
+    alpha: UInt8[np.ndarray, "H W"] | None = None
+    gloss: Float[np.ndarray, " 3"] | None = None
+    gloss_texture: UInt8[np.ndarray, "H W 2"] | None = None
 
     def placed(self, uvs: np.ndarray) -> tuple["Material", np.ndarray]:
         """Convert texture coordinates (V, 2) of the file to those of `Mesh`.
@@ -131,9 +132,6 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
     """List the features of a file that change neither its shape nor its base color.
 
     Light that a surface emits is among them: the renderer alone lights a mesh.
-
-    Raises:
-        ValueError: If the file requires an extension that might change them.
     """
     features = set()
     for material in tree.get("materials", []):
@@ -155,11 +153,7 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
 
 
 def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
-    """Read a material. Without an index, it is white and matte.
-
-    Raises:
-        ValueError: If the surface lets light pass, or if textures do not fit together.
-    """
+    """Read a material. Without an index, it is white and matte."""
     if index is None:
         return Material(color=np.ones(4))
     entry = file.entry("materials", index)
@@ -273,11 +267,7 @@ def _with_gloss_texture(material: Material, texels: np.ndarray, placement: Place
 def _with_common_placement(
     material: Material, placement: Placement, shape: tuple[int, ...]
 ) -> Material:
-    """Return a material with a texture at a place, which is white if there was none.
-
-    Raises:
-        ValueError: If the material has a texture at another place.
-    """
+    """Return a material with a texture at a place, which is white if there was none."""
     if material.placement is None:
         white = np.full((*shape, 3), 255, dtype=np.uint8)
         return replace(material, placement=placement, texture=white)

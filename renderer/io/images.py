@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps, features
 from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
 from torch import Tensor
@@ -33,19 +34,8 @@ FORMATS = [
 MIN_DECODED_RATIO = 16
 
 
-def read_image(path: str | Path, size: int) -> Tensor:
-    """Read the central square of an image file.
-
-    Args:
-        path: Image file.
-        size: Width and height of the result in pixels.
-
-    Returns:
-        RGB values in [0, 1], float32, shape (3, size, size).
-
-    Raises:
-        InputError: If the file does not exist or cannot be read.
-    """
+def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
+    """Read the central square of an image file."""
     require_file(path, "give an image file")
     # Pillow can raise almost any exception for a damaged file.
     try:
@@ -57,27 +47,8 @@ def read_image(path: str | Path, size: int) -> Tensor:
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
-def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
-    """Create a gray image, or read the central square of an image file.
-
-    Args:
-        name: Name of the argument, for errors.
-        choice: Gray value in [0, 1] as a number or as text, or path of an image
-            file.
-        size: Width and height of the result in pixels.
-
-    Returns:
-        Values in [0, 1], shape (1, size, size) for a gray value, and
-        (3, size, size) for a file.
-
-    Raises:
-        InputError: If `choice` is neither a gray value nor an image file, or if
-            the file cannot be read.
-
-    Example:
-        >>> gray_or_image("background", 0.5, 2).tolist()
-        [[[0.5, 0.5], [0.5, 0.5]]]
-    """
+def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "1 size size"]:
+    """Create a gray image, or read the central square of an image file."""
     advice = "give gray values in [0, 1] or image files"
     # `float` would accept True as 1.
     if isinstance(choice, bool):
@@ -98,37 +69,15 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
     return torch.full((1, size, size), gray)
 
 
-def read_square(path: str | Path, size: int) -> np.ndarray:
-    """Read the central square of an image file with 8 bits per channel.
-
-    Args:
-        path: Image file.
-        size: Width and height of the result in pixels.
-
-    Returns:
-        RGB values, uint8, shape (size, size, 3).
-
-    Raises:
-        Exception: If the file is damaged. The class depends on the format.
-    """
+def read_square(path: str | Path, size: int) -> UInt8[np.ndarray, "size size 3"]:
+    """Read the central square of an image file with 8 bits per channel."""
     image = read_rgb(path, MIN_DECODED_RATIO * size)
     return np.asarray(central_square(image, size))
 
 
 @contextmanager
 def open_image(path: str | Path) -> Iterator[Image.Image]:
-    """Open an image file of one of `FORMATS`, without decoding its pixels.
-
-    Args:
-        path: Regular file.
-
-    Yields:
-        Image.
-
-    Raises:
-        InputError: If the path is not a regular file, such as a named pipe.
-        Exception: If the file is damaged. The class depends on the format.
-    """
+    """Open an image file of one of `FORMATS`, without decoding its pixels."""
     require_file(path, "give an image file")
     # From a path, Pillow would map a TIFF file to memory, and scramble it if it is rotated.
     with Path(path).open("rb") as file, identify(file) as image:
@@ -136,14 +85,7 @@ def open_image(path: str | Path) -> Iterator[Image.Image]:
 
 
 def identify(file: BinaryIO) -> Image.Image:
-    """Return the image in a stream of bytes, without decoding its pixels.
-
-    Args:
-        file: Stream of an image file of one of `FORMATS`.
-
-    Raises:
-        Exception: If the file is damaged. The class depends on the format.
-    """
+    """Return the image in a stream of bytes, without decoding its pixels."""
     image = Image.open(file, formats=FORMATS)
     key = image.info.get("transparency")
     if image.format == "PNG" and key is not None:
@@ -162,18 +104,6 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
 
     A large JPEG file is decoded at 1/2, 1/4 or 1/8 of its size, which is several
     times faster.
-
-    Args:
-        path: Image file. It may be rotated (EXIF), have transparent parts and a
-            color profile.
-        min_side: Width and height in pixels below which an image is not reduced
-            while it is decoded.
-
-    Returns:
-        RGB image with 8 bits per channel.
-
-    Raises:
-        Exception: If the file is damaged. The class depends on the format.
     """
     with open_image(path) as image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
@@ -191,19 +121,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
 
 
 def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
-    """Return the upright pixels of an open image with 8 bits per channel.
-
-    Args:
-        image: Image of `open_image`. It may be rotated (EXIF).
-
-    Returns:
-        A tuple of
-        - the colors, in the mode "L", "RGB" or "CMYK";
-        - the opacity, in the mode "L", or None.
-
-    Raises:
-        Exception: If the file is damaged. The class depends on the format.
-    """
+    """Return the upright pixels of an open image with 8 bits per channel."""
     ImageOps.exif_transpose(image, in_place=True)
     image = eight_bits(image)
     if image.mode == "La":
@@ -219,34 +137,12 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
 
 
 def central_square(image: Image.Image, size: int) -> Image.Image:
-    """Cut out the central square of an image and resize it.
-
-    Args:
-        image: Image of any size.
-        size: Width and height of the result in pixels.
-
-    Returns:
-        Image of size × size pixels.
-    """
+    """Cut out the central square of an image and resize it."""
     return ImageOps.fit(image, (size, size), Image.Resampling.LANCZOS)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Convert an image to 8 bits per channel.
-
-    Args:
-        image: Image with 1 to 32 bits per channel.
-
-    Returns:
-        Image with 8 bits per channel. A 16-bit image with a transparent gray value
-        gets an alpha channel.
-
-    Raises:
-        ValueError: If the value of white is unknown, because the pixels are
-            floating-point numbers or integers of 32 bits. If another library
-            opened an image of another format than `FORMATS`.
-        Exception: If the file is damaged. The class depends on the format.
-    """
+    """Convert an image to 8 bits per channel."""
     if image.format not in (None, "MPO", *FORMATS):
         raise ValueError(f"the format {image.format} of an image is not read: use PNG or JPEG")
     if image.mode == "F" or (image.mode == "I" and image.format == "TIFF"):
@@ -276,14 +172,6 @@ def write_image(path: Path, image: Image.Image, **options: object) -> None:
     """Write an image file in the format that its suffix names.
 
     A reader never sees a part of the new file: see `atomic_write`.
-
-    Args:
-        path: File to replace or to create, such as "render.png".
-        image: Image to write.
-        **options: Options of Pillow's `Image.save`.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     content = io.BytesIO()
     image_format = Image.registered_extensions()[path.suffix.lower()]

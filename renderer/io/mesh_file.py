@@ -10,6 +10,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from renderer.errors import MAX_MAGNITUDE
 from renderer.image import decode, encode
@@ -41,8 +42,8 @@ class Part(NamedTuple):
     """
 
     mesh: Mesh
-    normals: np.ndarray | None = None
-    matrix: np.ndarray = np.eye(4)
+    normals: Float[np.ndarray, "F 3 3"] | None = None
+    matrix: Float[np.ndarray, "4 4"] = np.eye(4)
 
     def placed(self) -> tuple[Mesh, np.ndarray]:
         """Return the mesh in the axes of the scene, and its normals there or zeros."""
@@ -177,21 +178,12 @@ def words_per_line(text: bytes) -> np.ndarray:
 
 
 def triangles_of(
-    file: MeshFile, vertices: np.ndarray, indices: np.ndarray, sizes: np.ndarray
+    file: MeshFile,
+    vertices: Float[np.ndarray, "V 3"],
+    indices: Int[np.ndarray, " C"],
+    sizes: Float[np.ndarray, " P"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Divide the faces of a file into triangles.
-
-    Args:
-        file: File, for notes about unusual faces.
-        vertices: Vertex positions, shape (V, 3).
-        indices: Vertex indices of all faces, one face after the other, shape (C,).
-        sizes: Number of corners of each face, shape (P,).
-
-    Returns:
-        A tuple of
-        - the places in `indices` of the corners of the triangles, shape (T, 3);
-        - the face of each triangle, shape (T,).
-    """
+    """Divide the faces of a file into triangles."""
     require_bounded(coordinates=vertices)
     highest = len(vertices) - 1
     if len(indices) and not 0 <= indices.min() <= indices.max() <= highest:
@@ -207,25 +199,14 @@ def triangles_of(
 
 
 def colored_mesh(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
     colors: np.ndarray,
-    uvs: np.ndarray | None = None,
-    texture_ids: np.ndarray | None = None,
+    uvs: Float[np.ndarray, "F 3 2"] | None = None,
+    texture_ids: Int[np.ndarray, " F"] | None = None,
     textures: Sequence[np.ndarray] = (),
 ) -> Mesh:
-    """Create a matte mesh from the arrays of a file.
-
-    Args:
-        vertices: Vertex positions, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        colors: sRGB-encoded colors in [0, 1] that broadcast to (F, 3, 3).
-        uvs: Texture coordinates of the corners, or NaN, shape (F, 3, 2). None
-            without textures.
-        texture_ids: Index of the texture of each face, or `NO_TEXTURE`, shape (F,).
-            None without textures.
-        textures: Textures, uint8, shape (H, W, 3) each.
-    """
+    """Create a matte mesh from the arrays of a file."""
     corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
     if not textures or texture_ids is None:
         texture_ids = np.full(len(faces), NO_TEXTURE)

@@ -148,20 +148,7 @@ def _merge_vertices(mesh: Mesh, normals: np.ndarray) -> Mesh:
 
 
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:
-    """Read the parts of a mesh file, and warn once of what is ignored or assumed.
-
-    Args:
-        path: File to read.
-        gloss: True reads the specular reflection of glTF materials: roughness,
-            metallic and specular factor. False makes the parts matte.
-
-    Returns:
-        Parts with one or several materials.
-
-    Raises:
-        InputError: If the file does not exist, has an unknown format, or cannot
-            be read.
-    """
+    """Read the parts of a mesh file, and warn once of what is ignored or assumed."""
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     formats = (set(trimesh.available_formats()) | READERS.keys()) - ARCHIVES

@@ -10,6 +10,7 @@ such scenes.
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from renderer.camera import Camera, PerspectiveCamera
 
@@ -24,17 +25,7 @@ TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
-    """Describe an integrator, which computes the light that reaches the camera, for Mitsuba.
-
-    Args:
-        bounces: Number of bounces of light between surfaces. With 0, only light
-            that comes directly from emitters is rendered.
-        emitter_samples: Number of rays from a surface point to emitters if
-            `bounces` is 0. One more ray has a random direction.
-
-    Returns:
-        Entry for a Mitsuba scene, of the type "path" or "direct".
-    """
+    """Describe an integrator, which computes the light that reaches the camera, for Mitsuba."""
     if bounces:
         # Mitsuba's depth counts path segments: two more than
         # the bounces between surfaces, from the emitter to the
@@ -46,67 +37,26 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
 
 
 def environment(radiance: Scene, scale: float = 1.0) -> Scene:
-    """Describe an environment map for Mitsuba.
-
-    Args:
-        radiance: Image of the map in the layout of `renderer.light.environment`,
-            as {"bitmap": array} or {"filename": name}.
-        scale: Factor for the radiance.
-
-    Returns:
-        Entry for a Mitsuba scene, of the type "envmap".
-    """
+    """Describe an environment map for Mitsuba."""
     return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
-def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
-    """Describe a projector for Mitsuba.
-
-    Args:
-        pose: Matrix from the axes of the projector to world axes, as `pose_of`
-            returns it, shape (4, 4).
-        fov: Angle between opposite sides of the pattern in degrees.
-        pattern: Image of the pattern, as {"bitmap": array} or
-            {"filename": name}, with other options of Mitsuba's bitmap texture.
-        scale: Factor for the pattern. A white surface that faces the projector
-            at distance 1 has the radiance pattern · scale.
-
-    Returns:
-        Entry for a Mitsuba scene, of the type "projector".
-    """
+def projector(pose: Float[np.ndarray, "4 4"], fov: float, pattern: Scene, scale: float) -> Scene:
+    """Describe a projector for Mitsuba."""
     irradiance = {"type": "bitmap", **pattern, "raw": True}
     lens = {"fov": fov, "scale": scale, "to_world": pose}
     return {"type": "projector", "irradiance": irradiance, **lens}
 
 
 def sensor(
-    pose: np.ndarray,
+    pose: Float[np.ndarray, "4 4"],
     size: int,
     fov: float | None = None,
     pixel_format: str = "rgba",
     film_center: tuple[float, float] = (0.0, 0.0),
     pixel_aspect: float = 1.0,
 ) -> Scene:
-    """Describe a camera for Mitsuba, which calls it a sensor.
-
-    Args:
-        pose: Matrix from the axes of the camera to world axes, as `pose_of`
-            returns it, shape (4, 4).
-        size: Width of the image in pixels.
-        fov: Angle between the left and the right side of the image in degrees.
-            None for a camera without perspective, which shows x and y from -1 to 1
-            in the axes of the camera.
-        pixel_format: Channels of the image, such as "rgba".
-        film_center: Offset of the image center of a perspective camera from the
-            principal point: to the right as a fraction of the image width, and
-            down as a fraction of the image height.
-        pixel_aspect: Vertical focal length in pixels divided by the horizontal
-            one. Mitsuba has square pixels, so the image has size / pixel_aspect
-            rows.
-
-    Returns:
-        Entry for a Mitsuba scene, of the type "perspective" or "orthographic".
-    """
+    """Describe a camera for Mitsuba, which calls it a sensor."""
     row_count = max(1, round(size / pixel_aspect))
     film = {
         "type": "hdrfilm",
@@ -125,16 +75,7 @@ def sensor(
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
-    """Convert a camera of this renderer to a camera of Mitsuba.
-
-    Args:
-        camera: Camera to convert.
-        size: Width of the image in pixels.
-        pixel_format: Channels of the image, such as "rgba".
-
-    Returns:
-        Entry of the camera for a Mitsuba scene, as `sensor` returns it.
-    """
+    """Convert a camera of this renderer to a camera of Mitsuba."""
     if isinstance(camera, PerspectiveCamera):
         # The principal point is measured from the image center in halves of the
         # image, and Mitsuba measures the image center from the principal point.
@@ -145,19 +86,11 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
 
 
-def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
+def pose_of(camera: Camera, scale: float = 1.0) -> Float[np.ndarray, "4 4"]:
     """Compute the pose of a camera, or of a projector at the same place, for Mitsuba.
 
     Mitsuba's cameras and projectors look along +z, and x points to the left. Our
     cameras look along -z, and x points to the right.
-
-    Args:
-        camera: Camera of this renderer.
-        scale: Length in world units of one unit along the x- and y-axis of
-            Mitsuba's camera.
-
-    Returns:
-        Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     pose = camera.pose()
     # The columns are the axes x, y and z and the
@@ -166,17 +99,10 @@ def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
     return pose
 
 
-def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Compute the pose of a Mitsuba camera or projector that looks at a point, with z up.
-
-    Args:
-        origin: Position of the camera in world axes, shape (3,).
-        target: Point at which the camera looks, shape (3,). It must not lie
-            exactly above or below the camera.
-
-    Returns:
-        Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
-    """
+def look_at(
+    origin: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Compute the pose of a Mitsuba camera or projector that looks at a point, with z up."""
     ahead = (target - origin) / np.linalg.norm(target - origin)
     left = np.cross([0, 0, 1], ahead)
     left /= np.linalg.norm(left)

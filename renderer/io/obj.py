@@ -101,12 +101,7 @@ class _Material(NamedTuple):
 
 
 def read_obj(file: MeshFile) -> list[Part]:
-    """Read all objects of an .obj file as one part, or none if the file has no faces.
-
-    Raises:
-        ValueError: If the file is damaged, or has features that would change the
-            shape or the base color and are not supported.
-    """
+    """Read all objects of an .obj file as one part, or none if the file has no faces."""
     lines = _lines_by_keyword(file)
     vertices, vertex_colors = _vertices(lines["v"], file)
     uvs, _ = _table(lines["vt"], (1, 2, 3))
@@ -173,13 +168,7 @@ def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
 
 
 def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Parse lines of numbers as an array with zeros at the end of short lines.
-
-    Returns:
-        A tuple of
-        - the numbers, shape (N, largest of `lengths`);
-        - how many numbers each line has, shape (N,).
-    """
+    """Parse lines of numbers as an array with zeros at the end of short lines."""
     counts, text = lines.words()
     wrong = counts[~np.isin(counts, lengths)]
     if len(wrong):
@@ -214,15 +203,7 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
 def _polygons(
     lines: dict[str, _Lines], file: MeshFile
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parse the faces.
-
-    Returns:
-        A tuple of
-        - the numbers of the lines of the faces, shape (P,);
-        - the indices of the position, the texture coordinates and the normal of
-          each corner of all faces, or -1, shape (C, 3);
-        - the number of corners of each face, shape (P,).
-    """
+    """Parse the faces."""
     line_numbers = lines["f"].numbers()
     sizes, text = lines["f"].words()
     indices = _corners(text.split())
@@ -268,13 +249,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
 def _materials(
     lines: dict[str, _Lines], line_numbers: np.ndarray, file: MeshFile
 ) -> tuple[list[_Material], np.ndarray]:
-    """Read the materials in use, and find the material of each face.
-
-    Returns:
-        A tuple of
-        - the materials, of which the first is for faces without a material;
-        - the index of the material of each face, shape (P,).
-    """
+    """Read the materials in use, and find the material of each face."""
     library = _library(lines["mtllib"].texts(), file)
     materials = [_Material()]
     # Index of the material of each line "usemtl", after the index for faces before these lines.

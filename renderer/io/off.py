@@ -25,12 +25,7 @@ _HEADER = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?:OFF|off)")
 
 
 def read_off(file: MeshFile) -> list[Part]:
-    """Read an .off file as one part, or none if the file has no faces.
-
-    Raises:
-        ValueError: If the file is damaged, or has features that would change the
-            shape or the base color and are not supported.
-    """
+    """Read an .off file as one part, or none if the file has no faces."""
     text = without_comments(as_utf8(file.content).replace(b"\r", b"\n"))
     header = _HEADER.match(text)
     if header is None:

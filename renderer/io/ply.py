@@ -63,12 +63,7 @@ _Values = dict[str, np.ndarray | _Lists]
 
 
 def read_ply(file: MeshFile) -> list[Part]:
-    """Read a .ply file as one part, or none if the file has no faces.
-
-    Raises:
-        ValueError: If the file is damaged, or has features that would change the
-            shape or the base color and are not supported.
-    """
+    """Read a .ply file as one part, or none if the file has no faces."""
     elements, texture_names = _elements(file.content)
     vertex, face, strip = (elements.pop(key, {}) for key in ("vertex", "face", "tristrips"))
     vertices = _columns(vertex, "x", "y", "z")

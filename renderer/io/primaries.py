@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 # CIE 1931 chromaticities x and y of red, green, blue and white (ITU-R BT.709).
 REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
@@ -17,20 +18,8 @@ BRADFORD = np.array(
 )
 
 
-def to_rec709(chromaticities: Sequence[float], adapt: bool) -> np.ndarray | None:
-    """Compute the matrix from linear RGB of other primaries to Rec. 709.
-
-    Args:
-        chromaticities: CIE x and y of red, green, blue and white, 8 numbers.
-        adapt: True maps white to white, as for photographs (Bradford). False keeps
-            the chromaticity of each light, as for radiance.
-
-    Returns:
-        Matrix, shape (3, 3). None if the primaries are those of Rec. 709.
-
-    Raises:
-        ValueError: If the numbers are no primaries.
-    """
+def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray, "3 3"] | None:
+    """Compute the matrix from linear RGB of other primaries to Rec. 709."""
     given = np.asarray(chromaticities, dtype=np.float64)
     if given.shape == (8,) and np.abs(given - REC_709).max() <= ROUNDING:
         return None

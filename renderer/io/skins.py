@@ -53,15 +53,7 @@ class Skeleton:
     def posed(
         self, node: int, vertices: np.ndarray, attributes: dict[str, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute how far each joint carries each vertex of a part that a node shows.
-
-        Returns:
-            A tuple of
-            - the share of each joint in the position of each vertex, as in
-              `Skin.carried`, shape (V, J, 4);
-            - the vertices in the scene, shape (V, 3);
-            - a matrix (4, 4) that tells whether the part is mirrored.
-        """
+        """Compute how far each joint carries each vertex of a part that a node shows."""
         node_pose = self._file.poses[node]
         weights = np.zeros((len(vertices), len(self)))
         # Matrix that maps a vertex to where each joint alone would move it.
@@ -98,12 +90,7 @@ class Skeleton:
 def _add_weights(
     weights: np.ndarray, attributes: dict[str, np.ndarray], joint_indices: np.ndarray
 ) -> None:
-    """Add the weights of one skin to the weights (V, J) of all joints of the file, in place.
-
-    Raises:
-        ValueError: If a vertex has a joint that the skin does not have, or if weights do not add
-            up to about 1.
-    """
+    """Add the weights of one skin to the weights (V, J) of all joints of the file, in place."""
     sets = [name.removeprefix("JOINTS") for name in attributes if name.startswith("JOINTS")]
     for name in sets:
         values = attributes[f"WEIGHTS{name}"]

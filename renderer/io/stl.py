@@ -24,11 +24,7 @@ _FLAG = 0x8000
 
 
 def read_stl(file: MeshFile) -> list[Part]:
-    """Read an .stl file as one part, or none if the file has no faces.
-
-    Raises:
-        ValueError: If the file is damaged or has transparent colors.
-    """
+    """Read an .stl file as one part, or none if the file has no faces."""
     content = file.content
     header = content[:_HEADER_SIZE]
     face_count = int.from_bytes(header[-4:], "little")

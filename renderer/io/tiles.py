@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import accumulate, repeat, zip_longest
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
@@ -46,16 +47,11 @@ class Tile:
             are gray.
     """
 
-    image: np.ndarray
+    image: UInt8[np.ndarray, "H W 3"]
     caption: tuple[str, ...]
 
     def captioned(self) -> Image.Image:
-        """Draw the image with its caption below.
-
-        Returns:
-            Picture of the tile. It is as wide as the image or as the longest line of
-            the caption, whichever is wider.
-        """
+        """Draw the image with its caption below."""
         image = Image.fromarray(self.image)
         line_widths = [_text_width(line, CAPTION_SIZE) for line in self.caption]
         width = max([image.width, *line_widths])
@@ -78,15 +74,6 @@ def tiles_of(
 
     Small images are enlarged without smoothing, so that a tile shows the pixels
     that a classifier saw.
-
-    Args:
-        images: RGB images with values in [0, 1], shape (3, H, W) each.
-        captions: Lines of text below each image. The default is no text.
-        side: Width in pixels that the images should have at least. An image is
-            enlarged by the smallest whole factor that gives at least this width.
-
-    Returns:
-        One tile for each image.
     """
     tiles = []
     for image, caption in zip(images, captions, strict=False):
@@ -104,14 +91,6 @@ def draw_grid(
 
     Each column is as wide as its widest tile or title. Each row is as high as its
     highest tile.
-
-    Args:
-        rows: Tiles of each row. The last row may be shorter.
-        titles: Title of each column. The default is no titles.
-        heading: Title of the sheet. The default is no title.
-
-    Returns:
-        Sheet with a margin of MARGIN pixels on all sides.
     """
     images = [[tile.captioned() for tile in row] for row in rows]
     row_heights = [max(image.height for image in row) for row in images]
@@ -140,16 +119,7 @@ def draw_grid(
 
 
 def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str]) -> list[int]:
-    """Compute the width of each column of a sheet of images in pixels.
-
-    Args:
-        images: Images of each row of the sheet. The last row may be shorter.
-        titles: Titles of the columns. Some columns may have no title.
-
-    Returns:
-        Width of each column: that of its widest image or of its title, whichever
-        is wider.
-    """
+    """Compute the width of each column of a sheet of images in pixels."""
     columns = zip_longest(*images)
     widths = []
     # zip_longest fills up with None: an image,
@@ -162,15 +132,7 @@ def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str
 
 
 def _text_width(text: str, size: int) -> int:
-    """Compute the width of a line of text in pixels, rounded up.
-
-    Args:
-        text: Line of text.
-        size: Font size in pixels.
-
-    Returns:
-        Width, or 0 for an empty line.
-    """
+    """Compute the width of a line of text in pixels, rounded up."""
     if not text:
         return 0
     return round(ImageFont.load_default(size).getlength(text) + 0.5)

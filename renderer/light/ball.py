@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 # Largest number of Newton steps in `_nearest_in_box_and_sphere`. Four are usual. With
@@ -28,16 +29,12 @@ class Ball:
             all values of a row.
     """
 
-    center: Tensor
+    center: Float[Tensor, "N ..."]
     radius: float
     norm: str
 
     def unflatten(self, *shape: int) -> Ball:
-        """Return the same balls for rows that are reshaped from (N, D) to (N, *shape).
-
-        Args:
-            *shape: New shape of a row. The product of the sizes is D.
-        """
+        """Return the same balls for rows that are reshaped from (N, D) to (N, *shape)."""
         return Ball(self.center.unflatten(1, shape), self.radius, self.norm)
 
     @property
@@ -49,24 +46,12 @@ class Ball:
         return self.center - self.radius, self.center + self.radius
 
 
-def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = None) -> Tensor:
+def nearest_in_box(
+    values: Float[Tensor, "N ..."], low: Any, high: Any, within: Ball | None = None
+) -> Float[Tensor, "N ..."]:
     """Project each row of values onto a box, or onto the intersection of a box and a norm-ball.
 
     The projection is the nearest point with respect to the Euclidean distance.
-
-    Args:
-        values: N rows of values, shape (N, ...).
-        low: Lowest values of the box, a number or a tensor that broadcasts.
-        high: Highest values of the box, a number or a tensor that broadcasts.
-        within: Norm-balls whose centers lie in the box. None uses the box alone.
-
-    Returns:
-        Projections, shape (N, ...).
-
-    Example:
-        >>> ball = Ball(torch.zeros(1, 2), radius=1.0, norm="l2")
-        >>> nearest_in_box(torch.tensor([[0.0, 3.0]]), -2, 2, ball).tolist()
-        [[0.0, 1.0]]
     """
     if within is None:
         return values.clamp(low, high)
@@ -75,7 +60,9 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
     return _nearest_in_box_and_sphere(values, low, high, within)
 
 
-def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
+def _nearest_in_box_and_sphere(
+    values: Float[Tensor, "N ..."], low: Any, high: Any, ball: Ball
+) -> Float[Tensor, "N ..."]:
     """Project each row of values onto the intersection of a box and an L2 ball.
 
     Let v be a row and c the center of its ball. The projection is the point of the
@@ -84,15 +71,6 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     this point from c is a concave and piecewise linear function of f². Newton's
     method, which starts at f² = 0, therefore reaches the squared radius without
     passing it.
-
-    Args:
-        values: N rows v of values, shape (N, ...).
-        low: Lowest values of the box, a number or a tensor that broadcasts.
-        high: Highest values of the box, a number or a tensor that broadcasts.
-        ball: L2 balls whose centers lie in the box.
-
-    Returns:
-        Projections, shape (N, ...).
     """
     offset = values - ball.center
     squared_radius = ball.radius**2
@@ -122,14 +100,6 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     return nearest
 
 
-def _squared_norm(offsets: Tensor) -> Tensor:
-    """Compute the squared L2 norm of each row of a batch.
-
-    Args:
-        offsets: N rows of values, shape (N, ...).
-
-    Returns:
-        Squared norms, with size 1 along all axes but the first one, so that they
-        broadcast to `offsets`.
-    """
+def _squared_norm(offsets: Float[Tensor, "N ..."]) -> Tensor:
+    """Compute the squared L2 norm of each row of a batch."""
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_range
@@ -136,13 +137,6 @@ class Harmonics(Basis):
         name: Name of this kind of light in files and messages.
         allow_negative: True, because coefficients with negative radiance are
             rendered, too, as in the paper. Such a light does not exist.
-
-    Raises:
-        InputError: If the degree is out of range.
-
-    Example:
-        >>> Harmonics(degree=2).size
-        9
     """
 
     degree: int = 6
@@ -176,19 +170,8 @@ class Harmonics(Basis):
         """
         return nonzero_coefficients(self.degree)
 
-    def irradiance(self, normals: Tensor) -> Tensor:
-        """Compute the irradiance of N surfaces from each harmonic that changes it.
-
-        Args:
-            normals: Unit normals of the surfaces, shape (N, 3).
-
-        Returns:
-            Irradiance if the coefficient of one harmonic is 1 and all others are
-            0, shape (N, K). The K columns belong to the harmonics in `nonzero`.
-
-        Raises:
-            InputError: If a normal is not finite.
-        """
+    def irradiance(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
+        """Compute the irradiance of N surfaces from each harmonic that changes it."""
         require_finite(normals=normals)
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
         values = evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
@@ -197,29 +180,17 @@ class Harmonics(Basis):
         irradiance = torch.stack(values).to(normals.dtype) * factors[:, None]
         return irradiance.T.contiguous()
 
-    def radiance(self, directions: Tensor) -> Tensor:
-        """Compute the radiance of each harmonic from N directions.
-
-        Args:
-            directions: Directions toward the light, shape (N, 3).
-
-        Returns:
-            Radiance if the coefficient of one harmonic is 1 and all others are 0,
-            shape (N, size).
-        """
+    def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N size"]:
+        """Compute the radiance of each harmonic from N directions."""
         return basis(directions, self.degree)
 
-    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
+    def project_nonnegative(
+        self, coefficients: Float[Tensor, "... size 3"]
+    ) -> Float[Tensor, "... size 3"]:
         """Replace lights by the most similar lights without negative radiance.
 
         The new light has the same mean radiance. Of all such lights, its irradiance
         is the closest to the irradiance of the given light.
-
-        Args:
-            coefficients: SH coefficients of the lights, shape (..., size, 3).
-
-        Returns:
-            SH coefficients of the new lights, shape (..., size, 3).
         """
         # Only imported when it is needed, because it also imports SciPy's optimizers, which
         # takes long.
@@ -227,21 +198,13 @@ class Harmonics(Basis):
 
         return project_nonnegative(coefficients)
 
-    def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+    def nearest_nonnegative(
+        self, coefficients: Float[Tensor, "... size 3"], within: Ball | None = None
+    ) -> Tensor:
         """Replace lights by the nearest lights without negative radiance.
 
         The distance between lights is the Euclidean distance of their
         coefficients. The mean radiance may change.
-
-        Args:
-            coefficients: SH coefficients of the lights, shape (..., size, 3). With
-                `within`, the shape is (A, size, 3).
-            within: Norm balls, one for each of A lights, in which the results must
-                lie. Their centers must have no negative radiance. None for no
-                ball.
-
-        Returns:
-            SH coefficients of the nearest lights, in the same shape.
         """
         from renderer.light.nonnegative import nearest_nonnegative
 
@@ -270,10 +233,10 @@ class LightPaths(NamedTuple):
             points and normals. The choice of the paths is not differentiable.
     """
 
-    point: Tensor
-    function: Tensor
-    source: Tensor
-    irradiance: Tensor
+    point: Int[Tensor, " E"]
+    function: Int[Tensor, " E"]
+    source: Float[Tensor, "E 3"]
+    irradiance: Float[Tensor, " E"]
 
 
 class LocalBasis(Basis):
@@ -393,9 +356,6 @@ class SumBasis(Basis):
     Attributes:
         parts: Bases, at most one of which is environment light. The coefficients
             of the second basis follow those of the first one, and so on.
-
-    Raises:
-        InputError: If two parts are environment light.
     """
 
     parts: tuple[Harmonics | LocalBasis, ...]
@@ -440,24 +400,12 @@ class SumBasis(Basis):
         ]
         return torch.cat(projected, dim=-2)
 
-    def moved(self, positions: Tensor) -> Self:
-        """Return a copy of this basis in which the movable light sources are moved.
-
-        Args:
-            positions: New positions of the L movable light sources in world axes,
-                shape (L, 3).
-        """
+    def moved(self, positions: Float[Tensor, "L 3"]) -> Self:
+        """Return a copy of this basis in which the movable light sources are moved."""
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
     def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
-        """Iterate over the bases in `parts`, with the slices of their coefficients.
-
-        Yields:
-            A tuple of
-            - the slice that selects the coefficients of one basis from all
-              coefficients, shape (size, 3);
-            - this basis.
-        """
+        """Iterate over the bases in `parts`, with the slices of their coefficients."""
         first = 0
         for part in self.parts:
             yield slice(first, first + part.size), part
@@ -465,25 +413,13 @@ class SumBasis(Basis):
 
 
 def parts_of(basis: Basis) -> list[EnvironmentPart | LocalPart]:
-    """List the environment light and the local lights of a basis.
-
-    Args:
-        basis: Basis of all lights.
-
-    Returns:
-        Lights with the slices of their coefficients, in the order of the
-        coefficients.
-    """
+    """List the environment light and the local lights of a basis."""
     environment = [] if basis.environment is None else [basis.environment]
     return sorted([*environment, *basis.local_lights], key=lambda part: part.rows.start)
 
 
 def harmonics_of(basis: Basis) -> Harmonics:
-    """Return the spherical harmonics of the environment light of a basis.
-
-    Args:
-        basis: Basis of all lights of a scene. Each scene has environment light.
-    """
+    """Return the spherical harmonics of the environment light of a basis."""
     environment = basis.environment
     assert environment is not None
     return environment.basis
@@ -509,17 +445,8 @@ class SplitLight(NamedTuple):
         return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
 
 
-def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
-    """Divide the coefficients of a basis into environment light and local lights.
-
-    Args:
-        basis: Basis of all lights.
-        coefficients: RGB coefficients of all lights, shape (size, 3).
-
-    Returns:
-        Coefficients of the environment light, and local lights with their
-        coefficients.
-    """
+def split_light(basis: Basis, coefficients: Float[Tensor, "size 3"]) -> SplitLight:
+    """Divide the coefficients of a basis into environment light and local lights."""
     environment = basis.environment
     return SplitLight(
         environment=None if environment is None else coefficients[environment.rows],
@@ -530,18 +457,7 @@ def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
 def with_local_lights(
     sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
 ) -> tuple[Basis, Tensor]:
-    """Combine environment light and local lights to one basis with its coefficients.
-
-    Args:
-        sky: SH coefficients of the environment light, shape ((degree + 1)², 3).
-        lights: For each local light, its basis and its RGB coefficients,
-            shape (size, 3).
-
-    Returns:
-        A tuple of
-        - the basis of all lights, with the environment light first;
-        - the RGB coefficients of all lights, in the same order.
-    """
+    """Combine environment light and local lights to one basis with its coefficients."""
     harmonics = Harmonics(degree_of(sky))
     if not lights:
         return harmonics, sky

@@ -21,6 +21,7 @@ from types import ModuleType
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_file
@@ -56,53 +57,33 @@ _OTHER_NAMES = {"a", "alpha", "z", "zback", "depth", "mist", "id", "indexob", "i
 _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
-def to_map(coefficients: Tensor, height: int) -> Tensor:
+def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ 3"]:
     """Compute the environment map of a light that is given by SH coefficients.
 
     The radiance may be negative, because a sum of few harmonics oscillates around
     bright places. `harmonics.project` computes the coefficients from the map
     again. At degree 6, the L2 norm of its error is at most 22.2 / height² times
     the norm of the coefficients (3.4e-4 at a height of 256).
-
-    Args:
-        coefficients: SH coefficients, shape ((degree + 1)², 3).
-        height: Number of rows. The map has twice as many columns.
-
-    Returns:
-        Radiance at the centers of the texels, float64,
-        shape (height, 2 · height, 3).
     """
     directions, _ = equirectangular(height, 2 * height)
     return light_radiance(coefficients, directions)
 
 
-def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Compute the radiance of environment light that arrives from given directions.
-
-    Args:
-        coefficients: SH coefficients of the light, shape ((degree + 1)², 3).
-        directions: Directions toward the light, of any length, shape (..., 3).
-
-    Returns:
-        RGB radiance in the dtype of `directions`, shape (..., 3).
-    """
+def light_radiance(
+    coefficients: Tensor, directions: Float[Tensor, "... 3"]
+) -> Float[Tensor, "... 3"]:
+    """Compute the radiance of environment light that arrives from given directions."""
     degree = math.isqrt(len(coefficients)) - 1
     blocks = directions.flatten(0, -2).split(BLOCK)
     radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
     return radiance.unflatten(0, directions.shape[:-1])
 
 
-def negative_fraction(radiance: Tensor) -> float:
+def negative_fraction(radiance: Float[Tensor, "H W 3"]) -> float:
     """Compute which fraction of the light of an environment map is negative.
 
     This is the integral of max(-radiance, 0) over the sphere and the channels,
     divided by the integral of |radiance|.
-
-    Args:
-        radiance: Environment map, shape (H, W, 3).
-
-    Returns:
-        Fraction in [0, 1]. It is 0 for a black map.
     """
     _, solid_angles = equirectangular(*radiance.shape[:2])
     power = radiance * solid_angles[..., None]
@@ -110,7 +91,7 @@ def negative_fraction(radiance: Tensor) -> float:
     return float((-power).clamp(min=0).sum() / magnitude)
 
 
-def read_map(path: str | Path) -> Tensor:
+def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     """Read an environment map from a file.
 
     The values of the file are taken as linear RGB radiance. Other primaries than
@@ -121,18 +102,6 @@ def read_map(path: str | Path) -> Tensor:
     channel is used for red, green and blue. If an .exr file has layers, the layer
     without a name is read. If all layers have names, the first layer with red,
     green and blue is read.
-
-    Args:
-        path: An .npy, .hdr or .exr file. The array of an .npy file has the
-            shape (H, W, C) with C = 1, 3 or 4 channels.
-
-    Returns:
-        Radiance, float32, shape (H, W, 3).
-
-    Raises:
-        InputError: If the file does not exist, cannot be read or has no RGB or
-            gray channels, or if its radiance is NaN, infinite or above 1e12.
-            (The sun has 1.6e9 cd/m².)
     """
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
@@ -156,23 +125,8 @@ def read_map(path: str | Path) -> Tensor:
     return torch.from_numpy(radiance)
 
 
-def read_panorama(path: str | Path) -> Tensor:
-    """Read an environment map that covers the whole sphere and has no negative radiance.
-
-    Args:
-        path: An .npy, .hdr or .exr file, see `read_map`.
-
-    Returns:
-        Radiance of at least 0, float32, shape (H, W, 3). Negative radiance is
-        set to 0 if its magnitude is at most `NEGATIVE` times the largest
-        radiance.
-
-    Raises:
-        InputError: If `read_map` raises it. If the map has fewer than
-            `FEWEST_ROWS` rows, or is not about twice as wide as high (such as a
-            photograph of a mirror ball). If the map has radiance below
-            -`NEGATIVE` times the largest radiance.
-    """
+def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
+    """Read an environment map that covers the whole sphere and has no negative radiance."""
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
@@ -189,21 +143,13 @@ def read_panorama(path: str | Path) -> Tensor:
     return radiance.clamp(min=0)
 
 
-def write_map(path: str | Path, radiance: Tensor) -> None:
+def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
     """Write an environment map to a file.
 
     An .npy or .exr file stores float32 and keeps negative radiance. An .hdr file
     stores RGBE, which has no sign and one exponent for three channels. In an .hdr
     file, negative radiance becomes 0 (see `negative_fraction`), and the rounding
     error is at most 2⁻⁸ of the largest channel of a texel.
-
-    Args:
-        path: File to write, with the suffix .npy, .hdr or .exr. Its folder is
-            created.
-        radiance: Environment map, shape (H, W, 3).
-
-    Raises:
-        InputError: If the file has another suffix or cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -225,19 +171,11 @@ def write_map(path: str | Path, radiance: Tensor) -> None:
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 
 
-def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
+def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -> None:
     """Write an image with OpenImageIO.
 
     A temporary file is written first and then renamed, so a reader never sees a
     part of the file.
-
-    Args:
-        path: File to write or to replace.
-        texels: Linear values, shape (H, W, 3).
-        file_format: Name of the format in OpenImageIO, "hdr" or "openexr".
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     image = _openimageio().ImageBuf(texels.contiguous().numpy())
     with replacing(path) as temporary:
@@ -247,18 +185,7 @@ def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
-    """Read an environment map from an .npy file.
-
-    Args:
-        path: File to read.
-
-    Returns:
-        The texels, shape (H, W, C), and the names of the C channels.
-
-    Raises:
-        InputError: If the array does not have 3 dimensions and 1, 3 or 4
-            channels.
-    """
+    """Read an environment map from an .npy file."""
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
@@ -270,20 +197,7 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:
-    """Read an environment map from an .hdr or .exr file.
-
-    Args:
-        path: File to read.
-
-    Returns:
-        The texels, shape (H, W, C), the names of the C channels, and the
-        chromaticities of red, green, blue and white, 8 numbers.
-
-    Raises:
-        InputError: If the file cannot be read or has another format, or if the
-            image is stored cropped, mirrored or rotated.
-        ValueError: If the header of an .hdr file is damaged.
-    """
+    """Read an environment map from an .hdr or .exr file."""
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
     if not image.read():
@@ -315,16 +229,6 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     The manual of Radiance (File Formats, "Picture Files") says that EXPOSURE and
     COLORCORR are cumulative factors of the pixels. Indented lines are of other
     pictures. Without PRIMARIES, maps of others than Radiance are Rec. 709.
-
-    Args:
-        path: File that OpenImageIO has read.
-
-    Returns:
-        Factors of red, green and blue, float32, shape (3,), and the
-        chromaticities of red, green, blue and white, 8 numbers.
-
-    Raises:
-        ValueError: If the values are damaged, or encoded with a GAMMA.
     """
     factors = np.ones(3)
     chromaticities: Sequence[float] = REC_709
@@ -346,15 +250,9 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     return factors.astype(np.float32), chromaticities
 
 
-def _in_rec709(radiance: np.ndarray, chromaticities: Sequence[float]) -> np.ndarray:
-    """Convert radiance of any primaries to Rec. 709. A negative channel that this makes becomes 0.
-
-    Args:
-        radiance: Linear RGB radiance, float32, shape (H, W, 3).
-        chromaticities: CIE x and y of red, green, blue and white, 8 numbers.
-
-    Raises:
-        ValueError: If the chromaticities are no primaries.
+def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[float]) -> np.ndarray:
+    """Convert radiance of any primaries to Rec. 709. A negative channel that this makes becomes
+    0.
     """
     matrix = to_rec709(chromaticities, adapt=False)
     if matrix is None:
@@ -373,16 +271,10 @@ def _in_rec709(radiance: np.ndarray, chromaticities: Sequence[float]) -> np.ndar
     return np.where(is_beyond, 0, converted)
 
 
-def _to_rgbe_precision(radiance: Tensor) -> Tensor:
+def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """Round radiance to the nearest values that an .hdr file (format RGBE) can store.
 
     OpenImageIO would round all values down, which darkens and tints the light.
-
-    Args:
-        radiance: Environment map, shape (H, W, 3).
-
-    Returns:
-        Rounded radiance of at least 0, shape (H, W, 3).
     """
     radiance = radiance.clamp(min=0)
     # RGBE stores all three channels of a texel with the exponent of the largest channel.
@@ -394,19 +286,7 @@ def _to_rgbe_precision(radiance: Tensor) -> Tensor:
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Find the red, green and blue channel of an image by the names of its channels.
-
-    Args:
-        names: Names of all channels, "CHANNEL" or "LAYER.CHANNEL", in upper or
-            lower case.
-
-    Returns:
-        Indices of the red, the green and the blue channel. The three indices are
-        equal for a gray image.
-
-    Raises:
-        InputError: If there is no such channel.
-    """
+    """Find the red, green and blue channel of an image by the names of its channels."""
     layers = []
     channels = []
     for name in names:

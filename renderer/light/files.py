@@ -89,22 +89,7 @@ def save_light(
 
 
 def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, Tensor]:
-    """Read a light from a .json file.
-
-    Args:
-        path: Path of a file that `save_light` wrote. A file may also be a plain
-            list of rows [r, g, b]. These are SH coefficients.
-        kinds: Accepted kinds of light, as classes such as `Harmonics` or `Lamps`.
-
-    Returns:
-        A tuple of
-        - the basis of the light;
-        - its RGB coefficients, float32, shape (size, 3).
-
-    Raises:
-        InputError: If the file is missing, or does not describe a light of an
-            accepted kind.
-    """
+    """Read a light from a .json file."""
     path = Path(path)
     require_file(path, "give the path of a .json file of coefficients")
     kind_of_name = {kind.name: kind for kind in kinds}

@@ -21,20 +21,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache, wraps
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_range
 from renderer.settings import MAX_DEGREE
 from renderer.validation import as_tensor, require_whole
 from renderer.vectors import unit
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float64, Int
 
 # Largest degree that `quadrature` accepts. A rule of degree D has about D² / 2
 # directions.
@@ -69,14 +67,7 @@ def cache_tensors(function: Callable[..., Constant]) -> Callable[..., Constant]:
 
 
 def _copy_result(function: Callable[[int], Tensor]) -> Callable[[int], Tensor]:
-    """Decorate a function with a cache, so that changes of a result do not reach the cache.
-
-    Args:
-        function: Function that returns a cached tensor.
-
-    Returns:
-        Function that returns a copy of the tensor.
-    """
+    """Decorate a function with a cache, so that changes of a result do not reach the cache."""
 
     @wraps(function)
     def copied(degree: int) -> Tensor:
@@ -108,14 +99,7 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
 
 
 def _degree_of_rows(coefficients: Tensor) -> int | None:
-    """Find the degree of a light from the number of its SH coefficients.
-
-    Args:
-        coefficients: SH coefficients, shape ((degree + 1)², channels).
-
-    Returns:
-        Degree, or None if the tensor does not have such a shape.
-    """
+    """Find the degree of a light from the number of its SH coefficients."""
     if coefficients.ndim != 2 or len(coefficients) == 0:
         return None
     degree = math.isqrt(len(coefficients)) - 1
@@ -214,16 +198,6 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
     """Evaluate the orthonormal associated Legendre functions P_l^m / sin^m θ of one order m.
 
     The functions are polynomials in z = cos θ.
-
-    Args:
-        z: Cosine of the polar angle θ, any shape.
-        m: Order, at least 0.
-        degree: Largest l.
-
-    Yields:
-        Values for l = m, m + 1, ..., degree, in the shape of `z`. The first
-        function is constant and is yielded as a number, because multiplying by a
-        number is faster than by a tensor.
     """
     ratios = [(2 * k + 1) / (2 * k) for k in range(1, m + 1)]
     constant = math.sqrt(math.prod(ratios) / (4 * math.pi))
@@ -267,7 +241,7 @@ def gradient_matrices(degree: int) -> Tensor:
     return matrices
 
 
-def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
+def _set_gradients(matrices: Float[Tensor, "3 K K"], l: int, m: int) -> None:
     """Set the derivatives of the harmonics Y_lm and Y_l,-m in the matrices, in place.
 
     A column of a matrix belongs to a harmonic of band l. Its rows hold the
@@ -275,12 +249,6 @@ def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
     of Y_lm with respect to z is a harmonic of the same order in band l - 1. The
     derivatives with respect to x and y are sums of harmonics of the orders m - 1
     and m + 1 in band l - 1 (ladder operators).
-
-    Args:
-        matrices: Matrices of the derivatives with respect to x, y and z,
-            shape (3, K, K) for K harmonics.
-        l: Band, at least 1.
-        m: Order, at least 0.
     """
     norm = (2 * l + 1) / (2 * l - 1)
     # Factors of the harmonics of the orders m - 1 (down) and m + 1 (up) in band l - 1.
@@ -493,28 +461,13 @@ def irradiance_error(
     return torch.where(error > 0, error / norm, error)
 
 
-def _pad_bands(coefficients: Tensor, size: int) -> Tensor:
-    """Append zeros to the SH coefficients of lights.
-
-    Args:
-        coefficients: SH coefficients of C color channels, shape (..., K, C).
-        size: Number of coefficients after the padding, at least K.
-
-    Returns:
-        SH coefficients, shape (..., size, C).
-    """
+def _pad_bands(coefficients: Float[Tensor, "... K C"], size: int) -> Float[Tensor, "... size C"]:
+    """Append zeros to the SH coefficients of lights."""
     return F.pad(coefficients, (0, 0, 0, size - coefficients.shape[-2]))
 
 
-def _norm_over_coefficients(coefficients: Tensor) -> Tensor:
-    """Compute the L2 norm of each light over its K SH coefficients and C color channels.
-
-    Args:
-        coefficients: SH coefficients of the lights, shape (..., K, C).
-
-    Returns:
-        Norms, shape (...).
-    """
+def _norm_over_coefficients(coefficients: Float[Tensor, "... K C"]) -> Float[Tensor, " ..."]:
+    """Compute the L2 norm of each light over its K SH coefficients and C color channels."""
     return coefficients.square().sum((-2, -1)).sqrt()
 
 
@@ -617,20 +570,8 @@ def project(
     return basis(directions, degree).T @ (weights[:, None] * values)
 
 
-def _project_map(radiance: Tensor, degree: int) -> Tensor:
-    """Compute the SH coefficients of an environment map with the midpoint rule.
-
-    Args:
-        radiance: Environment map, shape (height, width, channels).
-        degree: Degree of the result.
-
-    Returns:
-        SH coefficients, float64, shape ((degree + 1)², channels).
-
-    Raises:
-        InputError: If the map does not have three axes, or holds NaN or
-            infinity.
-    """
+def _project_map(radiance: Float[Tensor, "height width channels"], degree: int) -> Tensor:
+    """Compute the SH coefficients of an environment map with the midpoint rule."""
     if radiance.ndim != 3:
         shape = tuple(radiance.shape)
         raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")

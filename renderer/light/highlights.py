@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
@@ -45,14 +46,6 @@ def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal. It multiplies the coefficients of degree l of the light by
     an amplitude. All degrees with a larger amplitude than `amplitude` are needed.
-
-    Args:
-        roughness: Roughness in [0, 1]. Values below MIN_ROUGHNESS count as MIN_ROUGHNESS.
-        amplitude: Largest amplitude of a degree that is not needed, as a fraction
-            of the amplitude of degree 0.
-
-    Returns:
-        Degree, at most MAX_DEGREE.
     """
     amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
     # The amplitudes fall with the degree. If n degrees from 1 on exceed the limit, these
@@ -60,7 +53,9 @@ def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
     return int(np.count_nonzero(amplitudes[1:] > amplitude))
 
 
-def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
+def window_without_ringing(
+    coefficients: Float[Tensor, "K C"], roughness: float
+) -> Float[Tensor, " K"]:
     """Find factors for the SH coefficients of a map that keep dark rings out of highlights.
 
     The radiance of few spherical harmonics oscillates around bright places of the
@@ -69,15 +64,6 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
     then the window for a highlight of the surface, and then the window for a
     highlight that is narrower by the factor NARROWER. It returns the first of
     these with which the narrower highlight is negative nowhere.
-
-    Args:
-        coefficients: SH coefficients of the environment map, shape (K, C) with
-            K = (degree + 1)² and C color channels.
-        roughness: Roughness of the smoothest surface, in [0, 1]. Values below
-            MIN_ROUGHNESS count as MIN_ROUGHNESS.
-
-    Returns:
-        Factor of each coefficient, float64, shape (K,). The first is 1.
     """
     degree = math.isqrt(len(coefficients)) - 1
     # The square root, because the width of a highlight is α = roughness².
@@ -102,16 +88,6 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     The factors (a window) change the highlight and the irradiance of a point
     light as little as possible. An error of the irradiance has IRRADIANCE_WEIGHT
     times the weight of an error of the highlight.
-
-    Args:
-        degree: Degree of the light.
-        roughness: Roughness of the smoothest surface, in [0, 1]. Values below
-            MIN_ROUGHNESS count as MIN_ROUGHNESS.
-        width: Factor for the width α = roughness² of the highlight.
-
-    Returns:
-        Factor of each coefficient, float64, shape ((degree + 1)²,). The first
-        is 1.
     """
     highlight = _amplitudes(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
     # The first harmonic of degree l has the index l².
@@ -130,15 +106,6 @@ def highlight_error(degree: int, roughness: float) -> float:
     by `highlight_window` for a highlight that is narrower by the factor NARROWER.
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal.
-
-    Args:
-        degree: Degree of the light.
-        roughness: Roughness of the surface, in [0, 1]. Values below MIN_ROUGHNESS count
-            as MIN_ROUGHNESS.
-
-    Returns:
-        Root mean square error over all directions, as a fraction of the root
-        mean square of the highlight.
     """
     amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
     window = highlight_window(degree, roughness, NARROWER)
@@ -152,20 +119,12 @@ def highlight_error(degree: int, roughness: float) -> float:
     return math.sqrt(relative_squared_error)
 
 
-def _amplitudes(roughness: float, degree: int) -> np.ndarray:
+def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degree+1"]:
     """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
 
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal. The lobe is symmetric about the normal, so the factor of
     degree l is the integral of the lobe times the Legendre polynomial P_l.
-
-    Args:
-        roughness: Roughness of the surface.
-        degree: Largest degree l.
-
-    Returns:
-        Factors, divided by the factor of degree 0, and at least MIN_AMPLITUDE.
-        They are float64 and have the shape (degree + 1,).
     """
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     node_count = 2**9 + 4 * degree

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import PerspectiveCamera
@@ -190,18 +191,14 @@ class Lamps(LocalBasis):
             for position, intensity in zip(self.positions, intensities, strict=True)
         ]
 
-    def _disc_points(self, positions: Tensor) -> Tensor:
+    def _disc_points(
+        self, positions: Float[Tensor, "L 3"]
+    ) -> Float[Tensor, "POINT_SETS L POINTS_PER_SET 3"]:
         """Choose points on disc lamps, to which shadow rays are cast.
 
         There are several sets of points. The points of a set represent equal areas
         of the disc. They lie on Vogel's spiral (1979), which is rotated by another
         angle in each set.
-
-        Args:
-            positions: Centers of the L discs in world axes, shape (L, 3).
-
-        Returns:
-            Points in world axes, shape (POINT_SETS, L, POINTS_PER_SET, 3).
         """
         # Both index tensors have one row for each set and one column for each point.
         set_index, point_index = torch.meshgrid(
@@ -223,19 +220,13 @@ class Lamps(LocalBasis):
         offsets = torch.einsum("spa,law->slpw", in_plane, torch.stack(plane_axes, dim=1))
         return positions[:, None] + offsets
 
-    def _irradiance(self, to_lamp: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
-        """Compute the irradiance of surface points from lamps with a coefficient of 1.
-
-        Args:
-            to_lamp: Vectors from the surface points to points on the lamps,
-                shape (..., 3).
-            normals: Unit normals of the surface, shape (..., 3).
-            positions: Centers of the lamps, shape (..., 3).
-
-        Returns:
-            Irradiance, shape (...). It is 0 or negative if a surface faces away
-            from the lamp, or if the point is behind a disc.
-        """
+    def _irradiance(
+        self,
+        to_lamp: Float[Tensor, "... 3"],
+        normals: Float[Tensor, "... 3"],
+        positions: Float[Tensor, "... 3"],
+    ) -> Float[Tensor, " ..."]:
+        """Compute the irradiance of surface points from lamps with a coefficient of 1."""
         squared_distance = to_lamp.square().sum(-1)
         irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:
@@ -248,31 +239,14 @@ class Lamps(LocalBasis):
     def _mitsuba_point(
         self, position: tuple[float, float, float], intensity: list[float]
     ) -> dict[str, Any]:
-        """Create the Mitsuba entry of a point lamp.
-
-        Args:
-            position: Position in world axes.
-            intensity: Radiant intensity in red, green and blue.
-
-        Returns:
-            Dictionary that describes the emitter in a Mitsuba scene.
-        """
+        """Create the Mitsuba entry of a point lamp."""
         color = {"type": "rgb", "value": intensity}
         return {"type": "point", "position": list(position), "intensity": color}
 
     def _mitsuba_disc(
         self, position: tuple[float, float, float], intensity: list[float]
     ) -> dict[str, Any]:
-        """Create the Mitsuba entry of a disc lamp.
-
-        Args:
-            position: Center of the disc in world axes.
-            intensity: Radiant intensity along the axis of the disc, in red, green
-                and blue.
-
-        Returns:
-            Dictionary that describes the emitter in a Mitsuba scene.
-        """
+        """Create the Mitsuba entry of a disc lamp."""
         x, y, z = position
         polar = math.degrees(math.atan2(math.hypot(x, y), z))
         azimuth = math.degrees(math.atan2(y, x))

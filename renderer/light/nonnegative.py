@@ -53,6 +53,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from torch import Tensor
@@ -135,22 +136,6 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     A light is non-negative if its radiance is negative in no direction. The
     channels of a light are projected separately, in float64. The result has no
     gradient.
-
-    Args:
-        coefficients: SH coefficients of the lights, shape (..., (degree + 1)², C)
-            with C color channels.
-
-    Returns:
-        SH coefficients in the same shape and dtype. The radiance of a channel is
-        at least -`TOLERANCE` times its largest radiance. The first coefficient
-        is unchanged, or 0 if it was negative. A channel without negative
-        radiance is returned without any change.
-
-    Example:
-        >>> import norm_balls as nb
-        >>> physical = project_nonnegative(nb.load_light("grace"))
-        >>> physical.shape
-        torch.Size([49, 3])
     """
     # Find the distinct channels, so that the equal channels of a gray light are projected
     # only once.
@@ -170,31 +155,17 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=_MAX_CACHED_CHANNELS)
-def _project_channel(channel: bytes) -> Tensor:
+def _project_channel(channel: bytes) -> Float[Tensor, " K"]:
     """Call `_project_with_mean` for one color channel, and cache the result.
 
     Several attacks often start in the same light. At degree 39, a projection takes
     half a minute.
-
-    Args:
-        channel: Bytes of the K SH coefficients of the channel, float64. Bytes can
-            be hashed, as the cache needs it.
-
-    Returns:
-        SH coefficients of the non-negative light, float64, shape (K,).
     """
     return torch.from_numpy(_project_with_mean(np.frombuffer(channel).copy()))
 
 
 def _project_with_mean(light: Array) -> Array:
-    """Find the non-negative light with the same mean as a light and the closest irradiance.
-
-    Args:
-        light: SH coefficients of one channel, shape (K,).
-
-    Returns:
-        SH coefficients of the non-negative light, shape (K,).
-    """
+    """Find the non-negative light with the same mean as a light and the closest irradiance."""
     mean = light[0]
     rounding_radiance = _rounding_radiance(light[None])
     uniform = np.concatenate([[max(mean, 0.0)], 0 * light[1:]])
@@ -230,15 +201,6 @@ def _mix_to_nonnegative(light: Array, filler: Array, harmonics: Array) -> Array:
     """Mix a second light into a light until its radiance is non-negative in D directions.
 
     The result is light + s (filler - light) with the smallest possible s ≥ 0.
-
-    Args:
-        light: SH coefficients of the light, shape (K,).
-        filler: SH coefficients of the second light, shape (K,). It is brighter
-            than the light wherever the light is negative.
-        harmonics: Harmonics in the D directions, shape (D, K).
-
-    Returns:
-        SH coefficients of the mixture, shape (K,).
     """
     radiance = harmonics @ light
     difference = harmonics @ (filler - light)
@@ -254,19 +216,6 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     distance between two lights is the Euclidean distance of their coefficients.
     The mean radiance changes, and often rises if a light is far below zero in
     some directions. The computation uses float64. The result has no gradient.
-
-    Args:
-        coefficients: SH coefficients of the lights, shape (..., (degree + 1)², C)
-            with C color channels. With `within`, the shape is
-            (A, (degree + 1)², C) for A lights.
-        within: Norm balls, one for each of the A lights, in which the results must
-            lie. Their centers must be non-negative lights. The norm "l2" is taken over
-            all channels of a light together. None for no ball.
-
-    Returns:
-        SH coefficients in the same shape and dtype. The radiance of a channel is
-        at least -`TOLERANCE` times its largest radiance. A channel that already
-        satisfies all constraints is returned without any change.
     """
     programs = _create_programs(coefficients, within)
     unsolved = programs
@@ -291,18 +240,10 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     return torch.from_numpy(nearest).view(coefficients.mT.shape).to(coefficients).mT
 
 
-def _create_programs(coefficients: Tensor, within: Ball | None) -> "list[_QuadraticProgram]":
-    """Create the quadratic programs whose solutions are the nearest non-negative lights.
-
-    Args:
-        coefficients: SH coefficients of the lights, shape (..., K, C), or
-            (A, K, C) with a ball.
-        within: Balls in which the results must lie, or None.
-
-    Returns:
-        One program for each light if `within` has the norm "l2", which couples
-        the C channels of a light. Otherwise, one program for each channel.
-    """
+def _create_programs(
+    coefficients: Float[Tensor, "... K C"], within: Ball | None
+) -> "list[_QuadraticProgram]":
+    """Create the quadratic programs whose solutions are the nearest non-negative lights."""
     original = _split_channels(coefficients)
     if within is None:
         return [_QuadraticProgram(channel) for channel in original]
@@ -323,28 +264,12 @@ def _create_programs(coefficients: Tensor, within: Ball | None) -> "list[_Quadra
 
 
 def _rounding_radiance(channels: Array) -> Array:
-    """Compute the largest radiance that may be nothing but a rounding error.
-
-    Args:
-        channels: SH coefficients of R channels, shape (R, K).
-
-    Returns:
-        Radiance for each channel, shape (R,). It is proportional to the norm of
-        the coefficients.
-    """
+    """Compute the largest radiance that may be nothing but a rounding error."""
     return _DARK_FRACTION * np.linalg.norm(channels, axis=1)
 
 
-def _split_channels(coefficients: Tensor) -> Array:
-    """Convert lights to an array with one row for each color channel of each light.
-
-    Args:
-        coefficients: SH coefficients of the lights, shape (..., K, C).
-
-    Returns:
-        SH coefficients of the R channels of all lights, float64, shape (R, 1, K).
-        Each row is a light with one channel, as a `_QuadraticProgram` takes it.
-    """
+def _split_channels(coefficients: Float[Tensor, "... K C"]) -> Array:
+    """Convert lights to an array with one row for each color channel of each light."""
     rows = coefficients.detach().mT.flatten(0, -2)
     return rows[:, None].cpu().double().numpy()
 
@@ -408,10 +333,6 @@ class _QuadraticProgram:
         projection of the point c + t (v - c) between the center (t = 0) and the
         given light v (t = 1). Newton steps change t until x lies on the sphere
         |x − c| = r, or inside of it with t = 1.
-
-        Args:
-            new_harmonics: For each of the C channels, the harmonics in M new
-                directions, shape (M, K).
         """
         constraints = [
             np.concatenate(pair)
@@ -444,18 +365,7 @@ class _QuadraticProgram:
         self.nearest = self._center + displacement * scale
 
     def _project(self, target: Array, constraints: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Find the light nearest to a given light that satisfies all constraints but the ball.
-
-        Args:
-            target: SH coefficients of the given light, shape (C, K).
-            constraints: For each channel, the harmonics in the M directions in
-                which its radiance must not be negative, shape (M, K).
-
-        Returns:
-            A tuple of
-            - the SH coefficients of the nearest light, shape (C, K);
-            - for each channel, the rows of `constraints` with positive multipliers.
-        """
+        """Find the light nearest to a given light that satisfies all constraints but the ball."""
         nearest = []
         active_constraints = []
         channels = zip(target, constraints, self._low, self._high, strict=True)
@@ -474,14 +384,6 @@ class _QuadraticProgram:
         the center c of the ball (t = 0) and the given light v (t = 1). The change s
         of t solves the quadratic equation |displacement + s velocity| = r. It is
         clipped so that t stays between its minimum and 1.
-
-        Args:
-            velocity: Derivative of the solution x with respect to t, shape (C, K).
-            displacement: Current x - c, shape (C, K).
-            missing_squared: r² - |x - c|².
-
-        Returns:
-            The change s.
         """
         squared_speed = float((velocity * velocity).sum())
         slope = float((velocity * displacement).sum())
@@ -520,15 +422,6 @@ def _differentiate(offset: Array, correction: Array, active_rows: Array) -> _Sol
     With the matrix R of the M active constraints, the solution is
     x = c + t (v − c) + Rᵀ μ, and R x = 0. The derivative of the multipliers μ is
     therefore the solution μ' of the least squares problem Rᵀ μ' ≈ −(v − c).
-
-    Args:
-        offset: v − c, shape (K,).
-        correction: Rᵀ μ, shape (K,). The multipliers μ are computed from it.
-        active_rows: Matrix R, the harmonics in the directions of the active
-            constraints, shape (M, K).
-
-    Returns:
-        Derivatives with respect to t, and multipliers.
     """
     right_sides = np.stack([-offset, correction], axis=1)
     solution = np.linalg.lstsq(active_rows.T, right_sides)[0]
@@ -550,19 +443,6 @@ def _least_distance(
     the shortest d. It stacks Gᵀ and the row hᵀ to a matrix E, and minimizes
     |E u − f| over all u ≥ 0, with f = (0, ..., 0, 1). With the residual r = E u − f
     of size K + 1, the result is d_j = −r_j / r_(K+1).
-
-    Args:
-        original: SH coefficients of the given light, shape (K,).
-        harmonics: Harmonics in the M directions in which the radiance must not be
-            negative, shape (M, K).
-        low: Lower bounds of the coefficients, shape (K,). Minus infinity for no
-            bound.
-        high: Upper bounds of the coefficients, shape (K,).
-
-    Returns:
-        A tuple of
-        - the SH coefficients of the nearest light x, shape (K,);
-        - the rows of `harmonics` with positive multipliers.
     """
     if not len(harmonics):
         return original, harmonics
@@ -597,19 +477,7 @@ def _least_distance(
 def _find_negative_minima(
     lights: Array, rounding_radiance: Array, limits: _StartLimits
 ) -> tuple[Array, Array]:
-    """Find the directions in which the radiance of R lights has a negative local minimum.
-
-    Args:
-        lights: SH coefficients of the lights, shape (R, K).
-        rounding_radiance: Radiance of each light up to which it counts as zero,
-            shape (R,). A light that is brighter nowhere has no negative minima.
-        limits: Limits for the grid directions from which a search starts.
-
-    Returns:
-        A tuple of
-        - for each of D minima, the index of its light, shape (D,);
-        - for each minimum, the harmonics in its direction, shape (D, K).
-    """
+    """Find the directions in which the radiance of R lights has a negative local minimum."""
     degree = math.isqrt(lights.shape[1]) - 1
     is_coarse = degree <= _COARSE_GRID_DEGREE
     grid = _grid(degree, _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS)
@@ -636,21 +504,7 @@ def _choose_starts(
     grid: "_Grid",
     limits: _StartLimits,
 ) -> tuple[Array, Array]:
-    """Choose the grid directions from which the search for a negative minimum starts.
-
-    Args:
-        radiance: Radiance of R lights in the N grid directions, shape (R, N).
-        largest: Largest magnitude of the radiance of each light, shape (R,).
-        rounding_radiance: Radiance of each light up to which it counts as zero,
-            shape (R,). No search starts for a light that is brighter nowhere.
-        grid: The grid directions and their neighbors.
-        limits: Limits for the radiance in a start direction.
-
-    Returns:
-        A tuple of
-        - the index of the light of each of D starts, shape (D,);
-        - the index of the grid direction of each start, shape (D,).
-    """
+    """Choose the grid directions from which the search for a negative minimum starts."""
     upper_limit = np.where(largest > rounding_radiance, limits.above_zero * largest, -np.inf)
     light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
     margin = limits.above_neighbors * largest
@@ -664,17 +518,7 @@ def _choose_starts(
 
 
 def _step_down(directions: Array, derivatives: Array) -> Array:
-    """Take one Newton step on the unit sphere toward lower radiance, from D directions.
-
-    Args:
-        directions: Unit vectors, shape (D, 3).
-        derivatives: For each direction, the SH coefficients of the 3 first and
-            the 9 second derivatives of its radiance with respect to x, y and z,
-            shape (D, 12, K).
-
-    Returns:
-        Unit vectors after the step, shape (D, 3).
-    """
+    """Take one Newton step on the unit sphere toward lower radiance, from D directions."""
     degree = math.isqrt(derivatives.shape[2]) - 1
     # Values of the derivatives in the directions, shape (D, 12, 1).
     values = derivatives @ _harmonics(directions, degree)[..., None]
@@ -708,13 +552,6 @@ def _harmonics(directions: Array, degree: int) -> Array:
     polynomial by 2. So each harmonic equals a homogeneous polynomial of degree
     `degree` or `degree` - 1 in x, y and z. For few directions, this is faster than
     `harmonics.evaluate_harmonics`.
-
-    Args:
-        directions: D unit vectors, shape (D, 3).
-        degree: Largest degree of the harmonics.
-
-    Returns:
-        Values of the K = (degree + 1)² harmonics, shape (D, K).
     """
     exponents, coefficients = _polynomials(degree)
     # Powers 0 to degree of x, y and z of D directions, shape (degree + 1, 3, D).
@@ -734,14 +571,6 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
     The monomials have a + b + c = degree or a + b + c = degree - 1. Harmonics of
     bands with the same parity as `degree` only need the first kind, and the other
     harmonics only need the second kind.
-
-    Args:
-        degree: Largest degree of the K = (degree + 1)² harmonics.
-
-    Returns:
-        A tuple of
-        - the exponents a, b and c of the monomials, shape (3, J);
-        - the coefficients of the monomials in each harmonic, shape (J, K).
     """
     exponents = []
     coefficients = []
@@ -759,15 +588,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
 
 @cache_tensors
 def _derivatives(degree: int) -> Array:
-    """Compute the matrix that maps SH coefficients to those of first and second derivatives.
-
-    Args:
-        degree: Degree of the light, which has K = (degree + 1)² coefficients.
-
-    Returns:
-        Matrix, shape (K, 12 K). Its columns are 12 blocks of K coefficients: the
-        3 first and then the 9 second derivatives with respect to x, y and z.
-    """
+    """Compute the matrix that maps SH coefficients to those of first and second derivatives."""
     # The shapes are (3, K, K) for the first and (9, K, K) for the second derivatives.
     first = gradient_matrices(degree)
     second = (first[:, None] @ first).flatten(0, 1)
@@ -792,16 +613,7 @@ class _Grid:
 
 @cache_tensors
 def _grid(degree: int, subdivisions: int) -> _Grid:
-    """Create the grid of directions in which negative radiance is searched.
-
-    Args:
-        degree: Largest degree of the harmonics that are evaluated on the grid.
-        subdivisions: How often each triangle of an icosahedron is divided into
-            four.
-
-    Returns:
-        Grid with the harmonics in all directions.
-    """
+    """Create the grid of directions in which negative radiance is searched."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 

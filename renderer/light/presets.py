@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import InputError, require_bounded
@@ -142,17 +143,10 @@ def load_light(
     return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
 
 
-def probe(name: str) -> Tensor:
+def probe(name: str) -> Float[Tensor, "49 3"]:
     """Return a published light probe, the measured light of a real place.
 
     The published coefficients have y up and are rotated to z up.
-
-    Args:
-        name: Name of the probe, one of `PROBES`.
-
-    Returns:
-        SH coefficients, float32, shape (49, 3). Coefficients of degree 3 to 6
-        are 0.
     """
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
     coefficients = torch.zeros(COEFFICIENTS, 3)
@@ -161,16 +155,10 @@ def probe(name: str) -> Tensor:
     return coefficients
 
 
-def ambient(color: Tensor) -> Tensor:
+def ambient(color: Float[Tensor, " 3"]) -> Float[Tensor, "49 3"]:
     """Create light with the same radiance from every direction.
 
     The irradiance of a surface in this light is π times the radiance.
-
-    Args:
-        color: Linear RGB radiance, shape (3,).
-
-    Returns:
-        SH coefficients, shape (49, 3).
     """
     require_bounded(color=color)
     coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
@@ -178,44 +166,29 @@ def ambient(color: Tensor) -> Tensor:
     return coefficients
 
 
-def directional(direction: Tensor, color: Tensor, degree: int = DEGREE) -> Tensor:
+def directional(
+    direction: Float[Tensor, "... 3"], color: Float[Tensor, " 3"], degree: int = DEGREE
+) -> Tensor:
     """Approximate parallel light from one direction by spherical harmonics.
 
     At degree 6, the error of the irradiance is at most 0.043 times the irradiance
     of a surface that faces the light.
-
-    Args:
-        direction: Unit vectors toward the light, shape (..., 3).
-        color: Linear RGB irradiance of a surface that faces the light,
-            shape (3,).
-        degree: Degree of the result.
-
-    Returns:
-        SH coefficients, shape (..., (degree + 1)², 3).
     """
     require_bounded(color=color)
     return basis(direction, degree)[..., None] * color
 
 
 def perturb(
-    light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator
-) -> Tensor:
+    light: Float[Tensor, "K 3"],
+    count: int,
+    amplitude: float,
+    radius: float | None,
+    generator: torch.Generator,
+) -> Float[Tensor, "count K 3"]:
     """Draw random lights around a light.
 
     A uniform random number in [-amplitude, amplitude] is added to each
     coefficient, as in the random mode of the paper (amplitude 0.5).
-
-    Args:
-        light: SH coefficients, shape (K, 3) with K = (degree + 1)².
-        count: Number of lights to draw.
-        amplitude: Largest change of a coefficient.
-        radius: L2 norm to which the change of a light is scaled. With it, only
-            coefficients that change the irradiance of a diffuse surface are
-            changed. None changes all coefficients and does not scale the change.
-        generator: Source of the random numbers.
-
-    Returns:
-        SH coefficients, shape (count, K, 3).
     """
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
@@ -229,35 +202,14 @@ def perturb(
     return light + offsets.to(light)
 
 
-def mean_luminance(coefficients: Tensor) -> float:
-    """Compute √(4π) times the mean luminance of a light over all directions.
-
-    Args:
-        coefficients: SH coefficients of linear RGB radiance, shape (K, 3). Only
-            the first row counts. It is √(4π) times the mean radiance.
-
-    Returns:
-        √(4π) times the luminance.
-    """
+def mean_luminance(coefficients: Float[Tensor, "K 3"]) -> float:
+    """Compute √(4π) times the mean luminance of a light over all directions."""
     weights = torch.tensor(LUMINANCE, dtype=torch.float64)
     return float(coefficients[0].cpu().double() @ weights)
 
 
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
-    """Read an environment map, and scale it to the mean luminance of the grace probe.
-
-    Args:
-        path: File of the map.
-        degree: Degree of the result.
-        roughness: Roughness in [0, 1] of the smoothest surface in this light, whose
-            highlights must not get dark rings. None if this does not matter.
-
-    Returns:
-        SH coefficients, float32, shape ((degree + 1)², 3).
-
-    Raises:
-        InputError: If the map cannot be read, or if it is black.
-    """
+    """Read an environment map, and scale it to the mean luminance of the grace probe."""
     coefficients = project(read_panorama(path), degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]

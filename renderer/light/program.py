@@ -34,20 +34,6 @@ def shortest(matrix: Array, lower_bounds: Array) -> Array:
     these conditions (Mehrotra 1992, "On the implementation of a primal-dual
     interior point method"). The computing time does not depend on how many
     inequalities hold with equality.
-
-    Args:
-        matrix: Left sides of M ≥ 1 inequalities, shape (M, n).
-        lower_bounds: Right sides of the inequalities, shape (M,). Some y must
-            satisfy all inequalities strictly, and y = 0 must violate one of them.
-
-    Returns:
-        The vector y, shape (n,). The inequalities hold up to 10⁻⁹ of the
-        largest magnitude in `lower_bounds`.
-
-    Example:
-        >>> matrix = np.array([[1.0, 0.0], [1.0, 1.0]])
-        >>> shortest(matrix, np.array([1.0, 3.0])).round(6).tolist()
-        [1.5, 1.5]
     """
     scale = np.abs(lower_bounds).max()
     iterate = _Iterate(matrix, lower_bounds / scale)
@@ -137,9 +123,6 @@ class _Iterate:
         products shall become: the longer, the smaller. The corrector is a Newton
         step toward these equal, positive products. It also removes the second-order
         error of the predictor.
-
-        Raises:
-            LinAlgError: If the linear system is not positive definite.
         """
         weighted_rows = self._matrix * np.sqrt(self.multipliers / self.slacks)[:, None]
         system = weighted_rows.T @ weighted_rows + np.eye(len(self.y))
@@ -167,15 +150,6 @@ class _Iterate:
 
         To first order, the step makes `dual_residual` and `primal_residual` zero,
         and reduces the products of slacks and multipliers by `reductions`.
-
-        Args:
-            factor: Cholesky factor of
-                I + matrixᵀ diag(multipliers / slacks) matrix, from cho_factor.
-            reductions: How much the product of each slack and its multiplier is
-                reduced, shape (M,).
-
-        Returns:
-            Changes of y, the slacks and the multipliers.
         """
         # Eliminating the slacks and the multipliers leaves a linear system for y.
         eliminated = (self.multipliers * self.primal_residual + reductions) / self.slacks
@@ -186,14 +160,7 @@ class _Iterate:
         return _Change(y=y_change, slacks=slack_change, multipliers=multiplier_change)
 
     def _longest_step(self, change: _Change) -> float:
-        """Compute how long a step may be, so that no slack or multiplier becomes negative.
-
-        Args:
-            change: Change of the vectors in a step of length 1.
-
-        Returns:
-            Length of the step, at most 1 / _FRACTION_TO_BOUNDARY.
-        """
+        """Compute how long a step may be, so that no slack or multiplier becomes negative."""
         # Largest fraction of its value that a slack loses in a step of length 1.
         slack_decrease = (-change.slacks / self.slacks).max()
         multiplier_decrease = (-change.multipliers / self.multipliers).max()

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import torch
+from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -99,21 +100,9 @@ class _FittedSky(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor
-    ) -> Tensor:
-        """Compute the SH coefficients of the sky, and save their derivatives in `ctx`.
-
-        Args:
-            ctx: Context of autograd.
-            zenith: Zenith angle of the sun in radians, shape (...).
-            azimuth: Azimuth of the sun in radians, same shape.
-            turbidity: Turbidity, same shape.
-            fit: Coefficients of the polynomials in the zenith angle (axis 0) and in
-                1 / turbidity (axis 1), see `_library_fit`.
-
-        Returns:
-            SH coefficients, shape (..., 49, 3).
-        """
+        ctx: Any, zenith: Float[Tensor, " ..."], azimuth: Tensor, turbidity: Tensor, fit: Tensor
+    ) -> Float[Tensor, "... 49 3"]:
+        """Compute the SH coefficients of the sky, and save their derivatives in `ctx`."""
         # The zenith angle from 0 to π/2 is mapped to the domain [-1, 1] of the polynomials.
         zenith_values, zenith_slopes = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
         # 1 / turbidity from 1/10 to 1/2 is mapped to the domain [-1, 1], too.
@@ -140,18 +129,8 @@ class _FittedSky(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Compute the gradients with respect to the three parameters of the sky.
-
-        Args:
-            ctx: Context of autograd, with the derivatives of the coefficients.
-            upstream: Gradient with respect to the SH coefficients,
-                shape (..., 49, 3).
-
-        Returns:
-            Gradients with respect to zenith angle, azimuth and turbidity,
-            shape (...) each, and None for the polynomials.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "... 49 3"]) -> tuple[Tensor | None, ...]:
+        """Compute the gradients with respect to the three parameters of the sky."""
         by_zenith, by_azimuth, by_turbidity = (
             (upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors
         )
@@ -164,10 +143,6 @@ def _library_fit() -> Tensor:
 
     Each SH coefficient of a sky with the sun at azimuth 0 is a sum of products of
     two Chebyshev polynomials, one of the zenith angle and one of 1 / turbidity.
-
-    Returns:
-        Factors of the products, with the axes: polynomial of the zenith angle,
-        polynomial of 1 / turbidity, 28 SH coefficients with order m ≥ 0, 3 colors.
     """
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 
@@ -180,19 +155,6 @@ def _as_parameters(
     The tensors get the dtype and the device of the first floating-point tensor
     among turbidity, zenith and azimuth. Without such a tensor, they are float64.
     Angles are converted to radians before they are rounded to this dtype.
-
-    Args:
-        zenith: Zenith angle of the sun in degrees.
-        azimuth: Azimuth of the sun in degrees.
-        turbidity: Turbidity.
-
-    Returns:
-        Zenith angle and azimuth in radians, and turbidity, in the shapes of the
-        arguments.
-
-    Raises:
-        InputError: If a value is no number or tensor, not finite, or out of
-            range.
     """
     value_by_name = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
     for name, value in value_by_name.items():
@@ -222,17 +184,7 @@ def _is_floating(value: object) -> TypeGuard[Tensor]:
 
 
 def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], expected: str) -> None:
-    """Check that all values of a parameter of the sky are within limits, up to rounding.
-
-    Args:
-        name: Name of the parameter, for the error message.
-        value: Values of the parameter, any shape.
-        limits: Smallest and largest permitted value.
-        expected: Description of the permitted values, for the error message.
-
-    Raises:
-        InputError: If an entry is outside of the limits, or NaN.
-    """
+    """Check that all values of a parameter of the sky are within limits, up to rounding."""
     low, high = limits
     rounding = 4 * torch.finfo(value.dtype).eps
     # Both comparisons are False for NaN, so NaN counts as outside.
@@ -244,19 +196,10 @@ def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], exp
         )
 
 
-def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:
-    """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p.
-
-    Args:
-        x: Values of the variable x in [-1, 1], shape (...).
-        slope: Derivative of x with respect to the parameter p, shape (...) or a
-            number.
-        count: Number of polynomials.
-
-    Returns:
-        Values and derivatives of the polynomials T_0 to T_(count - 1),
-        shape (..., count) each.
-    """
+def _chebyshev(
+    x: Float[Tensor, " ..."], slope: Tensor | float, count: int
+) -> tuple[Tensor, Tensor]:
+    """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p."""
     # The recurrence is T_(k + 1) = 2 x T_k - T_(k - 1). Its derivative follows from the
     # product rule.
     values = [torch.ones_like(x), x]

@@ -26,6 +26,7 @@ import math
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.polynomial import legendre
 from torch import Tensor
 
@@ -48,13 +49,6 @@ def nonnegative_window(degree: int) -> Tensor:
     is non-negative. Of all such windows, this one changes the irradiance of a
     point source least. The root mean square error is 0.17, 0.073 and 0.039 of the
     root mean square irradiance at degrees 6, 12 and 19.
-
-    Args:
-        degree: Degree of the light, from 0 to 20.
-
-    Returns:
-        Factor in [0, 1] for each coefficient, float64, shape ((degree + 1)²,).
-        All coefficients of a band have the same factor. The first factor is 1.
     """
     # The first harmonic of band l has the index l².
     first_of_band = np.arange(degree + 1) ** 2
@@ -65,23 +59,15 @@ def nonnegative_window(degree: int) -> Tensor:
     return best_window(np.ones(degree + 1), weights)
 
 
-def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
+def best_window(
+    spectrum: Float[np.ndarray, " degree+1"], weight: Float[np.ndarray, " degree+1"]
+) -> Tensor:
     """Compute the factors that make a lobe non-negative and change the lobe least.
 
     A lobe is a function of the angle θ from an axis, Σ_l (2l + 1) s_l P_l(cos θ),
     with the Legendre polynomials P_l. A window multiplies s_l by a factor w_l.
     The best window minimizes Σ_l weight_l² (w_l - 1)² under the condition that the
     windowed lobe Σ_l (2l + 1) s_l w_l P_l(cos θ) is negative at no angle.
-
-    Args:
-        spectrum: Positive factors s_l of the lobe, shape (degree + 1,). If all are
-            1, the lobe is a point source.
-        weight: Weight of the change w_l - 1 for each l, shape (degree + 1,).
-
-    Returns:
-        Factor w_l for each coefficient of a light, float64,
-        shape ((degree + 1)²,). All coefficients of degree l have the same
-        factor. The first factor is 1.
     """
     degree = len(weight) - 1
     if degree == 0:
@@ -114,12 +100,6 @@ def irradiance_weights(degree: int) -> Tensor:
     the coefficient in the irradiance (`lambertian_factors`). If A_l is zero, the
     weight is half of the smallest positive weight up to degree + 1, so that all
     weights are positive.
-
-    Args:
-        degree: Degree of the light.
-
-    Returns:
-        Positive weight of each coefficient, float64, shape ((degree + 1)²,).
     """
     # Also compute the factor of degree + 1, because it may be the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
@@ -128,21 +108,16 @@ def irradiance_weights(degree: int) -> Tensor:
     return weights[: (degree + 1) ** 2]
 
 
-def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
+def _best_factors(
+    cosines: Float[np.ndarray, " N"],
+    weight: Float[np.ndarray, " degree+1"],
+    spectrum: Float[np.ndarray, " degree+1"],
+) -> Float[np.ndarray, " degree+1"]:
     """Compute the factors that make a lobe non-negative at N angles and change it least.
 
     The lobe is Σ_l (2l + 1) s_l w_l P_l(cos θ) with the factors w_l. Its error is
     Σ_l weight_l² (w_l - 1)². It is the squared length of the vector with the
     entries weight_l (w_l - 1), so the shortest vector is searched.
-
-    Args:
-        cosines: Cosines of the angles at which the windowed lobe must not be
-            negative, shape (N,).
-        weight: Weight of w_l - 1 for each l, shape (degree + 1,).
-        spectrum: Factors s_l of the lobe, shape (degree + 1,).
-
-    Returns:
-        Factors w_l, the first of which is 1, shape (degree + 1,).
     """
     degree = len(weight) - 1
     # Only imported when it is needed, because it also imports scipy.linalg, which takes

@@ -19,9 +19,10 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -47,9 +48,6 @@ from renderer.surface.gloss import Gloss, SampleGloss, at_samples
 from renderer.validation import as_tensor
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import Rasterizer
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 # Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.
 TENSORS = ("albedo", "coverage", "pixels", "nonzero")
@@ -266,22 +264,9 @@ class TransferOperator:
         return self._light_gradient(radiance_gradient)
 
     def _images(
-        self, lights: Tensor, background: _PreparedBackground
+        self, lights: Float[Tensor, "... coefficients 3"], background: _PreparedBackground
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render images without autograd, and return what the gradient needs.
-
-        Args:
-            lights: Coefficients, shape (..., coefficients, 3).
-            background: Background of the images.
-
-        Returns:
-            A tuple of
-
-            - the images in [0, 1], shape (..., 3, size, size);
-            - 1 for values that clamping did not change, and 0 for other values, for
-              the D distinct pixels, shape (..., 3, D);
-            - the clamped linear values of the distinct pixels, shape (..., 3, D).
-        """
+        """Render images without autograd, and return what the gradient needs."""
         unclamped = self._radiance(lights).add_(background.term)
         clamped_values = unclamped.clamp(0, 1)
         # 1 for values in [0, 1], including the limits. Only these have a gradient.
@@ -306,21 +291,12 @@ class TransferOperator:
         return images.view(image_shape), is_unclamped, clamped_values
 
     def _gradient_of_images(
-        self, image_gradient: Tensor, is_unclamped: Tensor, clamped_values: Tensor
-    ) -> Tensor:
-        """Convert the gradient of a loss from the images of `_images` to the lights.
-
-        Args:
-            image_gradient: Gradient with respect to the images,
-                shape (..., 3, size, size).
-            is_unclamped: 1 for values of the D distinct pixels that clamping did not
-                change, and 0 for other values, shape (..., 3, D).
-            clamped_values: Clamped linear values of the distinct pixels,
-                shape (..., 3, D).
-
-        Returns:
-            Gradient with respect to the lights, shape (..., coefficients, 3).
-        """
+        self,
+        image_gradient: Float[Tensor, "... 3 size size"],
+        is_unclamped: Bool[Tensor, "... 3 D"],
+        clamped_values: Float[Tensor, "... 3 D"],
+    ) -> Float[Tensor, "... coefficients 3"]:
+        """Convert the gradient of a loss from the images of `_images` to the lights."""
         flat_gradient = image_gradient.flatten(-2)
         if self._distinct_in_image is not None:
             pixel_gradient = self._distinct_in_image.add_up(flat_gradient)
@@ -362,18 +338,11 @@ class TransferOperator:
         if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
-    def _radiance(self, lights: Tensor) -> Tensor:
+    def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 D"]:
         """Compute the light that D pixels send to the camera, without autograd or checks.
 
         Pixels that are equal in every light are computed once, which leaves the D
         distinct pixels.
-
-        Args:
-            lights: Coefficients of the lights, shape (..., coefficients, 3).
-
-        Returns:
-            Radiance of each pixel, times the fraction of the pixel that the mesh
-            covers, in a new tensor with the dtype of the lights, shape (..., 3, D).
         """
         dtype = self.distinct_transfer.dtype
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
@@ -395,17 +364,12 @@ class TransferOperator:
             radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
         return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
-    def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
+    def _light_gradient(
+        self, radiance_gradient: Float[Tensor, "... 3 D"]
+    ) -> Float[Tensor, "... coefficients 3"]:
         """Convert a gradient from the radiance of D pixels to the lights.
 
         The D pixels are the distinct pixels: one of each group of equal pixels.
-
-        Args:
-            radiance_gradient: Gradient with respect to the radiance, which is not
-                checked, shape (..., 3, D).
-
-        Returns:
-            Gradient with respect to the lights, shape (..., coefficients, 3).
         """
         upstream = radiance_gradient
         dtype = self.distinct_transfer.dtype
@@ -431,20 +395,13 @@ class TransferOperator:
         )
 
     def _prepare_background(
-        self, background: float | Tensor, lights: Tensor
+        self, background: float | Tensor, lights: Float[Tensor, "... coefficients 3"]
     ) -> _PreparedBackground:
         """Convert a background to images, and compute what it adds to the covered pixels.
 
         In a pixel that the mesh covers partly, the background is visible, too. The
         result for a gray value and a single light is cached for the next call,
         because optimizations call `image` many times with the same background.
-
-        Args:
-            background: Gray value, color or images in [0, 1].
-            lights: Lights of the images, shape (..., coefficients, 3).
-
-        Returns:
-            Background images, and linear values to add to the radiance.
         """
         is_gray = isinstance(background, float | int)
         if not is_gray or lights.ndim > 2:
@@ -460,16 +417,10 @@ class TransferOperator:
             self._background_cache["last"] = cached
         return cached[1]
 
-    def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
-        """Flatten background images, and compute what they add to the covered pixels.
-
-        Args:
-            images: Background images, shape (..., 3, size, size).
-            lights: Lights of the images, shape (..., coefficients, 3).
-
-        Returns:
-            Background images, and linear values to add to the radiance.
-        """
+    def _prepare_background_images(
+        self, images: Float[Tensor, "... 3 size size"], lights: Float[Tensor, "... coefficients 3"]
+    ) -> _PreparedBackground:
+        """Flatten background images, and compute what they add to the covered pixels."""
         flat_images = images.flatten(-2)
         at_pixels = flat_images.index_select(-1, self._select_distinct(self.pixels))
         if self.settings.encoding != "linear":
@@ -545,15 +496,8 @@ class TransferOperator:
         """Groups of equal pixels as in `distinct`, with row-major indices of image pixels."""
         return None if self.distinct is None else self.distinct.at(self.pixels)
 
-    def _select_distinct(self, values: Tensor) -> Tensor:
-        """Select the values of the D distinct pixels from those of the P covered pixels.
-
-        Args:
-            values: Values of the covered pixels, shape (..., P).
-
-        Returns:
-            Values of the distinct pixels, shape (..., D).
-        """
+    def _select_distinct(self, values: Float[Tensor, "... P"]) -> Float[Tensor, "... D"]:
+        """Select the values of the D distinct pixels from those of the P covered pixels."""
         if self.distinct is None:
             return values
         return values.index_select(-1, self.distinct.distinct)
@@ -603,26 +547,18 @@ class _PreparedBackground(NamedTuple):
             shape (..., 3, D).
     """
 
-    images: Tensor
-    term: Tensor
+    images: Float[Tensor, "... 3 size²"]
+    term: Float[Tensor, "... 3 D"]
 
 
 class _Radiance(torch.autograd.Function):
     """Radiance of the covered pixels of a view, differentiable with respect to the light."""
 
     @staticmethod
-    def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
-        """Compute the radiance of the P covered pixels.
-
-        Args:
-            ctx: Context of autograd.
-            lights: Coefficients, shape (..., coefficients, 3).
-            operator: Operator of the view.
-
-        Returns:
-            Radiance, times the fraction of each pixel that the mesh covers,
-            shape (..., 3, P).
-        """
+    def forward(
+        ctx: Any, lights: Float[Tensor, "... coefficients 3"], operator: TransferOperator
+    ) -> Float[Tensor, "... 3 P"]:
+        """Compute the radiance of the P covered pixels."""
         ctx.operator = operator
         radiance = operator._radiance(lights)
         if operator.distinct is None:
@@ -632,16 +568,8 @@ class _Radiance(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient with respect to the lights.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the radiance, shape (..., 3, P).
-
-        Returns:
-            Gradient, shape (..., coefficients, 3), and None for the operator.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "... 3 P"]) -> tuple[Tensor, None]:
+        """Compute the gradient with respect to the lights."""
         return ctx.operator.light_gradient(upstream), None
 
 
@@ -654,19 +582,12 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground
-    ) -> Tensor:
-        """Render one image under each light.
-
-        Args:
-            ctx: Context of autograd.
-            lights: Coefficients, shape (..., coefficients, 3).
-            operator: Operator of the view.
-            background: Background of the images.
-
-        Returns:
-            Images in [0, 1], shape (..., 3, size, size).
-        """
+        ctx: Any,
+        lights: Float[Tensor, "... coefficients 3"],
+        operator: TransferOperator,
+        background: _PreparedBackground,
+    ) -> Float[Tensor, "... 3 size size"]:
+        """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)
         ctx.operator = operator
         ctx.is_unclamped = is_unclamped
@@ -674,18 +595,8 @@ class _Image(torch.autograd.Function):
         return images
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the gradient with respect to the lights.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the images,
-                shape (..., 3, size, size).
-
-        Returns:
-            Gradient, shape (..., coefficients, 3), and None for the other two
-            arguments of `forward`.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "... 3 size size"]) -> tuple[Tensor, None, None]:
+        """Compute the gradient with respect to the lights."""
         # `_backward_once` raises an error if a second derivative is computed. Its decorator
         # takes notable time, so it only runs if the caller set create_graph=True.
         if torch.is_grad_enabled():
@@ -693,19 +604,12 @@ class _Image(torch.autograd.Function):
         return _Image._backward(ctx, upstream)
 
     @staticmethod
-    def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
+    def _backward(
+        ctx: Any, upstream: Float[Tensor, "... 3 size size"]
+    ) -> tuple[Tensor, None, None]:
         """Compute the gradient with respect to the lights, without a check for second derivatives.
 
         A second derivative through this function would be wrong, without an error.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the images,
-                shape (..., 3, size, size).
-
-        Returns:
-            Gradient, shape (..., coefficients, 3), and None for the other two
-            arguments of `forward`.
         """
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped_values)
         return gradient, None, None
@@ -715,15 +619,7 @@ class _Image(torch.autograd.Function):
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
-    """Check that the result of a user's function `loss_gradient` has the shape of the images.
-
-    Args:
-        image_gradient: Result of the user's function `loss_gradient`.
-        images: Images, any shape.
-
-    Raises:
-        InputError: If the result is no tensor, or has another shape.
-    """
+    """Check that the result of a user's function `loss_gradient` has the shape of the images."""
     is_tensor = isinstance(image_gradient, Tensor)
     if not is_tensor or image_gradient.shape != images.shape:
         given = f"the shape {tuple(image_gradient.shape)}"
@@ -735,23 +631,15 @@ def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
         )
 
 
-def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
+def apply_transfer(
+    lights: Float[Tensor, "... B K 3"],
+    transfer: Float[Tensor, "... C K P"],
+    albedo: Float[Tensor, "... 3 P"],
+) -> Float[Tensor, "... B 3 P"]:
     """Compute the radiance of P pixels under B lights, with one or more transfer matrices.
 
     The lights are the left factor of the matrix product, which is several times
     faster on a CPU.
-
-    Args:
-        lights: The K used coefficients of each light, shape (..., B, K, 3).
-        transfer: Transfer matrices in C channels, shape (..., C, K, P). With
-            C = 3, each color has a channel. With C = 1, all colors share a
-            channel. With C = 2, a channel of specular reflection follows the
-            shared channel.
-        albedo: Factors by which the shared channel is multiplied,
-            shape (..., 3, P).
-
-    Returns:
-        Radiance, shape (..., B, 3, P).
     """
     if transfer.shape[-3] == COLORS:
         # Multiply a matrix (B, K) and a matrix (K, P) for each color.
@@ -778,25 +666,6 @@ def build_operators(
     """Compute the transfer operators of a mesh for several cameras.
 
     Surfaces are shaded on the side that the camera sees.
-
-    Args:
-        mesh: Mesh that the views show.
-        cameras: Cameras of the views.
-        settings: Settings of the images.
-        rasterizer: Rasterizer that finds the visible faces.
-        albedo_scale: Factor for the albedo, for meshes whose texture is darker
-            than the real object.
-        basis: Basis of the lights.
-        dtype: Data type of the operators. The computation uses float64.
-        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
-            of the mesh.
-
-    Returns:
-        One operator per camera, in the order of the cameras.
-
-    Raises:
-        InputError: If the basis has local lights and `settings.bounces` is not
-            0, or if `albedo_scale` is not finite.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(
@@ -837,7 +706,7 @@ class _Channels(NamedTuple):
     number: int
     is_shared: bool
     sample_albedo: Tensor
-    pixel_albedo: Tensor
+    pixel_albedo: Float[Tensor, "P 3"]
 
 
 class _DenseRows(NamedTuple):
@@ -850,8 +719,8 @@ class _DenseRows(NamedTuple):
             light, shape (K,).
     """
 
-    transfer: Tensor
-    coefficients: Tensor
+    transfer: Float[Tensor, "C K P"]
+    coefficients: Int[Tensor, " K"]
 
 
 @dataclass(frozen=True)
@@ -880,14 +749,7 @@ class _OperatorBuilder:
     rays: Rays
 
     def build(self, fragments: Fragments) -> TransferOperator:
-        """Compute the operator of one view.
-
-        Args:
-            fragments: The S samples of the view that show the mesh, in P pixels.
-
-        Returns:
-            Operator of the view.
-        """
+        """Compute the operator of one view."""
         surface = Surface(self.mesh, fragments, self.settings, given_gloss=self.gloss)
         channels = self._channels(surface)
         albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
@@ -926,10 +788,6 @@ class _OperatorBuilder:
 
         This needs flat normals, a matte surface in which all colors share a
         channel, no shadows, no lamps and no projectors.
-
-        Args:
-            surface: Points and gloss at the samples of the view.
-            channels: Channels and albedo of the transfer matrix.
         """
         is_matte = surface.gloss is None and channels.is_shared
         has_open_sky = self.transport is None and not self.basis.local_lights
@@ -941,12 +799,6 @@ class _OperatorBuilder:
         If all samples of each pixel have the same albedo, the three colors can
         share one channel: the matrix is computed for the albedo 1, and the images
         are multiplied by the albedo of the pixels.
-
-        Args:
-            surface: Points and gloss at the S samples of the view.
-
-        Returns:
-            Channels and albedo of the transfer matrix.
         """
         fragments = surface.fragments
         pixel_count = len(fragments.pixels)
@@ -987,9 +839,6 @@ class _OperatorBuilder:
         the pixels. This is not possible if bounced light is colored. It is also
         not possible for a glossy mesh with shadows or local lights, because they
         add specular reflection, which has no albedo, to the same channel.
-
-        Args:
-            is_glossy: True if the mesh reflects specularly.
         """
         if self.transport is not None and self.transport.has_colored_light:
             return True
@@ -1009,17 +858,6 @@ class _OperatorBuilder:
         """Compute the rows of the transfer matrix for environment light.
 
         The rows contain shadows and bounces.
-
-        Args:
-            environment: Environment light of the basis.
-            surface: Points, normals and gloss at the samples of the view.
-            channels: Channels and albedo of the transfer matrix.
-            distinct: Groups of pixels that are equal in every light. Only one pixel
-                of each group (the distinct pixel) is computed. None computes all
-                pixels.
-
-        Returns:
-            Rows of the matrix, for the distinct pixels if `distinct` is given.
         """
         harmonics_basis = environment.basis
         all_coefficients = torch.arange(harmonics_basis.size)
@@ -1046,66 +884,27 @@ class _OperatorBuilder:
     def _local_entries(
         self, local_light: LocalPart, surface: Surface, channels: _Channels
     ) -> SparseTransfer:
-        """Compute the nonzero entries of the transfer matrix for a lamp or a projector.
-
-        Args:
-            local_light: Local light of the basis.
-            surface: Points, normals and gloss at the samples of the view.
-            channels: Channels and albedo of the transfer matrix.
-
-        Returns:
-            Nonzero entries. Their basis functions (lamps, or pixels of the
-            projector) are counted from the first function of this light.
-        """
+        """Compute the nonzero entries of the transfer matrix for a lamp or a projector."""
         return local_transfer(self.rays, surface, channels.sample_albedo, local_light.basis)
 
     def _local_rows(
         self, local_light: LocalPart, entries: SparseTransfer, surface: Surface
     ) -> _DenseRows:
-        """Write the transfer matrix of a lamp or projector (a local light) as dense rows.
-
-        Args:
-            local_light: Local light of the basis.
-            entries: Nonzero entries of the transfer matrix of this light. Their
-                basis functions are counted from the first function of the light.
-            surface: Samples of the view.
-
-        Returns:
-            Rows of the basis functions that reach a pixel.
-        """
+        """Write the transfer matrix of a lamp or projector (a local light) as dense rows."""
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
         return _DenseRows(transfer.to(self.dtype), local_light.rows.start + coefficients)
 
     def _sparse_rows(
         self, local_light: LocalPart, entries: SparseTransfer, channels: _Channels
     ) -> SparseTransfer:
-        """Convert the nonzero entries of a local light to three channels with the albedo.
-
-        Args:
-            local_light: Local light of the basis.
-            entries: Nonzero entries of the transfer matrix of this light. Their
-                basis functions are counted from the first function of the light.
-            channels: Channels and albedo of the transfer matrix.
-
-        Returns:
-            Entries whose basis functions are counted among all coefficients.
-        """
+        """Convert the nonzero entries of a local light to three channels with the albedo."""
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
         return SparseTransfer(local_light.rows.start + entries.function, entries.pixel, weight)
 
     def _concatenate(
         self, parts: list[_DenseRows], channel_count: int, pixel_count: int
     ) -> _DenseRows:
-        """Concatenate the rows of several lights in the order of their coefficients.
-
-        Args:
-            parts: Rows of each light.
-            channel_count: Number of channels. It is needed if there are no rows.
-            pixel_count: Number of pixels. It is needed if there are no rows.
-
-        Returns:
-            Rows of all lights.
-        """
+        """Concatenate the rows of several lights in the order of their coefficients."""
         if len(parts) == 1:
             # The rows of a single light are returned as they are, because `cat` copies them.
             return parts[0]
@@ -1121,18 +920,10 @@ def _first_coefficient(rows: _DenseRows) -> int:
     return int(rows.coefficients[0]) if len(rows.coefficients) else 0
 
 
-def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Return the albedo of each pixel if all samples of each pixel have the same albedo.
-
-    Args:
-        fragments: The S samples of a view that show the mesh, in P pixels.
-        albedo: Linear albedo of the samples, shape (S, 3).
-        dtype: Data type whose rounding errors are ignored in the comparison.
-
-    Returns:
-        Linear albedo of the pixels, shape (P, 3). None if two samples of a pixel
-        differ.
-    """
+def _pixel_albedo(
+    fragments: Fragments, albedo: Float[Tensor, "S 3"], dtype: torch.dtype
+) -> Float[Tensor, "P 3"] | None:
+    """Return the albedo of each pixel if all samples of each pixel have the same albedo."""
     sample_albedo = albedo.T
     zeros = sample_albedo.new_zeros(COLORS, len(fragments.pixels))
     # Each pixel gets the albedo of one of its samples. The comparison below shows whether
@@ -1147,31 +938,17 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 def _box_filter(
     surface: Surface,
-    albedo: Tensor | None,
+    albedo: Float[Tensor, "S C"] | None,
     basis: Harmonics,
     dtype: torch.dtype,
     distinct: DistinctPixels | None = None,
-) -> Tensor:
+) -> Float[Tensor, "C K P"]:
     """Compute the transfer matrix of a matte surface under an open sky, without shadows.
 
     An entry for a pixel and an SH coefficient is the mean of albedo · A_l Y_lm(n)
     over the samples of the pixel (box filter). A_l is the factor of the coefficient
     in the irradiance (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the
     normal of a sample. Sums are computed in float64.
-
-    Args:
-        surface: Normals at the S samples of a view, in P pixels.
-        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
-            in a single channel.
-        basis: SH basis, in which K functions change the irradiance.
-        dtype: Data type of the result.
-        distinct: D groups of pixels that are equal in every light. Only one pixel
-            of each group (the distinct pixel) is computed. This needs flat normals
-            and an albedo of 1. None computes all pixels.
-
-    Returns:
-        Radiance per unit of each of the K coefficients, shape (C, K, P), or
-        (C, K, D) for D distinct pixels.
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
@@ -1216,7 +993,7 @@ def _are_pixels_mostly_filled(fragments: Fragments) -> bool:
 
 def _copy_from_faces(
     fragments: Fragments,
-    face_values: Tensor,
+    face_values: Float[Tensor, "G K"],
     dtype: torch.dtype,
     distinct: DistinctPixels | None,
 ) -> Tensor:
@@ -1224,19 +1001,6 @@ def _copy_from_faces(
 
     A pixel that a single face fills has the values of this face. Only the other
     pixels need sums over several faces.
-
-    Args:
-        fragments: Samples of a view that show the mesh, in P pixels. They show G
-            faces.
-        face_values: Irradiance A_l Y_lm(n) of each of the G faces from each of K
-            harmonics, shape (G, K).
-        dtype: Data type of the result.
-        distinct: D groups of pixels that are equal in every light. Only one pixel
-            of each group (the distinct pixel) is computed. None computes all
-            pixels.
-
-    Returns:
-        Transfer matrix, shape (1, K, P) or (1, K, D).
     """
     # A group is all samples of one face in a pixel.
     group_to_pixel, group_to_face, sample_count = fragments.groups
@@ -1270,16 +1034,10 @@ def _copy_from_faces(
     return transfer[None]
 
 
-def _row_starts(counts: Tensor) -> Tensor:
+def _row_starts(counts: Float[Tensor, " N"]) -> Float[Tensor, " N+1"]:
     """Compute where each row begins in a list of the entries of all rows.
 
     For example, rows with 2 and 3 entries give 0, 2, 5.
-
-    Args:
-        counts: Number of entries of each of N rows, shape (N,).
-
-    Returns:
-        First entry of each row, and the number of all entries, shape (N + 1,).
     """
     starts = counts.new_zeros(len(counts) + 1)
     torch.cumsum(counts, 0, out=starts[1:])
@@ -1287,23 +1045,15 @@ def _row_starts(counts: Tensor) -> Tensor:
 
 
 def _weighted_row_sums(
-    weights: Tensor, entry_to_value: Tensor, entry_starts: Tensor, values: Tensor
-) -> Tensor:
+    weights: Float[Tensor, " E"],
+    entry_to_value: Int[Tensor, " E"],
+    entry_starts: Float[Tensor, " N+1"],
+    values: Float[Tensor, "M K"],
+) -> Float[Tensor, "N K"]:
     """Compute N weighted sums of rows of a matrix.
 
     Each sum has several entries, and an entry is a weight and a row of the matrix.
     Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1.
-
-    Args:
-        weights: Weight of each of E entries, shape (E,).
-        entry_to_value: Index of the row of `values` of each entry, shape (E,).
-        entry_starts: Number of the first entry of each sum, and of the entry after
-            the last sum, shape (N + 1,). The first entry in `weights` has the
-            number `entry_starts[0]`.
-        values: Matrix, shape (M, K).
-
-    Returns:
-        Sums, shape (N, K).
     """
     # The weights become a sparse matrix with one row for each sum and one column for each
     # row of `values`, in the compressed format of SciPy.
@@ -1314,22 +1064,12 @@ def _weighted_row_sums(
     return torch.from_numpy(weight_matrix @ values.numpy())
 
 
-def _group_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _group_weights(
+    fragments: Fragments, albedo: Float[Tensor, "S C"] | None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Compute how much each face that a pixel shows contributes to the mean of the pixel.
 
     A group is all samples of one face in a pixel.
-
-    Args:
-        fragments: The S samples of a view that show the mesh. They form R groups.
-        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
-            in a single channel.
-
-    Returns:
-        A tuple of
-        - the index into `fragments.pixels` of each group, shape (R,);
-        - the index into `fragments.faces` of each group, shape (R,);
-        - the sum of the albedo of the group, divided by the number of samples of a
-          pixel, shape (R, C).
     """
     if albedo is not None:
         return fragments.merge(albedo)
@@ -1338,17 +1078,10 @@ def _group_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor,
     return groups.group_to_pixel, groups.group_to_seen_face, weights[:, None]
 
 
-def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
-    """Compute how much each sample contributes to the mean of its pixel.
-
-    Args:
-        fragments: The S samples of a view that show the mesh.
-        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
-            in a single channel.
-
-    Returns:
-        Albedo divided by the number of samples of a pixel, shape (S, C).
-    """
+def _sample_weights(
+    fragments: Fragments, albedo: Float[Tensor, "S C"] | None
+) -> Float[Tensor, "S C"]:
+    """Compute how much each sample contributes to the mean of its pixel."""
     if albedo is None:
         albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.sample_to_pixel), 1)
     return albedo / fragments.samples**2
@@ -1356,23 +1089,8 @@ def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
 
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
-) -> Tensor:
-    """Compute the transfer matrix of a glossy surface under an open sky, without shadows.
-
-    Args:
-        surface: Normals at the S samples of a view, in P pixels.
-        gloss: Gloss at the samples.
-        albedo: Linear albedo at the samples, shape (S, 3). Or ones of shape
-            (S, 1), if all colors share a channel.
-        basis: SH basis with K functions.
-        dtype: Data type of the result.
-
-    Returns:
-        Radiance per unit of each of the K coefficients, shape (3, K, P), or
-        (2, K, P) if all colors share a channel. The second channel is then the
-        specular reflection with the color of the light, as dielectrics have it.
-        With 3 channels, this reflection is added to each channel.
-    """
+) -> Float[Tensor, "3 K P"]:
+    """Compute the transfer matrix of a glossy surface under an open sky, without shadows."""
     fragments = surface.fragments
     color_count = albedo.shape[1]
     channel_count = 2 if color_count == 1 else color_count
@@ -1403,21 +1121,12 @@ def _glossy_box_filter(
 
 
 def _diffuse_transfer(
-    gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int
-) -> Tensor:
+    gloss: SampleGloss, normals: Float[Tensor, "S 3"], to_camera: Tensor, degree: int
+) -> Float[Tensor, "S K"]:
     """Compute the diffuse radiance of S samples with a transparent coat, for an albedo of 1.
 
     The light passes the coat on its way to the diffuse layer below, and on its way
     back.
-
-    Args:
-        gloss: Specular material (gloss) at the samples.
-        normals: Unit normals, shape (S, 3).
-        to_camera: Unit vectors to the camera, shape (S, 3) or (1, 3).
-        degree: Degree of the light, which has K coefficients.
-
-    Returns:
-        Radiance per unit of each coefficient, shape (S, K).
     """
     # Irradiance below the coat: one row for each sample, one column for each coefficient.
     irradiance = harmonics.basis(normals, degree) * gloss.factors_below_coat(degree).T
@@ -1437,36 +1146,19 @@ class _Block(NamedTuple):
     """
 
     samples: slice
-    sample_to_pixel: Tensor
-    transfer: Tensor
+    sample_to_pixel: Float[Tensor, " S"]
+    transfer: Float[Tensor, "C K B"]
 
-    def sum_by_pixel(self, rows: Tensor) -> Tensor:
-        """Add up values over the samples of each pixel.
-
-        Args:
-            rows: K values for each of the S samples of this block, shape (S, K).
-
-        Returns:
-            Sums for the B pixels of this block, shape (K, B).
-        """
+    def sum_by_pixel(self, rows: Float[Tensor, "S K"]) -> Float[Tensor, "K B"]:
+        """Add up values over the samples of each pixel."""
         zeros = rows.new_zeros(self.transfer.shape[2], rows.shape[1])
         return zeros.index_add_(0, self.sample_to_pixel, rows).T
 
 
-def _blocks(sample_to_pixel: Tensor, transfer: Tensor, size: int) -> Iterator[_Block]:
-    """Split the P pixels of a view into blocks of successive pixels.
-
-    Args:
-        sample_to_pixel: Pixel of each of the S samples of the view, ascending,
-            shape (S,).
-        transfer: Transfer matrix of the view in C channels, with one row for each
-            of K coefficients and one column for each pixel, shape (C, K, P).
-        size: Number of pixels of a block.
-
-    Yields:
-        Blocks in the order of the pixels. Writing to `_Block.transfer` fills
-        `transfer`.
-    """
+def _blocks(
+    sample_to_pixel: Float[Tensor, " S"], transfer: Float[Tensor, "C K P"], size: int
+) -> Iterator[_Block]:
+    """Split the P pixels of a view into blocks of successive pixels."""
     first_sample = 0
     for first_pixel in range(0, transfer.shape[-1], size):
         end_sample = int(torch.searchsorted(sample_to_pixel, first_pixel + size))

@@ -10,16 +10,13 @@ and the other P - D pixels are copies of distinct pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.visibility.fragments import Fragments
-
-if TYPE_CHECKING:
-    from jaxtyping import Int
 
 # Equal pixels are only searched in views with at least this many copies of pixels. With
 # fewer copies, copying the results would take more time than it saves.
@@ -45,29 +42,14 @@ class DistinctPixels:
     copies: Int[Tensor, " copies"]
     copy_to_distinct: Int[Tensor, " copies"]
 
-    def at(self, new_index: Tensor) -> DistinctPixels:
-        """Return a copy in which pixels have other indices, such as those in the image.
-
-        Args:
-            new_index: New index of each covered pixel, shape (P,).
-
-        Returns:
-            The same pixels with their new indices.
-        """
+    def at(self, new_index: Int[Tensor, " P"]) -> DistinctPixels:
+        """Return a copy in which pixels have other indices, such as those in the image."""
         distinct = new_index.index_select(0, self.distinct)
         copies = new_index.index_select(0, self.copies)
         return replace(self, distinct=distinct, copies=copies)
 
-    def write(self, values: Tensor, canvas: Tensor) -> Tensor:
-        """Write one value for each group of equal pixels to all pixels of the group.
-
-        Args:
-            values: Values of the D groups, shape (..., D).
-            canvas: Tensor to change in place, shape (..., pixels).
-
-        Returns:
-            The changed `canvas`.
-        """
+    def write(self, values: Float[Tensor, "... D"], canvas: Float[Tensor, "... pixels"]) -> Tensor:
+        """Write one value for each group of equal pixels to all pixels of the group."""
         batch_shape = values.shape[:-1]
         distinct = self.distinct.expand(*batch_shape, -1)
         copies = self.copies.expand(*batch_shape, -1)
@@ -77,15 +59,8 @@ class DistinctPixels:
         canvas.scatter_(-1, distinct, values)
         return canvas.scatter_(-1, copies, values.gather(-1, copy_to_distinct))
 
-    def add_up(self, values: Tensor) -> Tensor:
-        """Add up the values of the pixels in each of the D groups of equal pixels.
-
-        Args:
-            values: Values of the pixels, shape (..., pixels).
-
-        Returns:
-            Sums for the groups, shape (..., D).
-        """
+    def add_up(self, values: Float[Tensor, "... pixels"]) -> Float[Tensor, "... D"]:
+        """Add up the values of the pixels in each of the D groups of equal pixels."""
         batch_shape = values.shape[:-1]
         distinct = self.distinct.expand(*batch_shape, -1)
         copies = self.copies.expand(*batch_shape, -1)
@@ -94,18 +69,12 @@ class DistinctPixels:
         return sums.scatter_add_(-1, copy_to_distinct, values.gather(-1, copies))
 
 
-def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | None:
+def find_distinct_pixels(
+    fragments: Fragments, albedo: Float[Tensor, "3 P"]
+) -> DistinctPixels | None:
     """Find the covered pixels that are equal because the same face fills them.
 
     All samples of a face must reflect the same light, up to their albedo.
-
-    Args:
-        fragments: Samples of a view that show the mesh, in P pixels.
-        albedo: Albedo of each pixel, shape (3, P).
-
-    Returns:
-        Distinct pixels, as indices of covered pixels. None if there are too few
-        copies to save time, or if a copy has another albedo.
     """
     pixel_count = len(fragments.pixels)
     if pixel_count < FEWEST_COPIES:
@@ -138,15 +107,9 @@ def find_distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels
     )
 
 
-def indices_of_true(mask: Tensor) -> Tensor:
+def indices_of_true(mask: Float[Tensor, " N"]) -> Tensor:
     """Return the indices of the entries of a mask that are true.
 
     This takes a quarter of the time of `torch.nonzero`.
-
-    Args:
-        mask: Mask, shape (N,).
-
-    Returns:
-        Ascending indices, int64.
     """
     return torch.from_numpy(np.flatnonzero(mask.numpy()))

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.light.basis import LightPaths, LocalBasis
@@ -43,22 +44,12 @@ class SparseTransfer(NamedTuple):
             C = 1 or 3 color channels, shape (N, C).
     """
 
-    function: Tensor
-    pixel: Tensor
-    weight: Tensor
+    function: Int[Tensor, " N"]
+    pixel: Int[Tensor, " N"]
+    weight: Float[Tensor, "N C"]
 
     def dense(self, pixel_count: int) -> tuple[Tensor, Tensor]:
-        """Write the entries into a dense matrix, without rows that would only have zeros.
-
-        Args:
-            pixel_count: Number P of covered pixels.
-
-        Returns:
-            A tuple of
-            - the matrix with one row for each of the L basis functions that have an
-              entry, in C color channels, shape (C, L, P);
-            - the indices of these functions, ascending, shape (L,).
-        """
+        """Write the entries into a dense matrix, without rows that would only have zeros."""
         functions, row_of_entry = self.function.unique(return_inverse=True)
         # One row for each channel, which has all rows of the matrix after each other.
         zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
@@ -71,12 +62,6 @@ class SparseTransfer(NamedTuple):
 
         The dense matrix has one column for each covered pixel, and one row for each
         basis function that has a nonzero entry.
-
-        Args:
-            pixel_count: Number P of covered pixels.
-
-        Returns:
-            True if entry by entry is faster.
         """
         row_count = len(self.function.unique())
         dense_size = row_count * pixel_count
@@ -86,26 +71,16 @@ class SparseTransfer(NamedTuple):
         return entry_count < SPARSE_FRACTION * dense_size
 
     def to(self, device: torch.device | str) -> SparseTransfer:
-        """Return a copy of the entries on another device.
-
-        Args:
-            device: Device of the copy, such as "cuda".
-        """
+        """Return a copy of the entries on another device."""
         return SparseTransfer(*(field.to(device) for field in self))
 
-    def radiance(self, lights: Tensor, image: Tensor, pixel_count: int) -> Tensor:
+    def radiance(
+        self, lights: Float[Tensor, "B K 3"], image: Int[Tensor, " N"], pixel_count: int
+    ) -> Float[Tensor, "B 3 P"]:
         """Compute the radiance of B images, each with its own light.
 
         The entries must have three channels. They may belong to several views.
         The result is differentiable with respect to the lights.
-
-        Args:
-            lights: Light coefficients of each image, shape (B, K, 3).
-            image: Index of the image to which each entry belongs, shape (N,).
-            pixel_count: Number P of covered pixels of an image.
-
-        Returns:
-            Radiance, shape (B, 3, P).
         """
         # Row of the coefficient of each entry, if the coefficients of all images are
         # written below each other.
@@ -119,14 +94,7 @@ class SparseTransfer(NamedTuple):
 
 
 def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
-    """Concatenate the nonzero entries of several transfer matrices, in their order.
-
-    Args:
-        parts: Nonzero entries of each matrix.
-
-    Returns:
-        All entries, or None if there is no matrix.
-    """
+    """Concatenate the nonzero entries of several transfer matrices, in their order."""
     if not parts:
         return None
     return SparseTransfer(
@@ -137,25 +105,12 @@ def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer | Non
 
 
 def local_transfer(
-    rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis
+    rays: Rays, surface: Surface, albedo: Float[Tensor, "S C"], basis: LocalBasis
 ) -> SparseTransfer:
     """Compute the matrix from coefficients of local light to the radiance of a view.
 
     Each sample casts a ray to each source, so the edges of shadows are as sharp
     as those of the mesh.
-
-    Args:
-        rays: Rays among the faces of the mesh.
-        surface: Points, normals and gloss at the S samples of the view.
-        albedo: Linear albedo at the samples, shape (S, C), with C = 1 or 3
-            channels.
-        basis: Basis of the local light.
-
-    Returns:
-        Nonzero entries of the matrix, float64.
-
-    Raises:
-        InputError: If Embree is not installed.
     """
     fragments = surface.fragments
     paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
@@ -178,27 +133,15 @@ def local_transfer(
 
 def local_radiance(
     surface: Surface,
-    albedo: Tensor,
+    albedo: Float[Tensor, "S 3"],
     paths: LightPaths,
-    light: Tensor,
+    light: Float[Tensor, "K 3"],
     fragments: Fragments | None = None,
-) -> Tensor:
+) -> Float[Tensor, "3 P"]:
     """Compute the radiance of a view under local light.
 
     The result is differentiable with respect to the light, the albedo, the
     irradiance of the paths and the gloss.
-
-    Args:
-        surface: Points, normals and gloss at the S samples of the view.
-        albedo: Linear albedo at the samples, shape (S, 3).
-        paths: Paths from the sources to the samples that no face blocks.
-        light: Coefficients of the K basis functions, shape (K, 3).
-        fragments: The same samples, grouped into other pixels. None uses
-            `surface.fragments`.
-
-    Returns:
-        Radiance of the P pixels, times the fraction of each pixel that the mesh
-        covers, float64, shape (3, P).
     """
     fragments = fragments or surface.fragments
     # Irradiance at the end of each path: one row for each path, one column for each color.
@@ -209,18 +152,10 @@ def local_radiance(
     return zeros.index_add(0, pixel_of_path, radiance).T
 
 
-def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
-    """Compute the reflected radiance, per irradiance, at the ends of E paths of light.
-
-    Args:
-        surface: Points, normals and gloss at the S samples of the view.
-        albedo: Linear albedo at the samples, shape (S, C).
-        paths: Paths from local lights to samples.
-
-    Returns:
-        Reflected radiance per irradiance, shape (E, C). A matte sample reflects
-        its albedo.
-    """
+def _reflectance(
+    surface: Surface, albedo: Float[Tensor, "S C"], paths: LightPaths
+) -> Float[Tensor, "E C"]:
+    """Compute the reflected radiance, per irradiance, at the ends of E paths of light."""
     sample = paths.point
     path_albedo = albedo[sample]
     gloss = surface.gloss
@@ -243,26 +178,14 @@ def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
 def unoccluded(
     rays: Rays,
     basis: LocalBasis,
-    points: Tensor,
-    normals: Tensor,
-    planes: Tensor,
-    positions: Tensor | None = None,
+    points: Float[Tensor, "S 3"],
+    normals: Float[Tensor, "S 3"],
+    planes: Float[Tensor, "S 3"],
+    positions: Float[Tensor, "L 3"] | None = None,
 ) -> LightPaths:
     """Find the paths from local lights to surface points that no face of the mesh blocks.
 
     A path must also arrive above the plane of the face on which the point lies.
-
-    Args:
-        rays: Rays among the faces of the mesh.
-        basis: Basis of the local light.
-        points: Surface points in world axes, shape (S, 3).
-        normals: Unit shading normals at the points, shape (S, 3).
-        planes: Unit normals of the faces on which the points lie, shape (S, 3).
-        positions: Positions to which the L lamps have moved, shape (L, 3). None
-            uses the positions of the basis.
-
-    Returns:
-        Unblocked paths.
     """
     paths = basis.connect(points, normals, positions)
     # Whether a path is blocked has no gradient, so no operations are recorded.
@@ -324,28 +247,15 @@ class LocalLightView:
     def radiance(
         self,
         basis: LocalBasis,
-        albedo: Tensor,
-        light: Tensor,
-        positions: Tensor | None = None,
+        albedo: Float[Tensor, "S 3"],
+        light: Float[Tensor, "K 3"],
+        positions: Float[Tensor, "L 3"] | None = None,
         fragments: Fragments | None = None,
-    ) -> Tensor:
+    ) -> Float[Tensor, "3 P"]:
         """Compute the radiance of the view under local light.
 
         The result is differentiable with respect to all tensors and to the
         vertices of the view.
-
-        Args:
-            basis: Basis of the local light.
-            albedo: Linear albedo at the S samples, shape (S, 3).
-            light: RGB coefficients of the K basis functions, shape (K, 3).
-            positions: Positions to which the L lamps have moved, shape (L, 3).
-                None uses the positions of the basis.
-            fragments: The same samples, assigned to other pixels. None uses the
-                pixels of the view.
-
-        Returns:
-            Radiance of the P pixels, times the fraction of each pixel that the mesh
-            covers, in the dtype and on the device of the light, shape (3, P).
         """
         fragments = None if fragments is None else fragments.to("cpu")
         if basis.is_movable and positions is not None:
@@ -359,15 +269,6 @@ class LocalLightView:
         )
         return radiance.to(light)
 
-    def _find_paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
-        """Find the paths from a local light to the samples of the view that no face blocks.
-
-        Args:
-            basis: Basis of the local light.
-            positions: Positions of the L lamps, float64, shape (L, 3). None uses
-                the positions of the basis.
-
-        Returns:
-            Paths that no face blocks.
-        """
+    def _find_paths(self, basis: LocalBasis, positions: Float[Tensor, "L 3"] | None) -> LightPaths:
+        """Find the paths from a local light to the samples of the view that no face blocks."""
         return unoccluded(self._rays, basis, self._points, self._normals, self._planes, positions)

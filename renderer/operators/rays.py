@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.errors import InputError
@@ -75,7 +76,7 @@ class Surface:
     mesh: Mesh
     fragments: Fragments
     settings: ImageSettings
-    moved: Tensor | None = None
+    moved: Float[Tensor, "V 3"] | None = None
     given_gloss: Gloss | None = None
 
     @cached_property
@@ -161,10 +162,10 @@ class RayHits(NamedTuple):
             positive weight if the angle to the shading normal is less than 90°.
     """
 
-    pixels: Tensor
-    sample_of_ray: Tensor
-    weight: Tensor
-    face_of_ray: Tensor
+    pixels: Int[Tensor, " B"]
+    sample_of_ray: Int[Tensor, "B D"]
+    weight: Float[Tensor, "B D"]
+    face_of_ray: Int[Tensor, "B D"]
 
 
 class Rays:
@@ -185,20 +186,12 @@ class Rays:
         largest_coordinate = float(np.abs(self._mesh.vertices).max())
         return OFFSET * largest_coordinate
 
-    def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
+    def hits(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[RayHits]:
         """Cast rays in D directions from all pixels that may see another face of the mesh.
 
         Each ray starts at one sample of its pixel. The face of this sample
         blocks all light from below its plane, as if the mesh were the surface of a
         solid.
-
-        Args:
-            surface: Points and normals at the S samples of the view.
-            directions: Unit vectors that divide the sphere equally, from the
-                function `sphere`, shape (D, 3).
-
-        Yields:
-            Hits of the next block of pixels.
         """
         fragments = surface.fragments
         pixels = self._pixels_to_cast(surface)
@@ -238,11 +231,7 @@ class Rays:
 
     @cached_property
     def _scene(self) -> Any:
-        """Embree scene with all faces of the mesh, in which rays are cast.
-
-        Raises:
-            InputError: If Embree is not installed.
-        """
+        """Embree scene with all faces of the mesh, in which rays are cast."""
         try:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
@@ -280,14 +269,6 @@ class Rays:
         sample lies. Second, the shading normal differs from the normal of the face
         by an angle a, so that the plane of the face blocks the fraction
         (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
-
-        Args:
-            surface: Points and normals at the S samples of the view.
-
-        Returns:
-            Indices in `Fragments.pixels`, ascending. These are all pixels if the
-            test would need more than `MAX_COMPARISONS` comparisons and would take
-            longer than the rays.
         """
         fragments = surface.fragments
         plane_normals = surface.face_planes
@@ -309,20 +290,12 @@ class Rays:
         return sample_to_pixel[casts_rays].unique()
 
     def first_hit(
-        self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None
-    ) -> Tensor:
-        """Find the first face that each of N rays hits.
-
-        Args:
-            origins: Starts of the rays in world axes, shape (N, 3).
-            directions: Unit directions of the rays, shape (N, 3).
-            lengths: Lengths of the rays in world units, shape (N,). None for
-                infinite rays.
-
-        Returns:
-            Index in the mesh of the face that each ray hits, or `NO_FACE`,
-            int64, shape (N,).
-        """
+        self,
+        origins: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "N 3"],
+        lengths: Float[Tensor, " N"] | None = None,
+    ) -> Int[Tensor, " N"]:
+        """Find the first face that each of N rays hits."""
         rays = [origins, directions] if lengths is None else [origins, directions, lengths]
         faces = self._scene.run(
             *(np.ascontiguousarray(array.numpy(), np.float32) for array in rays)
@@ -330,41 +303,19 @@ class Rays:
         return torch.from_numpy(faces).long()
 
 
-def _dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Compute scalar products of vectors, one for each pixel and direction, with directions.
-
-    Args:
-        vectors: A vector for each pixel and direction, shape (B, D, 3).
-        directions: The same directions for all pixels, shape (D, 3).
-
-    Returns:
-        Scalar products, shape (B, D).
-    """
+def _dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> Float[Tensor, "B D"]:
+    """Compute scalar products of vectors, one for each pixel and direction, with directions."""
     return torch.einsum("bdi,di->bd", vectors, directions)
 
 
-def directions_of_pixel(samples: int) -> Tensor:
-    """Compute the directions of the rays of a pixel, which its samples divide among themselves.
-
-    Args:
-        samples: Number of samples along one side of a pixel.
-
-    Returns:
-        Unit vectors, float64, shape (D, 3).
-    """
+def directions_of_pixel(samples: int) -> Float[Tensor, "D 3"]:
+    """Compute the directions of the rays of a pixel, which its samples divide among themselves."""
     return sphere(max(DIRECTIONS, DIRECTIONS_PER_SAMPLE * samples**2))
 
 
 @cache_tensors
-def sphere(count: int) -> Tensor:
-    """Compute directions that divide the sphere equally (spherical Fibonacci lattice).
-
-    Args:
-        count: Number of directions.
-
-    Returns:
-        Unit vectors, float64, shape (count, 3).
-    """
+def sphere(count: int) -> Float[Tensor, "count 3"]:
+    """Compute directions that divide the sphere equally (spherical Fibonacci lattice)."""
     index = torch.arange(count, dtype=torch.float64)
     golden_angle = math.pi * (3 - math.sqrt(5))
     z = 1 - (2 * index + 1) / count
@@ -374,16 +325,10 @@ def sphere(count: int) -> Tensor:
 
 
 @cache_tensors
-def _shuffled(count: int) -> Tensor:
+def _shuffled(count: int) -> Int[Tensor, " count"]:
     """Return a random permutation of 0 to count - 1, which is the same in every call.
 
     The directions of `sphere` are sorted by z. In this shuffled order, each sample
     of a pixel gets ray directions from all over the sphere.
-
-    Args:
-        count: Number of ray directions.
-
-    Returns:
-        The permutation, int64, shape (count,).
     """
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))

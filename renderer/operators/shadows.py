@@ -32,6 +32,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
@@ -81,8 +82,8 @@ class Patches:
 
     pieces: Mesh
     view: Fragments
-    fractions: Tensor
-    patch_of_side: Tensor
+    fractions: Float[Tensor, "S 1"]
+    patch_of_side: Int[Tensor, "2 F"]
 
     @staticmethod
     def from_mesh(mesh: Mesh) -> "Patches":
@@ -91,12 +92,6 @@ class Patches:
         The faces are first divided into small faces, called pieces. A patch is a
         group of neighboring pieces. The fronts and the backs of the same pieces are
         different patches. The backs of a closed mesh are left out.
-
-        Args:
-            mesh: Mesh to divide.
-
-        Returns:
-            The patches of the mesh.
         """
         patch_area = float(mesh.face_areas().sum()) / PATCHES
         pieces = refine(mesh, patch_area)
@@ -139,36 +134,21 @@ class Patches:
             pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
         )
 
-    def mean(self, values: Tensor) -> Tensor:
+    def mean(self, values: Float[Tensor, "S D"]) -> Float[Tensor, "N D"]:
         """Average values over each of the N patches.
 
         A patch is a group of sides (fronts or backs) of pieces, the small faces of
         the mesh.
-
-        Args:
-            values: D values for each of S sides, in the order of the samples of `view`,
-                shape (S, D).
-
-        Returns:
-            Means that are weighted with the areas of the pieces, shape (N, D).
         """
         patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
         return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
 
-    def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
+    def weights_by_patch(
+        self, hits: RayHits, directions: Float[Tensor, "D 3"], weights: Float[Tensor, "B D"]
+    ) -> csr_matrix:
         """Add up the weights of the rays from a pixel that hit the same patch.
 
         A patch is a group of pieces, the small faces of the mesh `pieces`.
-
-        Args:
-            hits: Pieces that rays from B pixels hit in D directions, as indices
-                into `pieces`.
-            directions: Unit directions of the rays, shape (D, 3).
-            weights: Weight of each ray, shape (B, D).
-
-        Returns:
-            Sum of the weights for each pixel and each of the N patches, as a sparse
-            matrix, shape (B, N).
         """
         is_hit = hits.face_of_ray != rays.NO_FACE
         # Pixel and direction of each ray that hits a face and has a nonzero weight.
@@ -188,23 +168,17 @@ class Patches:
 
 
 def _group_sides(
-    pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell_width: float
-) -> np.ndarray:
+    pieces: Mesh,
+    piece_of_side: Int[np.ndarray, " S"],
+    facing: Float[np.ndarray, "S 1"],
+    cell_width: float,
+) -> Int[np.ndarray, " S"]:
     """Group the S sides (fronts and backs) of the faces of a mesh into patches.
 
     The faces of the mesh are small. They are called pieces. Two sides belong to
     the same patch if the centers of their pieces lie in the same cell of a cubic
     grid, if the normals are equal after each component is rounded to -1, 0 or 1,
     and if both sides are fronts or both are backs.
-
-    Args:
-        pieces: Mesh of the pieces.
-        piece_of_side: Index of the piece of each side, shape (S,).
-        facing: `FRONT` or `BACK` for each side, shape (S, 1).
-        cell_width: Width of a cell of the grid in world units.
-
-    Returns:
-        Index of the patch of each side, shape (S,).
     """
     centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
     normals = pieces.face_normals()[piece_of_side]
@@ -253,19 +227,10 @@ class Transport:
             self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
             self.has_colored_light = self._sent.shape[2] > 1
 
-    def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
-        """Compute how shadows and bounces change the transfer matrix of a view.
-
-        Args:
-            surface: Points, normals and gloss at the S samples of the view.
-            albedo: Linear albedo at the samples, shape (S, C) for C color channels.
-                C is 3 if `has_colored_light` is true, and 1 or 3 otherwise.
-
-        Returns:
-            Change of the radiance of the P pixels per unit of each of the K
-            coefficients, times the fraction of the pixel that the mesh covers,
-            float64, shape (C, K, P). None if no surface blocks light.
-        """
+    def change(
+        self, surface: Surface, albedo: Float[Tensor, "S C"]
+    ) -> Float[Tensor, "C K P"] | None:
+        """Compute how shadows and bounces change the transfer matrix of a view."""
         change = None
         fragments = surface.fragments
         gloss = surface.gloss
@@ -308,21 +273,12 @@ class Transport:
                     channel_change[:, hits.pixels] += received
         return change
 
-    def _received(self, patches: Patches, hits: RayHits, blocked: Tensor, channel: int) -> Tensor:
+    def _received(
+        self, patches: Patches, hits: RayHits, blocked: Float[Tensor, "B D"], channel: int
+    ) -> Float[Tensor, "K B"]:
         """Compute the light that B pixels receive from patches and reflect, in one color channel.
 
         A patch is a group of small faces (pieces) of the mesh.
-
-        Args:
-            patches: The N patches of the mesh.
-            hits: Pieces that rays from the pixels hit in D directions.
-            blocked: Reflected radiance of each pixel per unit radiance that arrives
-                from each direction, shape (B, D). It is 0 in directions of the sky.
-            channel: Index of the color channel.
-
-        Returns:
-            Radiance of the pixels per unit of each of the K coefficients of the
-            light, shape (K, B).
         """
         # Radiance that the patches send: one row for each patch, one column for each SH
         # coefficient.
@@ -330,40 +286,21 @@ class Transport:
         received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
         return torch.from_numpy(received).T
 
-    def _cosines(self, surface: Surface, sample_of_ray: Tensor) -> Tensor:
-        """Compute the cosine between each ray and the shading normal at its start.
-
-        Args:
-            surface: Normals at the samples of the view.
-            sample_of_ray: Sample from which the ray of each of B pixels starts
-                in each of D directions, shape (B, D).
-
-        Returns:
-            Cosines, shape (B, D).
-        """
+    def _cosines(
+        self, surface: Surface, sample_of_ray: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B D"]:
+        """Compute the cosine between each ray and the shading normal at its start."""
         normals = surface.normals[sample_of_ray]
         return torch.einsum("bdi,di->bd", normals, self._directions)
 
     def _reflect_rays(
-        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Tensor
+        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Float[Tensor, "B D"]
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular reflectance of B pixels for light along their rays.
 
         The specular reflection may be narrower than the angle between two of the
         D ray directions. The reflectances of a pixel are therefore scaled so that
         their sum over the directions is exact for uniform light.
-
-        Args:
-            gloss: Gloss at the samples of the view.
-            surface: Normals at the samples of the view.
-            sample_of_ray: Sample from which each ray starts, shape (B, D).
-
-        Returns:
-            A tuple of
-            - the reflected radiance per irradiance that is multiplied by the
-              albedo, because metals color reflections, shape (B, D);
-            - the reflected radiance per irradiance that has the color of the
-              light, shape (B, D).
         """
         to_camera = at_samples(surface.toward, sample_of_ray)
         normals = surface.normals[sample_of_ray]
@@ -379,20 +316,13 @@ class Transport:
         scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
         return colored * scale, white * scale
 
-    def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
+    def radiance(
+        self, surface: Surface, albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]
+    ) -> Float[Tensor, "3 P"]:
         """Compute how shadows and bounces change the radiance of a view under one light.
 
         The result is differentiable with respect to the light, but not with
         respect to the albedo.
-
-        Args:
-            surface: Points, normals and gloss at the S samples of the view.
-            albedo: Linear albedo at the samples, shape (S, 3).
-            light: SH coefficients, shape (K, 3).
-
-        Returns:
-            Change of the radiance of the P pixels, times the fraction of each pixel
-            that the mesh covers, in the dtype of the light, shape (3, P).
         """
         with torch.no_grad():
             change = self.change(surface, albedo.detach().cpu().double())
@@ -409,21 +339,6 @@ def build_transport(
 
     The shadows of lamps and projectors are not included. They are computed in
     `renderer.operators.lamp_paths`.
-
-    Args:
-        mesh: Mesh that casts shadows on itself.
-        settings: Settings of the image.
-        albedo_scale: Factor for the albedo of the surfaces that light bounces
-            off.
-        basis: Basis of the light.
-
-    Returns:
-        Object that computes them for a view. None if the settings turn off shadows
-        and bounces, or if the basis has no environment light.
-
-    Raises:
-        InputError: If the basis has local lights and `settings.bounces` is not
-            0.
     """
     if basis.local_lights and settings.bounces:
         raise InputError(
@@ -438,24 +353,13 @@ def build_transport(
 
 def _radiosity(
     patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
-) -> Tensor:
+) -> Float[Tensor, "N K 3"]:
     """Compute the radiance that N patches send after `settings.bounces` bounces (radiosity).
 
     After one bounce, patch i with albedo ρ_i sends the radiance
     B_i = ρ_i / π S_i, where S_i is its irradiance from the sky. After each further
     bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij is the irradiance of patch i
     per unit radiance of patch j.
-
-    Args:
-        patches: Patches of the mesh.
-        rays: Rays among the small faces (pieces) of the patches.
-        settings: Settings of the image, with the number of bounces.
-        albedo_scale: Factor for the albedo of the mesh.
-        basis: SH basis of the environment light, with K coefficients.
-
-    Returns:
-        Radiance per unit of each coefficient, shape (N, K, 3), or (N, K, 1) if
-        all patches are gray.
     """
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
     # Mean albedo: one row for each patch, one column for each color.
@@ -487,22 +391,13 @@ class _PatchLinks:
             of the N patches, as a sparse matrix, shape (M, N).
     """
 
-    from_sky: Tensor
-    receiving: Tensor
+    from_sky: Float[Tensor, "N K 1"]
+    receiving: Int[Tensor, " M"]
     factors: csr_matrix
 
     @staticmethod
     def trace(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
-        """Cast rays from all patches to find which parts of the sky and which patches they see.
-
-        Args:
-            patches: The N patches.
-            rays: Rays among the small faces (pieces) of the patches.
-            basis: SH basis of the environment light.
-
-        Returns:
-            Irradiance of the patches from the sky and from each other.
-        """
+        """Cast rays from all patches to find which parts of the sky and which patches they see."""
         surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
         # One row for each patch, one column for each SH coefficient: the irradiance from the
         # whole sky. The loop below subtracts the directions that the mesh blocks.

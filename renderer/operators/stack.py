@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -16,9 +17,6 @@ from renderer.image import as_background, background_term, clamp, encode
 from renderer.operators.apply import TransferOperator, apply_transfer, require_image_gradient
 from renderer.operators.lamp_paths import SparseTransfer, concatenate_entries
 from renderer.validation import as_tensor
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Operators of small images are copied into common tensors (a stack) until their images have
 # this many pixels in total. Larger stacks are not faster.
@@ -223,17 +221,10 @@ class TransferOperators(Sequence[TransferOperator]):
                 stacks.append(OperatorStack(operators, operator_of_image, device))
         return stacks
 
-    def _image_by_image(self, lights: Tensor, background: Tensor) -> Tensor:
-        """Render all V views in a loop over the operators.
-
-        Args:
-            lights: Lights of each view, shape (V, ..., coefficients, 3).
-            background: One background image, shape (3, size, size), or one for
-                each image, shape (V, ..., 3, size, size).
-
-        Returns:
-            Images in [0, 1], shape (V, ..., 3, size, size).
-        """
+    def _image_by_image(
+        self, lights: Float[Tensor, "V ... coefficients 3"], background: Tensor
+    ) -> Float[Tensor, "V ... 3 size size"]:
+        """Render all V views in a loop over the operators."""
         size = self._operators[0].settings.size
         if background.ndim == 3:
             background = background.expand(len(self), COLORS, size, size)
@@ -243,19 +234,12 @@ class TransferOperators(Sequence[TransferOperator]):
         return torch.stack(images_by_view)
 
     def _stacked_images(
-        self, view_lights: Tensor, background: Tensor, image_shape: Sequence[int]
-    ) -> Tensor:
-        """Render all V views, with one batched matrix product for each stack of operators.
-
-        Args:
-            view_lights: Lights of each view, shape (V, ..., coefficients, 3).
-            background: One background image, shape (3, size, size), or one for
-                each image, shape (V, ..., 3, size, size).
-            image_shape: Shape of the result, (V, ..., 3, size, size).
-
-        Returns:
-            Images in [0, 1], shape (V, ..., 3, size, size).
-        """
+        self,
+        view_lights: Float[Tensor, "V ... coefficients 3"],
+        background: Tensor,
+        image_shape: Sequence[int],
+    ) -> Float[Tensor, "V ... 3 size size"]:
+        """Render all V views, with one batched matrix product for each stack of operators."""
         encoding = self._operators[0].settings.encoding
         # One light for each image. All images of the first view come first.
         lights = view_lights.flatten(0, -3).to(self._operators[0].distinct_transfer.dtype)
@@ -288,19 +272,8 @@ class TransferOperators(Sequence[TransferOperator]):
         return ScatterLayers.apply(canvas, targets, *covered_values).view(image_shape)
 
 
-def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
-    """Broadcast background images to the shape of the rendered images.
-
-    Args:
-        images: Background images, shape (..., 3, size, size).
-        shape: Shape of the rendered images, (V, ..., 3, size, size).
-
-    Returns:
-        View of `images` with the given shape.
-
-    Raises:
-        InputError: If `images` does not broadcast to the shape.
-    """
+def _broadcast_background(images: Float[Tensor, "... 3 size size"], shape: Sequence[int]) -> Tensor:
+    """Broadcast background images to the shape of the rendered images."""
     try:
         return images.expand(shape)
     except RuntimeError as error:
@@ -321,20 +294,12 @@ class ScatterLayers(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *layers: Tensor
+        ctx: Any,
+        canvas: Float[Tensor, "N 3 size²"],
+        targets: Sequence[tuple[Rows, Tensor]],
+        *layers: Tensor,
     ) -> Tensor:
-        """Write the values of all layers into the images.
-
-        Args:
-            ctx: Context of autograd.
-            canvas: Images, changed in place, shape (N, 3, size²).
-            targets: For each layer, a slice or indices of the B images, shape
-                (B,), and the row-major indices of the P pixels, shape (P,).
-            layers: For each layer, the new values, shape (B, 3, P).
-
-        Returns:
-            The changed `canvas`.
-        """
+        """Write the values of all layers into the images."""
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, layers, strict=True):
             # `scatter_` takes half the time of `index_copy_` on a CPU.
@@ -346,17 +311,8 @@ class ScatterLayers(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Compute the gradients with respect to the new values of the overwritten pixels.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the images, shape (N, 3, size²).
-
-        Returns:
-            None for the canvas and for the targets, and for each layer, the
-            gradient with respect to its values, shape (B, 3, P).
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "N 3 size²"]) -> tuple[Tensor | None, ...]:
+        """Compute the gradients with respect to the new values of the overwritten pixels."""
         gradients = []
         for rows, pixels in ctx.targets:
             # Merge the axes of images and colors, because torch selects from two axes ten
@@ -389,18 +345,10 @@ class OperatorStack:
     def __init__(
         self,
         operators: Sequence[TransferOperator],
-        shown: Tensor,
+        shown: Int[Tensor, " N"],
         device: torch.device | str = "cpu",
     ):
-        """Copy operators into common tensors.
-
-        Args:
-            operators: The O operators, on the CPU. All operators must have the
-                same dtype and basis of light.
-            shown: Index of the operator that each image shows, int64,
-                shape (N,).
-            device: Device of the stack.
-        """
+        """Copy operators into common tensors."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
         # If the number of coefficients is odd, append coefficient 0 once more. Its additional
@@ -443,21 +391,15 @@ class OperatorStack:
         self.coverage = coverage.to(device)
         self._coefficients = coefficients.to(device)
 
-    def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
+    def radiance(
+        self, lights: Float[Tensor, "A coefficients 3"], images: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A 3 P"]:
         """Compute the linear radiance of A of the N images, differentiable in their lights.
 
         A batched product needs the same number of lights for each operator. The
         lights are therefore written to a table with one row for each operator that
         the images show, and one column (slot) for each of its images. Slots stay
         empty if an operator has fewer images than another operator.
-
-        Args:
-            lights: Light coefficients of each of the A images,
-                shape (A, coefficients, 3).
-            images: Indices of the A images, int64, shape (A,), on the CPU.
-
-        Returns:
-            Radiance of the P pixels, shape (A, 3, P).
         """
         operator_of_image = self.shown[images]
         operators, image_to_row, images_per_row = torch.unique(
@@ -490,22 +432,9 @@ class OperatorStack:
         return radiance + entries.radiance(lights, image_of_entry, len(self.pixels))
 
     def _select_entries(
-        self, sparse: SparseTransfer, operator_of_image: Tensor
+        self, sparse: SparseTransfer, operator_of_image: Int[Tensor, " A"]
     ) -> tuple[SparseTransfer, Tensor]:
-        """Select the nonzero matrix entries of the operators that A images show.
-
-        Args:
-            sparse: Nonzero entries of all operators of the stack.
-            operator_of_image: Index of the operator of each image, int64,
-                shape (A,), on the CPU.
-
-        Returns:
-            A tuple of
-            - E entries, those of the first image first. The entries of an
-              operator are repeated for each image that shows it;
-            - the index of the image of each entry, from 0 to A - 1, int64,
-              shape (E,).
-        """
+        """Select the nonzero matrix entries of the operators that A images show."""
         first_in_stack = self._first_entry[operator_of_image]
         entry_count = self._first_entry[operator_of_image + 1] - first_in_stack
         image_of_entry = torch.arange(len(operator_of_image)).repeat_interleave(entry_count)
@@ -520,17 +449,12 @@ class OperatorStack:
         return selected, image_of_entry
 
 
-def _rank_in_row(item_to_row: Tensor, items_per_row: Tensor) -> Tensor:
+def _rank_in_row(
+    item_to_row: Int[Tensor, " A"], items_per_row: Int[Tensor, " rows"]
+) -> Int[Tensor, " A"]:
     """For each of A items, count the earlier items in the same row of a table.
 
     For example, items in the rows 1, 0, 1 have the ranks 0, 0, 1.
-
-    Args:
-        item_to_row: Row of each item, int64, shape (A,).
-        items_per_row: Number of items of each row, int64, shape (rows,).
-
-    Returns:
-        Rank of each item in its row, from 0, int64, shape (A,).
     """
     # Sort the items by row. The items of a row keep their order.
     sorted_items = item_to_row.argsort(stable=True)

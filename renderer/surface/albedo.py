@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial, reduce
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.errors import require_bounded
@@ -45,22 +46,11 @@ class Texture:
     look_up: Callable[[Tensor], Tensor]
 
     @staticmethod
-    def from_values(values: Tensor) -> "Texture":
+    def from_values(values: Float[Tensor, "H W C"]) -> "Texture":
         """Create a texture from a tensor of linear values.
 
         The values that `look_up` returns are differentiable with respect to the
         tensor.
-
-        Args:
-            values: Linear values of the texels, floating point,
-                shape (H, W, C) for H rows, W columns and C channels.
-
-        Returns:
-            Texture with H rows and W columns.
-
-        Raises:
-            InputError: If `values` is not floating point, or has NaN or
-                infinite values.
         """
         require_bounded(texture=values)
         height = values.shape[0]
@@ -73,27 +63,12 @@ class Texture:
 
 def surface_albedo(
     mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
-) -> Tensor:
+) -> Float[Tensor, "S 3"]:
     """Compute the albedo of a mesh at the samples of a view that show the mesh.
 
     The albedo is the interpolated color of the face corners times the interpolated
     texture. Colors and texels are decoded to linear values before they are
     interpolated.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: The S samples of the view that show the mesh.
-        encoding: Encoding of the colors and textures of the mesh, "linear" or
-            "srgb".
-        textures: Textures of linear albedo that replace those of the mesh, shape
-            (H, W, 3) each. The result is differentiable with respect to them.
-            None uses the textures of the mesh.
-
-    Returns:
-        Linear albedo at the samples, float64, shape (S, 3).
-
-    Raises:
-        InputError: If a color or texture has NaN or infinite values.
     """
     colors = _interpolated_colors(mesh, fragments, encoding)
     textures_to_sample: list[Texture] = []
@@ -106,19 +81,10 @@ def surface_albedo(
     return colors * sample_textures(textures_to_sample, mesh, fragments).T
 
 
-def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Look up the textures of a mesh at the samples of a view, with interpolation.
-
-    Args:
-        textures: Textures with C channels. For each face, `mesh.texture_ids` has
-            the index of its texture in this sequence.
-        mesh: Mesh that the view shows. It provides the texture coordinates.
-        fragments: The S samples of the view that show the mesh.
-
-    Returns:
-        Linear values at the samples, shape (C, S). Samples of faces without a
-        texture have the value 1.
-    """
+def sample_textures(
+    textures: Sequence[Texture], mesh: Mesh, fragments: Fragments
+) -> Float[Tensor, "C S"]:
+    """Look up the textures of a mesh at the samples of a view, with interpolation."""
     sample_uvs = _interpolated_uvs(mesh, fragments)
     texture_of_face = _texture_of_seen_face(mesh, fragments)
     # All faces of most meshes have the same texture. Then it is looked up at all samples.
@@ -144,19 +110,12 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
     return values.index_copy(1, textured_samples, textured_values)
 
 
-def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
+def interpolate_texture(texture: Texture, uvs: Float[Tensor, "2 N"]) -> Float[Tensor, "C N"]:
     """Interpolate a texture bilinearly at N points.
 
     The texture coordinates are u (to the right) and v (up). The texture covers
     [0, 1] in both and repeats beyond. The center of column i is at
     u = (i + 0.5) / width.
-
-    Args:
-        texture: Texture with C channels.
-        uvs: Texture coordinates u and v of the points, shape (2, N).
-
-    Returns:
-        Interpolated linear values, shape (C, N).
     """
     values_by_block = []
     # The points are processed in blocks to limit the memory.
@@ -170,19 +129,8 @@ def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
     return torch.cat(values_by_block, dim=1)
 
 
-def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Find the four texels around each of N points, and their weights for interpolation.
-
-    Args:
-        texture: Texture in which the points lie.
-        uvs: Texture coordinates u and v of the points, shape (2, N).
-
-    Returns:
-        Four pairs: for the upper left, upper right, lower left and lower right
-        texel of each point. A pair has the bilinear weights of these texels,
-        shape (N,), and their indices row · width + column, shape (N,). The four
-        weights of a point add up to 1.
-    """
+def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
+    """Find the four texels around each of N points, and their weights for interpolation."""
     u, v = uvs
     # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)
@@ -195,21 +143,10 @@ def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Ten
     return texels
 
 
-def _neighbors(coordinate: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
+def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor, Tensor]]:
     """Find the two columns of texels, or the two rows, between which each of N points lies.
 
     Columns and rows are both called lines.
-
-    Args:
-        coordinate: Coordinate of the points in the direction in which the lines
-            are counted, shape (N,). The texture is [0, 1] and repeats beyond.
-        count: Number of lines.
-
-    Returns:
-        Two pairs, the first for the line before each point and the second for
-        the line after it. A pair has the index of the line, a whole
-        floating-point number in [0, count), and its weight for linear
-        interpolation, shape (N,) each.
     """
     # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5
@@ -221,30 +158,13 @@ def _neighbors(coordinate: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
     ]
 
 
-def _modulo(index: Tensor, count: int) -> Tensor:
-    """Compute `index` modulo `count`, a number in [0, count).
-
-    Args:
-        index: Whole floating-point numbers, which may be negative, shape (N,).
-        count: Divisor.
-
-    Returns:
-        Remainders, shape (N,).
-    """
+def _modulo(index: Float[Tensor, " N"], count: int) -> Float[Tensor, " N"]:
+    """Compute `index` modulo `count`, a number in [0, count)."""
     return index - count * (index / count).floor()
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
-    """Convert the 8-bit textures of a mesh to `Texture` objects, which return linear values.
-
-    Args:
-        mesh: Mesh with textures of eight bits per channel.
-        encoding: Encoding of the texels, "linear" or "srgb".
-        like: Tensor whose device and dtype the linear values get.
-
-    Returns:
-        Textures with three channels of linear albedo.
-    """
+    """Convert the 8-bit textures of a mesh to `Texture` objects, which return linear values."""
     # A channel has only 256 possible values. A table with the linear value of each saves
     # decoding every texel.
     eight_bit_values = torch.arange(256, dtype=torch.float64) / 255
@@ -258,41 +178,22 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     return textures
 
 
-def _look_up_packed(packed_texels: Tensor, linear_values: Tensor, texels: Tensor) -> Tensor:
-    """Look up the linear values of N texels of a texture with one integer per texel.
-
-    Args:
-        packed_texels: All texels of a texture with H rows and W columns, row by
-            row, int32, shape (H · W,). Bits 0 to 7 of a texel are red, 8 to 15
-            green and 16 to 23 blue.
-        linear_values: Linear value for each of the 256 values of a channel,
-            shape (256,).
-        texels: Indices of the texels to look up, shape (N,).
-
-    Returns:
-        Linear red, green and blue, shape (3, N).
-    """
+def _look_up_packed(
+    packed_texels: Int[Tensor, " _"],
+    linear_values: Float[Tensor, " 256"],
+    texels: Int[Tensor, " N"],
+) -> Float[Tensor, "3 N"]:
+    """Look up the linear values of N texels of a texture with one integer per texel."""
     first_bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=packed_texels.device)
     # Values from 0 to 255: one row for each color, one column for each texel.
     eight_bit_values = (packed_texels.index_select(0, texels) >> first_bits) & 255
     return linear_values.index_select(0, eight_bit_values.long().flatten()).view(3, -1)
 
 
-def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
+def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Tensor, "S 3"]:
     """Look up the albedo at the samples of a mesh with one albedo per face.
 
     The result is differentiable with respect to `albedo`.
-
-    Args:
-        albedo: Linear albedo of the F faces of the mesh, shape (F, 3).
-        fragments: The S samples of the view that show the mesh.
-
-    Returns:
-        Linear albedo at the samples, shape (S, 3).
-
-    Raises:
-        InputError: If `albedo` is not floating point, or has NaN or infinite
-            values.
     """
     require_bounded(albedo=albedo)
     seen_faces = fragments.faces
@@ -304,32 +205,15 @@ def paint_faces(
     fragments: Fragments,
     encoding: str,
     albedo_scale: float,
-    added: Tensor,
-    hue: Tensor | None = None,
-) -> Tensor:
+    added: Float[Tensor, "F 3"],
+    hue: Float[Tensor, " F"] | None = None,
+) -> Float[Tensor, "S 3"]:
     """Compute the albedo at samples after a change of the hue and color of each face.
 
     The albedo is scaled. Then the hue is rotated and a color is added at corners
     and texels (`changed_albedo`), before they are interpolated. The changed albedo
     can therefore be stored in image files (see `renderer.surface.texture_bake`).
     The result is differentiable with respect to `added` and `hue`.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: The S samples of the view that show the mesh.
-        encoding: Encoding of the colors and textures of the mesh, "linear" or
-            "srgb".
-        albedo_scale: Factor for the albedo of the mesh.
-        added: Linear color that is added to each face, shape (F, 3).
-        hue: Hue rotation of each face in degrees, shape (F,). None leaves the
-            hues unchanged.
-
-    Returns:
-        Linear albedo at the samples in the dtype of `added`, shape (S, 3).
-
-    Raises:
-        InputError: If `added` or a color of the mesh has NaN or infinite
-            values.
     """
     sample_to_seen_face = fragments.sample_to_seen_face
     added_at_samples = face_albedo(added, fragments)
@@ -379,22 +263,13 @@ def paint_faces(
 
 
 def _interpolate_painted_texels(
-    texture: Texture, uvs: Tensor, colors: Tensor, hue: Tensor | None, added: Tensor
-) -> Tensor:
-    """Interpolate a texture at N points after a change of the hue and color of its texels.
-
-    Args:
-        texture: Texture with three channels.
-        uvs: Texture coordinates u and v of the points, shape (2, N).
-        colors: Linear color that multiplies the four texels around each point,
-            shape (N, 3).
-        hue: Hue rotation of these texels in degrees, shape (N,). None leaves
-            the hue unchanged.
-        added: Linear color that is added to these texels, shape (N, 3).
-
-    Returns:
-        Linear albedo of the points, shape (N, 3).
-    """
+    texture: Texture,
+    uvs: Float[Tensor, "2 N"],
+    colors: Float[Tensor, "N 3"],
+    hue: Float[Tensor, " N"] | None,
+    added: Float[Tensor, "N 3"],
+) -> Float[Tensor, "N 3"]:
+    """Interpolate a texture at N points after a change of the hue and color of its texels."""
     weighted_texels = []
     for weight, texel in _surrounding_texels(texture, uvs):
         texel_albedo = colors * texture.look_up(texel).T
@@ -403,21 +278,14 @@ def _interpolate_painted_texels(
     return reduce(torch.add, weighted_texels)
 
 
-def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
+def changed_albedo(
+    albedo: Float[Tensor, "... 3"], hue: Float[Tensor, " ..."] | None, added: Float[Tensor, "... 3"]
+) -> Float[Tensor, "... 3"]:
     """Rotate the hue of an albedo, add a color, and clamp the sum.
 
     The hue is rotated about the gray axis of RGB space, which preserves the mean
     of the three channels (Haeberli 1993). A channel is clamped to [0, 1], or to
     [0, albedo] if its albedo is above 1.
-
-    Args:
-        albedo: Linear albedo, shape (..., 3).
-        hue: Rotation angle in degrees, shape (...). None leaves the hue
-            unchanged.
-        added: Linear color to add, shape (..., 3).
-
-    Returns:
-        Changed linear albedo, shape (..., 3).
     """
     rotated = albedo
     if hue is not None:
@@ -430,21 +298,8 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
     return clamp(rotated + added, albedo.clamp(min=1))
 
 
-def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | None:
-    """Return the albedo of the faces that a view shows if all of them have the same albedo.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: Samples of the view that show the mesh, with their faces.
-        encoding: Encoding of the colors of the mesh, "linear" or "srgb".
-
-    Returns:
-        Linear albedo, float64, shape (3,). None if the mesh has a texture, if
-        two corners of these faces differ in color, or if the view shows no face.
-
-    Raises:
-        InputError: If a color has NaN or infinite values.
-    """
+def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, " 3"] | None:
+    """Return the albedo of the faces that a view shows if all of them have the same albedo."""
     if mesh.packed_textures:
         return None
     # One row for each corner of the seen faces, one column for each channel.
@@ -457,17 +312,8 @@ def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | N
     return first_albedo
 
 
-def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """Interpolate the linear corner colors of a mesh at the S covered samples of a view.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: Samples of the view that show the mesh.
-        encoding: Encoding of the colors, "linear" or "srgb".
-
-    Returns:
-        Linear colors without textures, float64, shape (S, 3).
-    """
+def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, "S 3"]:
+    """Interpolate the linear corner colors of a mesh at the S covered samples of a view."""
     corner_albedo = _corner_albedo(mesh, fragments, encoding)
     if not mesh.one_color_per_face:
         return fragments.interpolate(corner_albedo)
@@ -479,21 +325,8 @@ def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Ten
     return face_colors.gather(1, sample_to_seen_face.expand(3, -1)).T
 
 
-def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """Decode the corner colors of the G faces that a view shows.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: Samples of the view that show the mesh.
-        encoding: Encoding of the colors, "linear" or "srgb".
-
-    Returns:
-        Linear colors of three corners with three channels, float64,
-        shape (G, 3, 3).
-
-    Raises:
-        InputError: If a color has NaN or infinite values.
-    """
+def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, "G 3 3"]:
+    """Decode the corner colors of the G faces that a view shows."""
     seen_faces = fragments.faces.cpu().numpy()
     corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0))
     corner_colors = corner_colors.to(fragments.coverage)
@@ -501,48 +334,23 @@ def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     return decode(corner_colors, encoding)
 
 
-def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Interpolate the texture coordinates of a mesh at the S covered samples of a view.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: Samples of the view that show the mesh.
-
-    Returns:
-        Texture coordinates u and v, float64, shape (2, S).
-    """
+def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Float[Tensor, "2 S"]:
+    """Interpolate the texture coordinates of a mesh at the S covered samples of a view."""
     seen_faces = fragments.faces.cpu().numpy()
     # Axes: seen face, corner, texture coordinate (u or v).
     corner_uvs = torch.from_numpy(mesh.corner_uvs.take(seen_faces, axis=0))
     return fragments.interpolate(corner_uvs.to(fragments.coverage)).T
 
 
-def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Return the index of the texture of each of the G faces that a view shows.
-
-    Args:
-        mesh: Mesh that the view shows.
-        fragments: Samples of the view that show the mesh.
-
-    Returns:
-        Index of the texture, or `NO_TEXTURE`, shape (G,).
-    """
+def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Int[Tensor, " G"]:
+    """Return the index of the texture of each of the G faces that a view shows."""
     seen_faces = fragments.faces.cpu().numpy()
     texture_ids = torch.from_numpy(mesh.texture_ids.take(seen_faces))
     return texture_ids.to(fragments.sample_to_seen_face.device)
 
 
-def _at_samples(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up the values of the face that each sample shows.
-
-    Args:
-        face_values: D values for each of the G faces that the view shows,
-            shape (G, D).
-        fragments: The S samples of the view that show the mesh.
-
-    Returns:
-        Values at the samples, shape (S, D).
-    """
+def _at_samples(face_values: Float[Tensor, "G D"], fragments: Fragments) -> Float[Tensor, "S D"]:
+    """Look up the values of the face that each sample shows."""
     sample_to_seen_face = fragments.sample_to_seen_face
     # Selecting columns of the transposed matrix takes half the time of selecting rows.
     return face_values.T.contiguous().index_select(1, sample_to_seen_face).T

@@ -34,10 +34,11 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import InputError, require_bounded
@@ -57,9 +58,6 @@ from renderer.surface.lobes import (
 from renderer.validation import as_tensor, require_flag
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Attributes of `Gloss`, in the order of the columns of the array `Mesh.gloss`.
 _NAMES = ("roughness", "metallic", "specular_factor")
@@ -173,40 +171,19 @@ class SampleGloss(NamedTuple):
         return self.metallic.requires_grad or bool(self.metallic.any())
 
     def at(self, samples: Tensor | slice) -> SampleGloss:
-        """Return the gloss of some of the samples.
-
-        Args:
-            samples: Indices of the samples, any shape, or a slice.
-        """
+        """Return the gloss of some of the samples."""
         return SampleGloss(*(at_samples(values, samples) for values in self))
 
     def to(self, like: Tensor) -> SampleGloss:
-        """Return a copy in the dtype and on the device of another tensor.
-
-        Args:
-            like: Tensor with the dtype and the device.
-        """
+        """Return a copy in the dtype and on the device of another tensor."""
         return SampleGloss(*(values.to(like) for values in self))
 
-    def lobes(self, cosine: Tensor, degree: int) -> tuple[Tensor | None, Tensor]:
+    def lobes(self, cosine: Float[Tensor, " S"], degree: int) -> tuple[Tensor | None, Tensor]:
         """Compute the specular lobes of S samples for environment light.
 
         A lobe is the specular reflectance as a function of the direction to the
         light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, the values
         of `renderer.surface.lobes.lobe_functions`.
-
-        Args:
-            cosine: Cosine n·v between the normal n and the direction v to the
-                camera, shape (S,).
-            degree: Degree of the light.
-
-        Returns:
-            A tuple of
-
-            - the lobe of the reflection that is multiplied by the albedo,
-              shape (M, S), or None if no sample is metallic;
-            - the lobe of the reflection with the color of the light,
-              shape (M, S).
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
         dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
@@ -219,22 +196,9 @@ class SampleGloss(NamedTuple):
         return self.metallic * schlick, white + self.metallic * edge
 
     def reflect_uniform_light(
-        self, normals: Tensor, toward: Tensor
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"]
     ) -> tuple[Tensor | None, Tensor]:
-        """Compute the specular radiance of S samples under uniform light of irradiance 1.
-
-        Args:
-            normals: Unit normals, shape (S, 3).
-            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
-                samples share one vector.
-
-        Returns:
-            A tuple of
-
-            - the radiance that is multiplied by the albedo, shape (S,), or None
-              if no sample is metallic;
-            - the radiance with the color of the light, shape (S,).
-        """
+        """Compute the specular radiance of S samples under uniform light of irradiance 1."""
         cosine = (normals * toward).sum(1).clamp(0, 1)
         colored, white = self.lobes(cosine, degree=0)
         white_radiance = white[0] * _UNIFORM_COEFFICIENT
@@ -249,17 +213,10 @@ class SampleGloss(NamedTuple):
         1 - s E(μ). E(μ) is the fraction that a coat with the specular factor s = 1
         reflects (`coat_albedo`). The result is differentiable with respect to the
         cosine and to the gloss.
-
-        Args:
-            cosine: Cosine μ between the normal and the beam, any shape. Negative
-                cosines count as 0.
-
-        Returns:
-            Fractions in [0, 1], in the shape of `cosine`.
         """
         return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
-    def factors_below_coat(self, degree: int) -> Tensor:
+    def factors_below_coat(self, degree: int) -> Float[Tensor, "K S"]:
         """Compute the factor of each SH coefficient in the irradiance below the dielectric coat.
 
         The irradiance is Σ_lm (A_l - s B_l) U_lm Y_lm(n), with the coefficients
@@ -267,13 +224,6 @@ class SampleGloss(NamedTuple):
         factor s. A_l is the factor without a coat (`lambertian_factors`), and
         B_l the factor of the light that the coat reflects (`coat_irradiance_factors`). The
         result is differentiable with respect to the gloss.
-
-        Args:
-            degree: Degree of the light, at most `harmonics.DIFFUSE_DEGREE`.
-
-        Returns:
-            Factor A_l - s B_l of each of the K coefficients, shape (K, S), or
-            (K, 1) if all samples have the same gloss.
         """
         # Factors B_l of the light that the coat reflects: one row for each degree l, one column
         # for each sample.
@@ -284,7 +234,9 @@ class SampleGloss(NamedTuple):
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 
-    def diffuse_factor(self, normals: Tensor, toward: Tensor) -> Tensor:
+    def diffuse_factor(
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"]
+    ) -> Float[Tensor, " S"]:
         """Compute the factor by which metal and coat reduce the diffuse radiance at S samples.
 
         The diffuse radiance is this factor times the albedo times the irradiance
@@ -293,45 +245,19 @@ class SampleGloss(NamedTuple):
         light that the coat reflects (`coat_albedo`), and E_avg its mean
         (`coat_mean`). The result is differentiable with respect to the vectors and
         the gloss.
-
-        Args:
-            normals: Unit normals n, shape (S, 3).
-            toward: Unit vectors v to the camera, shape (S, 3), or (1, 3) if all
-                samples share one vector.
-
-        Returns:
-            Factors, shape (S,).
         """
         transmittance = self.coat_transmittance((normals * toward).sum(1))
         mean_transmittance = 1 - self.specular_factor * coat_mean(self.roughness)
         return (1 - self.metallic) * transmittance / mean_transmittance
 
     def specular_transfer(
-        self, normals: Tensor, toward: Tensor, degree: int
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"], degree: int
     ) -> tuple[Tensor | None, Tensor, ViewFrame]:
         """Compute the specular radiance of S samples from each spherical harmonic.
 
         The environment light has K = (degree + 1)² SH coefficients in axes that
         face the camera. The result is differentiable with respect to the vectors
         and the gloss.
-
-        Args:
-            normals: Unit normals, shape (S, 3).
-            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
-                samples share one vector.
-            degree: Degree of the light.
-
-        Returns:
-            A tuple of
-
-            - the radiance of metals per unit of each coefficient, which must be
-              multiplied by the albedo, shape (K, S), or None if no sample is
-              metallic;
-            - all other specular radiance per unit of each coefficient,
-              shape (K, S);
-            - the axes that face the camera. `ViewFrame.to_world` converts the
-              first two results to world axes, and `ViewFrame.from_world` converts
-              a light to the axes that face the camera.
         """
         frame = ViewFrame.from_directions(normals, toward)
         colored_lobe, white_lobe = self.lobes(frame.cosine, degree)
@@ -339,24 +265,14 @@ class SampleGloss(NamedTuple):
         return colored_transfer, frame.harmonics(white_lobe), frame
 
     def reflect_beams(
-        self, normals: Tensor, toward: Tensor, directions: Tensor
+        self,
+        normals: Float[Tensor, "... 3"],
+        toward: Float[Tensor, "... 3"],
+        directions: Float[Tensor, "... 3"],
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular radiance per irradiance for light from single directions.
 
         The result is differentiable with respect to the vectors and the gloss.
-
-        Args:
-            normals: Unit normals, shape (..., 3).
-            toward: Unit vectors to the camera, shape (..., 3).
-            directions: Unit vectors to the light, shape (..., 3).
-
-        Returns:
-            A tuple of
-
-            - the radiance per irradiance that is multiplied by the albedo,
-              shape (...);
-            - the radiance per irradiance with the color of the light,
-              shape (...).
         """
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
         white = self.metallic * edge + (1 - self.metallic) * self.specular_factor * dielectric
@@ -368,12 +284,6 @@ def smallest_roughness(mesh: Mesh) -> float:
 
     In each texture of the roughness, the 1% of the texels with the smallest
     roughness do not count.
-
-    Args:
-        mesh: Mesh whose faces are examined.
-
-    Returns:
-        Roughness in [0, 1]. It is 1 for a matte mesh.
     """
     if mesh.gloss is None:
         return 1.0
@@ -390,18 +300,8 @@ def smallest_roughness(mesh: Mesh) -> float:
     return float(roughness_of_face.min(initial=1, where=has_gloss))
 
 
-def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
-    """Select the values of some samples. A single value counts for all samples.
-
-    Args:
-        values: Values of all S samples, shape (S, ...), or one value that all
-            samples share, shape (1, ...).
-        samples: Indices of samples, any shape, or a slice.
-
-    Returns:
-        Values of the selected samples. A shared value is returned as it is, in
-        the shape (1, ...).
-    """
+def at_samples(values: Tensor, samples: Tensor | slice) -> Float[Tensor, "1 ..."]:
+    """Select the values of some samples. A single value counts for all samples."""
     return values if len(values) == 1 else values[samples]
 
 
@@ -412,19 +312,6 @@ def sample_gloss(
 
     The result is differentiable with respect to `gloss`. A warning is issued if
     a roughness is raised to its minimum 0.2.
-
-    Args:
-        mesh: Mesh that the view shows, with F faces.
-        fragments: The S samples of the view that show the mesh.
-        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
-            of the mesh.
-
-    Returns:
-        Gloss at the samples, float64, or None for a matte surface.
-
-    Raises:
-        InputError: If a value of the gloss is NaN, not in [0, 1], or has a shape
-            other than (), (1,) or (F,).
     """
     # A given gloss uses the textures of the mesh only if its field `textured` is True.
     gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
@@ -453,16 +340,7 @@ def sample_gloss(
 
 
 def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
-    """Convert the array `Mesh.gloss` to a `Gloss`.
-
-    Args:
-        mesh: Mesh with F faces. `Mesh.gloss` has one row for each face, with its
-            roughness, metallic and specular factor. It is None for a matte mesh.
-
-    Returns:
-        Gloss with tensors of shape (F,), or (1,) if all faces have the same
-        gloss. None for a matte mesh.
-    """
+    """Convert the array `Mesh.gloss` to a `Gloss`."""
     if mesh.gloss is None:
         return None
     has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
@@ -472,36 +350,17 @@ def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
 
 
 def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up the value of the face that each sample shows.
-
-    Args:
-        face_values: A value for each of the F faces of the mesh, shape (F,), or
-            one value that all faces share, shape (1,).
-        fragments: The S samples of the view that show the mesh.
-
-    Returns:
-        Values at the samples, shape (S,). A shared value is returned as it is,
-        shape (1,).
-    """
+    """Look up the value of the face that each sample shows."""
     if len(face_values) == 1:
         return face_values
     seen_face_values = face_values.index_select(0, fragments.faces)
     return seen_face_values.index_select(0, fragments.sample_to_seen_face)
 
 
-def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
+def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
     """Compute unit vectors from the S samples of a view to the camera.
 
     The vectors are differentiable with respect to the vertices.
-
-    Args:
-        fragments: Samples of the view that show the mesh.
-        vertices: Vertex positions in world axes, shape (V, 3).
-
-    Returns:
-        Unit vectors in world axes, in the dtype of `vertices`, shape (S, 3).
-        Without perspective, all samples share one vector, and the shape is
-        (1, 3).
     """
     eye = fragments.eye.to(vertices)
     # `eye` is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with

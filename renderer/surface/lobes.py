@@ -31,6 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from renderer.light.harmonics import bands, cache_tensors, evaluate_harmonics, rotate
@@ -386,22 +387,12 @@ def _axis_permutation(degree: int) -> Tensor:
     return rotate(identity, permutation)
 
 
-def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:
+def lobe_functions(
+    cosine: Float[Tensor, " S"], roughness: Float[Tensor, " S"], degree: int, terms: Sequence[int]
+) -> Float[Tensor, "T M S"]:
     """Evaluate the lobe functions π c_lm (see the module) at the S samples.
 
     The result is differentiable with respect to both tensors.
-
-    Args:
-        cosine: Cosine n·v = cos θ in [0, 1] at the S samples, shape (S,).
-        roughness: Roughness r in [MIN_ROUGHNESS, 1], shape (S,), or (1,) if all
-            samples share one roughness.
-        degree: Largest degree l of the spherical harmonics.
-        terms: T Fresnel terms of the reflectance among SCHLICK, EDGE and
-            DIELECTRIC.
-
-    Returns:
-        Values of the M = (degree + 1) (degree + 2) / 2 functions with
-        0 ≤ m ≤ l, in ascending order of l and then of m, shape (T, M, S).
     """
     function_count = (degree + 1) * (degree + 2) // 2
     table = _table_like(max(degree, COMMON_DEGREE), cosine.dtype, cosine.device)
@@ -552,7 +543,7 @@ def _table_like(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor
 
 
 @cache_tensors
-def _table(degree: int) -> Tensor:
+def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     """Interpolate the lobe functions by Chebyshev polynomials T in the roughness and the cosine.
 
     A lobe function is Σ_k Σ_p a_kp T_k(y) T_p(x). The argument y stands for the
@@ -560,11 +551,6 @@ def _table(degree: int) -> Tensor:
     `_cosine_to_argument`). When a mirror turns by θ, the reflected light turns by
     2 θ. A harmonic of degree l of this light therefore needs polynomials up to
     degree 2 l in cos θ.
-
-    Returns:
-        Coefficients a_kp, float64, for each of the three Fresnel terms and of
-        the M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l,
-        shape (3, M, ROUGHNESS_POLYNOMIALS, 2 degree + EXTRA_POLYNOMIALS).
     """
     cosine_count = 2 * degree + EXTRA_POLYNOMIALS
     roughnesses = _argument_to_roughness(_chebyshev_nodes(ROUGHNESS_POLYNOMIALS))
@@ -584,7 +570,9 @@ def _table(degree: int) -> Tensor:
     ).contiguous()
 
 
-def lobe_integrals(cosine: Tensor, roughness: Tensor, degree: int) -> Tensor:
+def lobe_integrals(
+    cosine: Float[Tensor, " N"], roughness: Float[Tensor, " R"], degree: int
+) -> Float[Tensor, "3 M R N"]:
     """Integrate π times a specular lobe times each spherical harmonic over the sphere.
 
     In sample axes, a half vector with the polar angle β and the azimuth φ reflects
@@ -594,16 +582,6 @@ def lobe_integrals(cosine: Tensor, roughness: Tensor, degree: int) -> Tensor:
     lobe times cos mφ. The azimuths end where the light is on the horizon. The
     substitution tan φ/2 = AZIMUTH_SCALE tan ψ draws their nodes to φ = 0, where
     the lobe is high.
-
-    Args:
-        cosine: N cosines n·v in (0, 1), float64, shape (N,).
-        roughness: R values of the roughness, float64, shape (R,).
-        degree: Largest degree l of the spherical harmonics.
-
-    Returns:
-        Integrals π c_lm s_m (see the module) for each of the three Fresnel terms
-        and each of the M = (degree + 1) (degree + 2) / 2 pairs (l, m) with
-        0 ≤ m ≤ l, shape (3, M, R, N).
     """
     polar_nodes, polar_weights = _gauss_legendre(POLAR_NODE_COUNT)
     azimuth_nodes, azimuth_weights = _gauss_legendre(AZIMUTH_NODE_COUNT)

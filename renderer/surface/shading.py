@@ -29,10 +29,11 @@ the light, (degree + 1)².
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -43,9 +44,6 @@ from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
 from renderer.surface.lobes import coat_irradiance_factors, roughness_polynomials
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 # Number of normals whose irradiance is computed at once. Their intermediate values fit
 # into the cache of the processor.
@@ -65,23 +63,6 @@ def radiance(
 
     The result is differentiable with respect to the vertices, the light and the
     albedo.
-
-    Args:
-        fragments: The S samples of the view that show the mesh.
-        vertices: Vertex positions in world axes, shape (V, 3).
-        light: SH coefficients of any degree, shape (K, 3).
-        albedo: Linear albedo at the samples (see `renderer.surface.albedo`),
-            shape (S, 3).
-        normals: Normals at the corners of the G seen faces for smooth shading,
-            from `normals_in_sight`, shape (G, 3, 3). None for flat shading with
-            the normals of the faces.
-
-    Returns:
-        Radiance, times the fraction of each pixel that the surface covers, in the
-        dtype of `vertices`, shape (3, P).
-
-    Raises:
-        InputError: If an argument holds NaN.
     """
     # Only the albedo is checked here. `area_vectors` checks the vertices, and `irradiance`
     # checks the light.
@@ -121,22 +102,6 @@ def glossy_radiance(
 
     The result is differentiable with respect to the vertices, the light, the
     albedo and the gloss.
-
-    Args:
-        fragments: The S samples of the view that show the mesh.
-        vertices: Vertex positions in world axes, shape (V, 3).
-        light: SH coefficients of any degree, shape (K, 3).
-        albedo: Linear albedo at the samples, shape (S, 3).
-        normals: Normals at the corners of the seen faces for smooth shading,
-            shape (G, 3, 3), or None for flat shading (see `radiance`).
-        gloss: Gloss at the samples (see `renderer.surface.gloss`).
-
-    Returns:
-        Radiance, times the fraction of each pixel that the surface covers, in the
-        dtype of `vertices`, shape (3, P).
-
-    Raises:
-        InputError: If an argument holds NaN.
     """
     wide = torch.promote_types(vertices.dtype, torch.float32)
     # The functions `unit` and `area_vectors` have the three components along the first
@@ -175,21 +140,13 @@ def glossy_radiance(
 
 
 def _lobe_radiance(
-    normals: Tensor, to_camera: Tensor, light: Tensor, albedo: Tensor, gloss: SampleGloss
-) -> Tensor:
-    """Compute the radiance of specular reflection at S samples under environment light.
-
-    Args:
-        normals: Unit normals, shape (S, 3).
-        to_camera: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
-            samples share one vector.
-        light: SH coefficients, shape (K, 3).
-        albedo: Linear albedo, shape (S, 3).
-        gloss: Gloss at the samples.
-
-    Returns:
-        Radiance, shape (3, S).
-    """
+    normals: Float[Tensor, "S 3"],
+    to_camera: Float[Tensor, "S 3"],
+    light: Float[Tensor, "K 3"],
+    albedo: Float[Tensor, "S 3"],
+    gloss: SampleGloss,
+) -> Float[Tensor, "3 S"]:
+    """Compute the radiance of specular reflection at S samples under environment light."""
     degree = harmonics.degree_of(light)
     # `colored` and `white` have one row for each SH coefficient, one column for each sample.
     # The reflection of metals (colored) is multiplied by the albedo. All other specular
@@ -202,19 +159,13 @@ def _lobe_radiance(
     return reflected
 
 
-def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
+def _coat_irradiance(
+    normals: Float[Tensor, "3 S"], light: Float[Tensor, "K 3"], gloss: SampleGloss
+) -> Float[Tensor, "3 S"]:
     """Compute the irradiance that the dielectric coat reflects at S samples.
 
     The coat is a transparent layer on a diffuse layer. The reflected irradiance
     does not reach the diffuse layer.
-
-    Args:
-        normals: Unit normals, shape (3, S).
-        light: SH coefficients of environment light, shape (K, 3).
-        gloss: Gloss at the samples.
-
-    Returns:
-        Irradiance, shape (3, S).
     """
     degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
     # Coefficients of higher degrees are ignored, because they hardly change the irradiance.
@@ -247,17 +198,10 @@ class _HarmonicSum(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
-        """Compute the sum Σ_k c_k Y_k(n) for each channel and each normal n.
-
-        Args:
-            ctx: Context of autograd.
-            normals: Unit normals, shape (3, N).
-            coefficients: Coefficients c_k of the K harmonics, shape (K, C).
-
-        Returns:
-            Sums, shape (C, N).
-        """
+    def forward(
+        ctx: Any, normals: Float[Tensor, "3 N"], coefficients: Float[Tensor, "K C"]
+    ) -> Float[Tensor, "C N"]:
+        """Compute the sum Σ_k c_k Y_k(n) for each channel and each normal n."""
         degree = math.isqrt(len(coefficients)) - 1
         # The harmonic of degree 0 has the constant value 1 / √(4π).
         value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
@@ -281,19 +225,8 @@ class _HarmonicSum(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Compute the gradients with respect to the normals and the coefficients.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the sums, shape (C, N).
-
-        Returns:
-            A tuple of
-            - the gradient with respect to the normals, shape (3, N);
-            - the gradient with respect to the coefficients, shape (K, C).
-            A gradient that is not needed is None.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "C N"]) -> tuple[Tensor | None, Tensor | None]:
+        """Compute the gradients with respect to the normals and the coefficients."""
         normals, gradient = ctx.saved_tensors
         normal_gradient = None
         coefficient_gradient = None
@@ -314,20 +247,6 @@ def irradiance(
     The result is differentiable with respect to the normals and the light. The
     irradiance is the function R in appendix B.2 of Liu et al. 2019. Appendix D has
     its derivative. Both are evaluated as polynomials of the normal.
-
-    Args:
-        normals: Finite normals of any length, shape (3, N). They are divided by
-            their lengths in their own dtype.
-        light: SH coefficients, shape (K, 3).
-        dtype: Data type of all other computations, float32 or float64.
-
-    Returns:
-        Irradiance in three color channels, shape (3, N). Some coefficients do not
-        change the irradiance (odd degrees from 3 on). Their gradient is exactly 0.
-
-    Raises:
-        InputError: If the light holds NaN, or if its shape is not
-            ((degree + 1)², 3).
     """
     require_bounded(light=light)
     # `degree_of` raises InputError if K is not (degree + 1)².
@@ -343,17 +262,10 @@ class _Irradiance(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
-        """Compute the irradiance at N normals.
-
-        Args:
-            ctx: Context of autograd.
-            normals: Normals of any length, shape (3, N).
-            light: SH coefficients, shape (K, 3).
-
-        Returns:
-            Irradiance in three color channels, shape (3, N).
-        """
+    def forward(
+        ctx: Any, normals: Float[Tensor, "3 N"], light: Float[Tensor, "K 3"]
+    ) -> Float[Tensor, "3 N"]:
+        """Compute the irradiance at N normals."""
         directions, lengths = unit_vectors(normals)
         directions = directions.to(light.dtype)
         polynomial = _IrradiancePolynomial(light)
@@ -376,19 +288,8 @@ class _Irradiance(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Compute the gradients with respect to the normals and the light.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the irradiance, shape (3, N).
-
-        Returns:
-            A tuple of
-            - the gradient with respect to the normals, shape (3, N);
-            - the gradient with respect to the SH coefficients, shape (K, 3).
-            A gradient that is not needed is None.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "3 N"]) -> tuple[Tensor | None, Tensor | None]:
+        """Compute the gradients with respect to the normals and the light."""
         # The gradient of the irradiance has the axes: direction, color, normal.
         directions, lengths, color_gradients = ctx.saved_tensors
         normal_gradient = None
@@ -431,12 +332,8 @@ class _IrradiancePolynomial:
         constant: The constant c for 3 colors, shape (3, 1).
     """
 
-    def __init__(self, light: Tensor):
-        """Compute the coefficients of the irradiance c + a · n + p(n).
-
-        Args:
-            light: SH coefficients, shape (K, 3).
-        """
+    def __init__(self, light: Float[Tensor, "K 3"]):
+        """Compute the coefficients of the irradiance c + a · n + p(n)."""
         light_degree = math.isqrt(len(light)) - 1
         matrices = _gradient_of_light(light_degree, light.dtype, light.device)
         # Gradients with the axes: direction of the derivative, coefficient (those of ∇p
@@ -451,21 +348,11 @@ class _IrradiancePolynomial:
         # and the harmonic Y_0 = 1 / √(4π).
         self.constant = light[:1].T * math.sqrt(math.pi / 4)
 
-    def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(self, directions: Float[Tensor, "3 N"]) -> tuple[Tensor, Tensor]:
         """Compute the irradiance and its gradient at N unit normals n.
 
         The irradiance is c + a · n + p(n), with the constant c, the vector a and the
         polynomial p of this object.
-
-        Args:
-            directions: Unit normals n, shape (3, N).
-
-        Returns:
-            A tuple of
-            - the irradiance, shape (3 colors, N);
-            - the gradient a + ∇p(n), shape (3 components, 3 colors, N). Only its
-              component tangential to the sphere is the derivative of the
-              irradiance. Its component along n has no meaning.
         """
         # A tensor of monomials with a name would stay in memory until the function
         # returns.
@@ -491,17 +378,6 @@ def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) ->
     comes from the harmonic of degree 0, the vector a from those of degree 1, and
     the homogeneous polynomial p from those of even degree from 2 on. The gradient
     is therefore a + ∇p(n).
-
-    Args:
-        degree: Degree of the light.
-        dtype: Data type of the result.
-        device: Device of the result.
-
-    Returns:
-        One matrix for each of the 3 components of the gradient, with one column
-        for each SH coefficient up to the degree of p. The last row gives the
-        component of a. The other rows give the coefficients of the component of
-        ∇p, one for each monomial. Shape (3, monomials + 1, coefficients).
     """
     even_degree = _even_degree(degree)
     coefficient_count = (even_degree + 1) ** 2
@@ -518,12 +394,6 @@ def _even_degree(degree: int) -> int:
 
     Harmonics above `harmonics.DIFFUSE_DEGREE` are ignored, because they hardly
     change the irradiance of a diffuse surface.
-
-    Args:
-        degree: Degree of the light.
-
-    Returns:
-        Largest even degree of a harmonic, at least 2.
     """
     highest = min(degree, harmonics.DIFFUSE_DEGREE)
     return max(highest - highest % 2, 2)
@@ -537,14 +407,6 @@ def _gradients(degree: int) -> Tensor:
     homogeneous polynomial |n|^degree Y_k(n / |n|) on the unit sphere (see
     `harmonics.homogeneous_gradients`). Its gradient is a sum of monomials of
     degree `degree` - 1.
-
-    Args:
-        degree: Degree of the polynomials.
-
-    Returns:
-        Coefficients of the gradients,
-        shape (3 components, monomials, (degree + 1)²), with one column for each
-        harmonic. Columns are zero for l = 0 and for l of the other parity.
     """
     band = harmonics.bands(degree)
     # Each gradient as a sum of harmonics below `degree`. Axes: component of the gradient,
@@ -556,19 +418,8 @@ def _gradients(degree: int) -> Tensor:
     return in_monomials * ((band > 0) & has_same_parity)
 
 
-def _diffuse_basis(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
-    """Compute the irradiance of N diffuse surfaces from each spherical harmonic.
-
-    Args:
-        directions: Unit or zero normals of the surfaces, shape (3, N).
-        degree: Degree of the light.
-
-    Returns:
-        A tuple of
-        - the ascending indices of the M harmonics that change the irradiance;
-        - the irradiance if the coefficient of one of these harmonics is 1 and
-          all others are 0, shape (M, N).
-    """
+def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
+    """Compute the irradiance of N diffuse surfaces from each spherical harmonic."""
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
     factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
     return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
@@ -580,18 +431,7 @@ def normals_in_sight(
     faces: Int[Tensor, "F 3"],
     normal_ids: Int[Tensor, "F 3"],
 ) -> Float[Tensor, "G 3 3"]:
-    """Compute the normals at the corners of the G faces that a view shows.
-
-    Args:
-        fragments: Samples of the view that show the mesh. Their faces are seen.
-        vertices: Vertex positions in world axes, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        normal_ids: Index of the normal of each corner (see `Mesh.normal_ids`),
-            shape (F, 3).
-
-    Returns:
-        Unit normals, float32 or float64, shape (G, 3, 3).
-    """
+    """Compute the normals at the corners of the G faces that a view shows."""
     # All first corners of the seen faces, then all second and third corners.
     seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
     count = int(normal_ids.max()) + 1
@@ -620,13 +460,5 @@ def smooth_normals(
 
     The normals of faces that are seen from behind are reversed, so that they
     point to the side of the camera.
-
-    Args:
-        fragments: The S samples of the view that show the mesh.
-        corner_normals: Normals at the corners of the G seen faces,
-            shape (G, 3, 3).
-
-    Returns:
-        Interpolated normals, which are not of unit length, shape (S, 3).
     """
     return fragments.interpolate(corner_normals * fragments.facing[:, :, None].to(corner_normals))

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.image import decode, encode, to_bytes
@@ -47,31 +48,16 @@ CHANNEL_VALUES = 256
 
 def with_added_albedo(
     mesh: Mesh,
-    added: np.ndarray,
+    added: Float[np.ndarray, "F 3"],
     encoding: str,
     albedo_scale: float = 1.0,
-    hue: np.ndarray | None = None,
+    hue: Float[np.ndarray, " F"] | None = None,
 ) -> tuple[Mesh, float]:
     """Return a copy of a mesh whose colors and textures hold the albedo after an attack.
 
     An attack rotates the hue of each face and adds a color to it. New textures
     have 8 bits per channel. They hold the product of the old texture and the
     corner colors, so faces with a texture get white corners.
-
-    Args:
-        mesh: Mesh with F faces.
-        added: Linear color that is added to each face, shape (F, 3).
-        encoding: Encoding of colors and textures, "linear" or "srgb".
-        albedo_scale: Factor s for the albedo of the mesh.
-        hue: Hue rotation of each face in degrees, shape (F,). None leaves the
-            hues unchanged.
-
-    Returns:
-        A tuple of
-        - the mesh with changed colors and textures;
-        - the albedo scale s' with which the new mesh must be rendered. It is 1,
-          or the largest albedo if this is above 1, because files store values up
-          to 1. A larger scale would multiply the rounding errors of the colors.
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     eight_bit_values = torch.arange(CHANNEL_VALUES, dtype=torch.float32) / (CHANNEL_VALUES - 1)
@@ -113,20 +99,10 @@ def with_added_albedo(
     return baked, painter.new_scale
 
 
-def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) -> float:
-    """Compute an upper bound of the linear albedo of a mesh.
-
-    Args:
-        mesh: Mesh with F faces.
-        corner_albedo: Linear color of the three corners of each face,
-            shape (F, 3, 3).
-        linear_values: Linear value of each 8-bit value of a texture,
-            shape (256,).
-
-    Returns:
-        The largest value in the corner colors. If all faces have a texture, it is
-        multiplied by the largest value in the textures.
-    """
+def _largest_albedo(
+    mesh: Mesh, corner_albedo: Float[Tensor, "F 3 3"], linear_values: Float[Tensor, " 256"]
+) -> float:
+    """Compute an upper bound of the linear albedo of a mesh."""
     largest_corner = float(corner_albedo.max())
     if not (mesh.texture_ids >= 0).all():
         return largest_corner
@@ -152,20 +128,15 @@ class _Painter:
     encoding: str
     scale: float
     new_scale: float
-    added: Tensor
-    hue: Tensor | None
+    added: Float[Tensor, "F 3"]
+    hue: Float[Tensor, " F"] | None
 
-    def paint(self, albedo: Tensor, faces: np.ndarray) -> Tensor:
+    def paint(
+        self, albedo: Float[Tensor, "N 3"], faces: Int[np.ndarray, " N"]
+    ) -> Float[Tensor, "N 3"]:
         """Rotate the hue of the albedo at N points, add the color of the face, and encode it.
 
         The changed albedo is divided by `new_scale` before it is encoded.
-
-        Args:
-            albedo: Linear albedo at the points, shape (N, 3).
-            faces: Index of the face on which each point lies, shape (N,).
-
-        Returns:
-            Encoded albedo at the points, shape (N, 3).
         """
         hue_at_points = None if self.hue is None else self.hue[faces]
         changed = changed_albedo(albedo * self.scale, hue_at_points, self.added[faces])
@@ -185,14 +156,8 @@ class _TextureSheet:
             the mesh has no gloss textures. It is 0 before `paint`.
     """
 
-    def __init__(self, mesh: Mesh, texture_id: int, faces: np.ndarray) -> None:
-        """Place a rectangle (chart) for each of N faces on the new texture.
-
-        Args:
-            mesh: Mesh with the old texture.
-            texture_id: Index of the old texture in `mesh.textures`.
-            faces: Indices of the N faces with the old texture, shape (N,).
-        """
+    def __init__(self, mesh: Mesh, texture_id: int, faces: Int[np.ndarray, " N"]) -> None:
+        """Place a rectangle (chart) for each of N faces on the new texture."""
         self._mesh = mesh
         self._faces = faces
         self._old_texture = mesh.textures[texture_id]
@@ -208,16 +173,13 @@ class _TextureSheet:
         gloss_channels = self._old_gloss_texture.shape[2]
         self.gloss_texture = np.zeros((rows, columns, gloss_channels), dtype=np.uint8)
 
-    def paint(self, painter: _Painter, corner_albedo: Tensor, linear_values: Tensor) -> None:
-        """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss.
-
-        Args:
-            painter: Rotation of the hue and added color of each face of the mesh.
-            corner_albedo: Linear color of the three corners of each of the N
-                faces, by which the texels are multiplied, shape (N, 3, 3).
-            linear_values: Table of the linear values that belong to the 256 values
-                of an 8-bit texel of the old texture, shape (256,).
-        """
+    def paint(
+        self,
+        painter: _Painter,
+        corner_albedo: Float[Tensor, "N 3 3"],
+        linear_values: Float[Tensor, " 256"],
+    ) -> None:
+        """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss."""
         block_count = 1 + self.charts.texel_count // BLOCK
         for charts in np.array_split(np.arange(len(self._faces)), block_count):
             texels = self.charts.texels(charts)
@@ -239,15 +201,11 @@ class _TextureSheet:
             gloss_column, gloss_row = gloss_position.astype(np.int64).T
             self.gloss_texture[row, column] = self._old_gloss_texture[gloss_row, gloss_column]
 
-    def _multiply_by_colors(self, albedo: Tensor, texels: "_Texels", corner_albedo: Tensor) -> None:
-        """Multiply the albedo of texels by the interpolated corner colors of their faces, in place.
-
-        Args:
-            albedo: Linear albedo of T texels, changed in place, shape (T, 3).
-            texels: The T texels. `texels.chart` is the index of the face of each
-                texel.
-            corner_albedo: Linear color of the three corners of each of the N
-                faces, shape (N, 3, 3).
+    def _multiply_by_colors(
+        self, albedo: Float[Tensor, "T 3"], texels: "_Texels", corner_albedo: Float[Tensor, "N 3 3"]
+    ) -> None:
+        """Multiply the albedo of texels by the interpolated corner colors of their faces, in
+        place.
         """
         if not self._mesh.one_color_per_face:
             weights = torch.from_numpy(self.charts.weights(texels)).float()
@@ -273,9 +231,9 @@ class _Texels(NamedTuple):
             larger than a texel of the old texture.
     """
 
-    chart: np.ndarray
-    sheet_position: np.ndarray
-    position: np.ndarray
+    chart: Int[np.ndarray, " T"]
+    sheet_position: Float[np.ndarray, "T 2"]
+    position: Float[np.ndarray, "T 2"]
 
 
 class _Charts:
@@ -289,14 +247,8 @@ class _Charts:
             shape (N, 3, 2).
     """
 
-    def __init__(self, uvs: np.ndarray, old_size: tuple[int, int]) -> None:
-        """Compute the size of the rectangle of each face, and place it on the new texture.
-
-        Args:
-            uvs: Texture coordinates in the old texture of the three corners of
-                each face, shape (N, 3, 2).
-            old_size: Number of columns and rows of the old texture.
-        """
+    def __init__(self, uvs: Float[np.ndarray, "N 3 2"], old_size: tuple[int, int]) -> None:
+        """Compute the size of the rectangle of each face, and place it on the new texture."""
         # Positions of the corners as pairs of column and row, counted from the top. The
         # texture coordinate v points up.
         old_positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * old_size
@@ -319,16 +271,8 @@ class _Charts:
         sheet_positions = self._positions + (self._sheet_corner - self._first_texel)[:, None]
         self.uvs = sheet_positions / self.sheet_size * [1, -1] + [0, 1]
 
-    def texels(self, charts: np.ndarray) -> _Texels:
-        """List all texels of some charts.
-
-        Args:
-            charts: Indices of the charts, shape (M,).
-
-        Returns:
-            Texels of the first chart in row-major order, then those of the
-            second chart, and so on.
-        """
+    def texels(self, charts: Int[np.ndarray, " M"]) -> _Texels:
+        """List all texels of some charts."""
         texels_per_chart = self._size[charts].prod(axis=1)
         chart_of_texel = np.repeat(charts, texels_per_chart)
         texels_before_chart = texels_per_chart.cumsum() - texels_per_chart
@@ -345,18 +289,11 @@ class _Charts:
             position=self._first_texel[chart_of_texel] + position_in_chart + 0.5,
         )
 
-    def weights(self, texels: _Texels) -> np.ndarray:
+    def weights(self, texels: _Texels) -> Float[np.ndarray, "T 3"]:
         """Compute the barycentric weights of T texels in the faces to which they belong.
 
         A texel outside of its face has a negative weight, which is set to 0. The
         other weights are then scaled to the sum 1.
-
-        Args:
-            texels: The T texels.
-
-        Returns:
-            Weights of the three corners of the face, at least 0, with the sum 1,
-            shape (T, 3).
         """
         # Vectors from the first corner to the second and the third corner. Axes: face,
         # vector, column or row.
@@ -371,20 +308,11 @@ class _Charts:
         return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _pack(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+def _pack(sizes: Float[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
     """Pack N rectangles on a sheet that is about square.
 
     The rectangles are placed from left to right in rows, the highest rectangle
     first.
-
-    Args:
-        sizes: Number of columns and rows of each rectangle, shape (N, 2).
-
-    Returns:
-        A tuple of
-        - the column and row of the top left corner of each rectangle,
-          shape (N, 2);
-        - the number of columns and rows of the sheet.
     """
     area = sizes.prod(axis=1).sum()
     widest = int(sizes[:, 0].max(initial=1))

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -46,9 +47,9 @@ class PixelGroups(NamedTuple):
         sample_count: Number of samples in each group, int64, shape (R,).
     """
 
-    group_to_pixel: Tensor
-    group_to_seen_face: Tensor
-    sample_count: Tensor
+    group_to_pixel: Int[Tensor, " R"]
+    group_to_seen_face: Int[Tensor, " R"]
+    sample_count: Int[Tensor, " R"]
 
 
 @dataclass(frozen=True)
@@ -88,16 +89,16 @@ class Fragments:
 
     size: int
     samples: int
-    pixels: Tensor
-    coverage: Tensor
-    faces: Tensor
-    corners: Tensor
-    facing: Tensor
-    outlines: Tensor
-    sample_to_pixel: Tensor
-    sample_to_seen_face: Tensor
-    sample_numbers: Tensor
-    depths: Tensor | None = None
+    pixels: Int[Tensor, " P"]
+    coverage: Float[Tensor, " P"]
+    faces: Int[Tensor, " G"]
+    corners: Int[Tensor, "G 3"]
+    facing: Float[Tensor, "G 1"]
+    outlines: Float[Tensor, "G 3 2"]
+    sample_to_pixel: Int[Tensor, " S"]
+    sample_to_seen_face: Int[Tensor, " S"]
+    sample_numbers: Int[Tensor, " S"]
+    depths: Float[Tensor, "G 3"] | None = None
     camera: Camera | None = None
 
     @property
@@ -164,13 +165,8 @@ class Fragments:
             weight.div_(weight.sum(0))
         return weights.T
 
-    def positions(self) -> Tensor:
-        """Compute the positions of the S covered samples in the image.
-
-        Returns:
-            Positions (x, y), float64, shape (S, 2). x points to the right and y
-            up, and the image is [-1, 1] in x and y.
-        """
+    def positions(self) -> Float[Tensor, "S 2"]:
+        """Compute the positions of the S covered samples in the image."""
         # Dividing floating-point numbers takes a tenth of the time of dividing integers.
         pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
         pixel_row, pixel_column = _divide(pixel_index, self.size)
@@ -184,12 +180,7 @@ class Fragments:
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
     def by_sample(self) -> "Fragments":
-        """Return a copy for a finer image, in which each sample is a pixel.
-
-        Returns:
-            The same S samples in the same order, for an image with size · s
-            pixels per side and one sample per pixel. s is `samples`.
-        """
+        """Return a copy for a finer image, in which each sample is a pixel."""
         resolution = self.size * self.samples
         # Row-major index of each pixel of the finer image.
         finer_indices = torch.arange(resolution**2, device=self.sample_numbers.device)
@@ -210,16 +201,10 @@ class Fragments:
         )
         return self._share_weights(finer, slice(None))
 
-    def select(self, samples: Tensor) -> "Fragments":
+    def select(self, samples: Int[Tensor, " N"]) -> "Fragments":
         """Return a copy that keeps only some of the S samples.
 
         `pixels` and `coverage` stay the same.
-
-        Args:
-            samples: Indices of the N samples to keep, shape (N,).
-
-        Returns:
-            Copy whose tensors of shape (S,) have N entries.
         """
         selected = replace(
             self,
@@ -234,31 +219,14 @@ class Fragments:
 
         The copy then does not compute the weights again. Nothing happens if the
         weights have not been computed yet.
-
-        Args:
-            copied: Copy of these fragments, changed in place.
-            samples: Samples of these fragments that the copy has, as indices or as
-                a slice.
-
-        Returns:
-            The argument `copied`.
         """
         is_computed = _WEIGHTS in vars(self)
         if is_computed:
             vars(copied)[_WEIGHTS] = self.barycentric[samples]
         return copied
 
-    def image_of_samples(self, values: Tensor, empty: float) -> Tensor:
-        """Arrange values at samples as an image with one pixel per sample.
-
-        Args:
-            values: Value of each covered sample, shape (S,).
-            empty: Value of samples that show no mesh.
-
-        Returns:
-            Image with one pixel per sample, shape (size · s, size · s), for
-            s = `samples`. Row 0 is at the top.
-        """
+    def image_of_samples(self, values: Float[Tensor, " S"], empty: float) -> Float[Tensor, "_ _"]:
+        """Arrange values at samples as an image with one pixel per sample."""
         image = values.new_full((self.size**2 * self.samples**2,), empty)
         image.index_copy_(0, self.sample_numbers, values)
         # Axes: row of a pixel, column of a pixel, row in the pixel, column in the pixel.
@@ -266,52 +234,31 @@ class Fragments:
         by_pixel = image.view(self.size, self.size, self.samples, self.samples)
         return by_pixel.transpose(1, 2).reshape(self.size * self.samples, -1)
 
-    def of_image(self, image: Tensor) -> Tensor:
+    def of_image(self, image: Float[Tensor, "_ _"]) -> Float[Tensor, " S"]:
         """Read the values of the covered samples from an image with one pixel per sample.
 
         This is the inverse of `image_of_samples`.
-
-        Args:
-            image: Image with one pixel per sample, shape (size · s, size · s),
-                for s = `samples`.
-
-        Returns:
-            Values of the covered samples, shape (S,).
         """
         # Axes: row of a pixel, row in the pixel, column of a pixel, column in the pixel.
         # The transpose exchanges the second and the third axis.
         by_row = image.view(self.size, self.samples, self.size, self.samples)
         return by_row.transpose(1, 2).flatten().index_select(0, self.sample_numbers)
 
-    def interpolate(self, corners: Tensor) -> Tensor:
+    def interpolate(self, corners: Float[Tensor, "G 3 D"]) -> Float[Tensor, "S D"]:
         """Interpolate values at the corners of faces to the S samples.
 
         The result is differentiable with respect to `corners`.
-
-        Args:
-            corners: D values for each of the three corners of the G seen faces,
-                shape (G, 3, D).
-
-        Returns:
-            Values at the samples, shape (S, D).
         """
         # One column for each seen face: the D values of its first corner, then those of
         # its second and its third corner.
         corner_rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(corner_rows, self.sample_to_seen_face, self.barycentric.T).T
 
-    def distribute(self, values: Tensor) -> Tensor:
+    def distribute(self, values: Float[Tensor, "S D"]) -> Float[Tensor, "G 3 D"]:
         """Add up values at samples for each corner of the faces that the samples show.
 
         Each value is multiplied by the barycentric weight of the corner at the
         sample. This is the transpose of `interpolate`, as in backpropagation.
-
-        Args:
-            values: D values for each of the S samples, shape (S, D).
-
-        Returns:
-            Weighted sums for the three corners of the G seen faces,
-            shape (G, 3, D).
         """
         corner_rows_shape = (3 * values.shape[1], len(self.faces))
         corner_rows = _distribute(
@@ -320,22 +267,11 @@ class Fragments:
         # The axes corner, value, seen face become seen face, corner, value.
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
-    def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def merge(self, albedo: Float[Tensor, "S C"]) -> tuple[Tensor, Tensor, Tensor]:
         """Add up the albedo of the samples of a pixel that show the same face.
 
         With flat normals, the samples of such a group have the same normal, so they
         can be shaded together.
-
-        Args:
-            albedo: C channels of albedo at each of the S samples, shape (S, C).
-
-        Returns:
-            A tuple of
-            - the index into `pixels` of each of R groups, shape (R,);
-            - the index into `faces` of each group, shape (R,);
-            - the albedo summed over the samples of each group and divided by the
-              number of samples in a pixel, shape (R, C). It is differentiable
-              with respect to `albedo`.
         """
         if self.samples == 1 or len(self.sample_to_pixel) == 0:
             # Each sample is a group of its own if a pixel has one sample.
@@ -371,14 +307,7 @@ class Fragments:
         )
 
     def to(self, device: torch.device | str) -> "Fragments":
-        """Return a copy with all tensors on a device.
-
-        Args:
-            device: Device for the tensors.
-
-        Returns:
-            Copy with tensors on `device`.
-        """
+        """Return a copy with all tensors on a device."""
         tensors_on_device: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -397,22 +326,12 @@ class _Interpolation(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, corner_rows: Tensor, sample_to_seen_face: Tensor, weights: Tensor
-    ) -> Tensor:
-        """Interpolate D values from the three corners of a face to each of S samples.
-
-        Args:
-            ctx: Context of autograd.
-            corner_rows: D values at the first corners of G faces, then D values
-                at the second and at the third corners, shape (3 · D, G).
-            sample_to_seen_face: Index in [0, G) of the face that each sample
-                shows, shape (S,).
-            weights: Barycentric weights of the three corners at each sample,
-                shape (3, S).
-
-        Returns:
-            Values at the samples, shape (D, S).
-        """
+        ctx: Any,
+        corner_rows: Float[Tensor, "_ G"],
+        sample_to_seen_face: Int[Tensor, " S"],
+        weights: Float[Tensor, "3 S"],
+    ) -> Float[Tensor, "D S"]:
+        """Interpolate D values from the three corners of a face to each of S samples."""
         ctx.save_for_backward(sample_to_seen_face, weights)
         ctx.corner_rows_shape = corner_rows.shape
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
@@ -427,45 +346,22 @@ class _Interpolation(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the gradient with respect to the values at the corners of G faces.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the D values at each of S samples,
-                shape (D, S).
-
-        Returns:
-            Gradient with respect to the D values at the first corners, then at the
-            second and at the third corners, shape (3 · D, G), and None for the
-            other two arguments of `forward`.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "D S"]) -> tuple[Tensor, None, None]:
+        """Compute the gradient with respect to the values at the corners of G faces."""
         sample_to_seen_face, weights = ctx.saved_tensors
         gradient = _distribute(upstream, sample_to_seen_face, weights, ctx.corner_rows_shape)
         return gradient, None, None
 
 
 def _distribute(
-    values: Tensor,
-    sample_to_seen_face: Tensor,
-    weights: Tensor,
+    values: Float[Tensor, "D S"],
+    sample_to_seen_face: Int[Tensor, " S"],
+    weights: Float[Tensor, "3 S"],
     corner_rows_shape: Sequence[int],
-) -> Tensor:
+) -> Float[Tensor, "_ G"]:
     """Add up values at S samples for each corner of the faces that the samples show.
 
     Each value is multiplied by the barycentric weight of the corner at the sample.
-
-    Args:
-        values: D values for each sample, shape (D, S).
-        sample_to_seen_face: Index in [0, G) of the face that each sample shows,
-            shape (S,).
-        weights: Barycentric weights of the three corners at each sample,
-            shape (3, S).
-        corner_rows_shape: Shape of the result, (3 · D, G).
-
-    Returns:
-        Weighted sums of D values at the first corners of G faces, then at the
-        second and at the third corners, shape (3 · D, G).
     """
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
@@ -476,61 +372,25 @@ def _distribute(
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Split several tensors along their last axis into blocks of BLOCK entries.
-
-    Args:
-        tensors: Tensors of shape (..., S) with the same S.
-
-    Yields:
-        For each block, one view of every tensor, shape (..., BLOCK). The last
-        block may be shorter.
-    """
+    """Split several tensors along their last axis into blocks of BLOCK entries."""
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 
-def _divide(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
-    """Divide whole numbers that are stored as floating-point numbers.
-
-    Args:
-        numbers: Whole numbers, float64, shape (S,).
-        divisor: Whole number.
-
-    Returns:
-        The whole quotients and the remainders, shape (S,) each.
-    """
+def _divide(numbers: Float[Tensor, " S"], divisor: int) -> tuple[Tensor, Tensor]:
+    """Divide whole numbers that are stored as floating-point numbers."""
     quotient = (numbers / divisor).floor()
     return quotient, numbers - quotient * divisor
 
 
 def build_fragments(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
     cameras: Sequence[Camera],
     settings: ImageSettings,
     rasterizer: Rasterizer,
     closed: bool = False,
 ) -> list[Fragments]:
-    """Rasterize a mesh once for each camera to find the samples that show the mesh.
-
-    Args:
-        vertices: Vertex positions in world axes, float64, shape (V, 3).
-        faces: Indices of the three vertices of each face, shape (F, 3).
-        cameras: Cameras of the N views.
-        settings: Size of the images and number of samples per pixel side.
-        rasterizer: Rasterizer that finds the nearest face at each sample.
-        closed: True promises that the mesh is watertight and that its faces are
-            counter-clockwise seen from outside (see `Mesh.closed`). Faces that
-            are seen from behind are then not drawn. They are drawn if the near
-            plane cuts the mesh open.
-
-    Returns:
-        Covered samples of each view, in the order of the cameras. A view without
-        the mesh has no covered samples.
-
-    Raises:
-        InputError: If `vertices` holds NaN or infinite values, or if the mesh
-            reaches a perspective camera.
-    """
+    """Rasterize a mesh once for each camera to find the samples that show the mesh."""
     require_finite(vertices=torch.from_numpy(vertices))
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
@@ -561,33 +421,20 @@ class _CoveredSamples(NamedTuple):
             shape (S,).
     """
 
-    pixels: np.ndarray
-    sample_count: np.ndarray
-    sample_to_pixel: np.ndarray
+    pixels: Int[np.ndarray, " P"]
+    sample_count: Float[np.ndarray, " P"]
+    sample_to_pixel: Int[np.ndarray, " S"]
 
 
 def _fragments_of_view(
     camera: Camera,
-    projected: np.ndarray,
-    depths: np.ndarray | None,
-    face_ids: np.ndarray,
-    faces: np.ndarray,
+    projected: Float[np.ndarray, "V 3"],
+    depths: Float[np.ndarray, " V"] | None,
+    face_ids: Int[np.ndarray, "_ _"],
+    faces: Int[np.ndarray, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
-    """Create the `Fragments` of one view from the face at each sample of its image.
-
-    Args:
-        camera: Camera of the view.
-        projected: Vertices as `Camera.project` returns them, shape (V, 3).
-        depths: Depths of the vertices, shape (V,). None without perspective.
-        face_ids: Index of the face at each sample of the image, or -1,
-            shape (size · s, size · s), with s = `settings.samples`.
-        faces: Vertex indices of the F faces of the mesh, shape (F, 3).
-        settings: Size of the image and number of samples per pixel side.
-
-    Returns:
-        Covered samples of the view.
-    """
+    """Create the `Fragments` of one view from the face at each sample of its image."""
     size = settings.size
     samples = settings.samples
     # Neighboring samples in a row of the same pixel become one item, which is faster to
@@ -624,18 +471,10 @@ def _fragments_of_view(
     )
 
 
-def _group_by_pixel(covered_samples: np.ndarray, size: int, samples: int) -> _CoveredSamples:
-    """Find the pixels to which the S covered samples of an image belong.
-
-    Args:
-        covered_samples: Numbers of the covered samples, ascending, shape (S,).
-            All samples of the image are numbered pixel by pixel.
-        size: Width and height of the image in pixels.
-        samples: Number of samples along one side of a pixel.
-
-    Returns:
-        Pixels of the samples.
-    """
+def _group_by_pixel(
+    covered_samples: Float[np.ndarray, " S"], size: int, samples: int
+) -> _CoveredSamples:
+    """Find the pixels to which the S covered samples of an image belong."""
     if samples == 1:
         # Sample numbers and pixel indices are the same if a pixel has one sample.
         return _CoveredSamples(
@@ -654,20 +493,11 @@ def _group_by_pixel(covered_samples: np.ndarray, size: int, samples: int) -> _Co
     )
 
 
-def _compact(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+def _compact(values: Float[np.ndarray, " S"], limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the distinct values of an array, and the index of each entry among them.
 
     The result equals that of np.unique with return_inverse=True. This function
     is faster, because it does not sort.
-
-    Args:
-        values: Whole numbers in [0, limit), shape (S,).
-        limit: Number that is larger than all values.
-
-    Returns:
-        A tuple of
-        - the G distinct values, ascending, shape (G,);
-        - the index of each value among the distinct values, shape (S,).
     """
     # Convert the indices once here. Otherwise, each of the two lookups would convert them.
     values = values.astype(np.intp)

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from renderer.errors import InputError
 from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, to_fixed_point
@@ -33,25 +34,13 @@ TYPES = (
 )
 
 
-def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def rasterize(
+    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
+) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
     coordinates and the rounding.
-
-    Args:
-        points: The V vertices, projected to each of N views, finite, float64,
-            shape (N, V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: True leaves out faces that are clockwise in the image.
-
-    Returns:
-        Index of the nearest face at each sample, or -1 without a face, int32,
-        shape (N, R, R).
-
-    Raises:
-        IndexError: If a face has a vertex that does not exist.
     """
     # Unsigned indices are faster: compiled code checks signed indices for negative values.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
@@ -80,12 +69,6 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     The machine code is stored in a file, so that the next process need not
     compile the function again.
-
-    Args:
-        function: Function to compile.
-
-    Returns:
-        Compiled function.
     """
     # numba may raise any exception if its cache is read-only or damaged.
     try:
@@ -96,19 +79,7 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_njit
 def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
-    """Compute twice the signed area of the triangle with the vertices a, b and c.
-
-    Args:
-        x: x of all vertices, shape (V,).
-        y: y of all vertices, pointing down, shape (V,).
-        a: Index of the first vertex.
-        b: Index of the second vertex.
-        c: Index of the third vertex.
-
-    Returns:
-        Area, which is negative for a triangle that is counter-clockwise in the
-        image.
-    """
+    """Compute twice the signed area of the triangle with the vertices a, b and c."""
     return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
 
 
@@ -116,19 +87,7 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 def _covered_range(
     coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int
 ) -> tuple[int, int]:
-    """Find the range of rows, or of columns, in which a triangle can cover samples.
-
-    Args:
-        coordinates: y of all vertices for rows, or x for columns, shape (V,).
-        a: Index of the first vertex of the triangle.
-        b: Index of the second vertex.
-        c: Index of the third vertex.
-        bits: Number of fractional bits of the coordinates.
-        resolution: Number of rows or columns.
-
-    Returns:
-        The first row, and the first row after the range.
-    """
+    """Find the range of rows, or of columns, in which a triangle can cover samples."""
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
     # The operator >> divides by 2^bits and rounds down. The two minus signs make it round
@@ -138,19 +97,7 @@ def _covered_range(
 
 @_njit
 def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort three corners by y, from the top to the bottom.
-
-    Args:
-        ax: x of the first corner.
-        ay: y of the first corner, pointing down.
-        bx: x of the second corner.
-        by: y of the second corner.
-        cx: x of the third corner.
-        cy: y of the third corner.
-
-    Returns:
-        x and y of the top, the middle and the bottom corner, six numbers.
-    """
+    """Sort three corners by y, from the top to the bottom."""
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     if by > cy:
@@ -167,17 +114,6 @@ def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> in
     All coordinates are in subsamples, which are 1 / 2^bits of a sample. The row
     crosses the edge at x + (row_y - y) (to_x - x) / (to_y - y). This is divided by
     2^bits and rounded up.
-
-    Args:
-        x: x of the start of the edge.
-        y: y of the start of the edge.
-        to_x: x of the end of the edge.
-        to_y: y of the end of the edge, not equal to y.
-        row_y: y of the row of samples.
-        bits: Number of fractional bits of the coordinates.
-
-    Returns:
-        Index of the column.
     """
     # The operator // rounds down. The minus sign before it makes the result round up.
     return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << bits))
@@ -191,17 +127,6 @@ def _draw(
 
     Faces are drawn in ascending order. If two faces have the same depth at a
     sample, the face with the lower index therefore stays.
-
-    Args:
-        positions: Fixed-point positions of the vertices, shape (2, V).
-        depths: Depths of the vertices, from 0 to FAR, shape (V,).
-        faces: Vertex indices of the faces, shape (F, 3).
-        closed: True leaves out faces that are clockwise in the image.
-        bits: Number of fractional bits of the positions.
-        ids: Index of the nearest face at each sample, changed in place,
-            shape (R, R).
-        nearest: Depth of this face at each sample, changed in place,
-            shape (R, R).
     """
     x = positions[0]
     y = positions[1]

@@ -27,6 +27,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 # Positions in the image are integers. Their unit, the subsample, is the distance of two
 # neighboring samples divided by SUBSAMPLES.
@@ -48,22 +49,13 @@ FACES_PER_BLOCK = 2**14
 ENTRIES_PER_BLOCK = 2**13
 
 
-def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def rasterize(
+    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
+) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
     coordinates and the rounding.
-
-    Args:
-        points: The V vertices, projected to each of N views, finite, float64,
-            shape (N, V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: True leaves out faces that are clockwise in the image.
-
-    Returns:
-        Index of the nearest face at each sample, or -1 without a face, int32,
-        shape (N, R, R).
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
@@ -84,26 +76,19 @@ class _TriangleRows(NamedTuple):
             shape (T,).
     """
 
-    triangle_index: np.ndarray
-    first_row: np.ndarray
-    row_count: np.ndarray
+    triangle_index: Int[np.ndarray, " T"]
+    first_row: Float[np.ndarray, " T"]
+    row_count: Float[np.ndarray, " T"]
 
 
-def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def _keys(
+    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
+) -> Int[np.ndarray, " R²"]:
     """Compute the smallest key of each sample of one view.
 
     Each face has one key at a sample that it covers: its depth, and in the low
     FACE_BITS bits its index. The smallest key therefore belongs to the nearest
     face.
-
-    Args:
-        points: Projected vertices, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: True leaves out faces that are clockwise in the image.
-
-    Returns:
-        Keys in row-major order, int64, shape (R²,).
     """
     positions, depths = to_fixed_point(points, resolution)
     keys = np.full(resolution * resolution, EMPTY_KEY)
@@ -121,26 +106,17 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
 
 
 def _draw(
-    keys: np.ndarray,
-    triangles: np.ndarray,
-    depths: np.ndarray,
+    keys: Float[np.ndarray, " R²"],
+    triangles: Float[np.ndarray, "2 3 T"],
+    depths: Float[np.ndarray, "3 T"],
     rows: _TriangleRows,
-    face_ids: np.ndarray,
+    face_ids: Int[np.ndarray, " T"],
     resolution: int,
 ) -> None:
     """Draw T triangles: lower the keys of the samples at which a triangle is nearest so far.
 
     A key is an integer. Its high bits are the depth of the nearest face at a
     sample, and its low FACE_BITS bits are the index of this face.
-
-    Args:
-        keys: Smallest key of each sample so far, changed in place, shape (R²,).
-        triangles: Positions (x, y) of the three corners in subsamples,
-            shape (2, 3, T).
-        depths: Depths of the corners, shape (3, T).
-        rows: Rows in which the triangles may cover samples.
-        face_ids: Index of the face of each triangle, shape (T,).
-        resolution: Number R of samples per side.
     """
     edges = _edges(triangles)
     planes = _planes(triangles, depths)
@@ -168,23 +144,14 @@ def _draw(
             np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
 
 
-def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+def to_fixed_point(
+    points: Float[np.ndarray, "V 3"], resolution: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Convert projected points to integer positions and to depths from 0 to FAR.
 
     The unit of the positions is a subsample, 1/256 of the distance of two samples.
     As on GPUs, positions in samples are computed with one multiplication and one
     addition, rounded to float32, and then rounded to subsamples.
-
-    Args:
-        points: Projected points (x, y, depth), with the image in [-1, 1] and the
-            near plane at the depth -1, shape (V, 3).
-        resolution: Number of samples per side of the image.
-
-    Returns:
-        A tuple of
-        - x to the right and y down from the center of the first sample, in
-          subsamples, int64, shape (2, V);
-        - depths, float64, shape (V,).
     """
     half = resolution / 2
     # Positions from the top left corner of the image, in samples. The product with a
@@ -202,22 +169,13 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
     return positions, depths
 
 
-def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _TriangleRows:
+def _cull(triangles: Float[np.ndarray, "2 3 F"], resolution: int, closed: bool) -> _TriangleRows:
     """Find the triangles that can cover samples, and their rows.
 
     By the top-left rule, a sample on an edge belongs to the triangle to the
     right of the edge or, if the edge is horizontal, to the triangle below it.
     A triangle therefore covers only samples whose x and y are at least its
     smallest x and y, and less than its largest x and y.
-
-    Args:
-        triangles: Positions (x, y) of the three corners of F triangles in
-            subsamples, shape (2, 3, F).
-        resolution: Number of samples per side.
-        closed: True leaves out triangles that are clockwise in the image.
-
-    Returns:
-        Triangles that may cover samples.
     """
     areas = _doubled_areas(triangles)
     # First column and first row of samples in the bounding box of each triangle, as the
@@ -235,44 +193,19 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _TriangleRows
     )
 
 
-def _doubled_areas(triangles: np.ndarray) -> np.ndarray:
-    """Compute twice the signed areas of F triangles.
-
-    Args:
-        triangles: Positions (x, y) of the three corners, with y pointing down,
-            shape (2, 3, F).
-
-    Returns:
-        Areas, shape (F,). They are negative for triangles that are
-        counter-clockwise in the image.
-    """
+def _doubled_areas(triangles: Float[np.ndarray, "2 3 F"]) -> Float[np.ndarray, " F"]:
+    """Compute twice the signed areas of F triangles."""
     (ax, bx, cx), (ay, by, cy) = triangles
     return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
 
 
 def _next_sample(positions: np.ndarray) -> np.ndarray:
-    """Round positions in subsamples up to whole samples.
-
-    Args:
-        positions: Coordinates x or y in subsamples (1/256 of a sample), any shape.
-
-    Returns:
-        First column (for x) or row (for y) of samples at or after each position,
-        same shape.
-    """
+    """Round positions in subsamples up to whole samples."""
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
-def _sort(corners: np.ndarray) -> np.ndarray:
-    """Sort the three values of each column of an array, several times faster than np.sort.
-
-    Args:
-        corners: Integers, shape (3, T).
-
-    Returns:
-        The smallest, the middle and the largest value of each column,
-        shape (3, T).
-    """
+def _sort(corners: Int[np.ndarray, "3 T"]) -> Float[np.ndarray, "3 T"]:
+    """Sort the three values of each column of an array, several times faster than np.sort."""
     least = corners.min(axis=0)
     greatest = corners.max(axis=0)
     return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
@@ -295,19 +228,11 @@ class _EdgeLines(NamedTuple):
     """
 
     coefficients: np.ndarray
-    middle_row: np.ndarray
+    middle_row: Float[np.ndarray, " T"]
 
 
-def _edges(triangles: np.ndarray) -> _EdgeLines:
-    """Compute the lines through the edges of T triangles.
-
-    Args:
-        triangles: Positions (x, y) of the three corners in subsamples (1/256 of a
-            sample), shape (2, 3, T).
-
-    Returns:
-        Lines of the edges.
-    """
+def _edges(triangles: Float[np.ndarray, "2 3 T"]) -> _EdgeLines:
+    """Compute the lines through the edges of T triangles."""
     x, y = triangles
     # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
     # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
@@ -328,20 +253,12 @@ def _edges(triangles: np.ndarray) -> _EdgeLines:
 
 
 def _crossings(
-    edges: _EdgeLines, triangle: np.ndarray, row: np.ndarray, resolution: int
+    edges: _EdgeLines,
+    triangle: Int[np.ndarray, " N"],
+    row: Float[np.ndarray, " N"],
+    resolution: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row.
-
-    Args:
-        edges: Lines of the edges of T triangles.
-        triangle: Index of the triangle of each pair, shape (N,).
-        row: Row of each pair, shape (N,).
-        resolution: Number of samples per side.
-
-    Returns:
-        The first covered column, and the first column after the covered columns,
-        shape (N,) each.
-    """
+    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row."""
     is_below_middle = row >= edges.middle_row.take(triangle)
     triangle_count = len(edges.middle_row)
     # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
@@ -356,18 +273,10 @@ def _crossings(
     return np.minimum(*columns), np.maximum(*columns)
 
 
-def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Compute the depth of T triangles as a linear function of column and row.
-
-    Args:
-        triangles: Positions (x, y) of the three corners in subsamples,
-            shape (2, 3, T).
-        depths: Depths of the corners, shape (3, T).
-
-    Returns:
-        Five rows: the column, the row and the depth of the first corner, and the
-        slopes of the depth per column and per row, shape (5, T).
-    """
+def _planes(
+    triangles: Float[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
+) -> Float[np.ndarray, "5 T"]:
+    """Compute the depth of T triangles as a linear function of column and row."""
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
     to_b = depth_b - depth_a
@@ -378,18 +287,12 @@ def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
 
 
-def _expand(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _expand(counts: Float[np.ndarray, " N"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Repeat the index of each item as often as its count, and number the repetitions.
 
     For example, the counts 2 and 3 give the indices 0, 0, 1, 1, 1 and the numbers
     0, 1, 0, 1, 2. The result comes in blocks of about ENTRIES_PER_BLOCK entries.
     All entries of an item are in the same block.
-
-    Args:
-        counts: Count of each item, shape (N,).
-
-    Yields:
-        For a block of B entries, the indices and the numbers, shape (B,) each.
     """
     # Number of entries of all items up to each item, with and without the item itself.
     entries_with_item = np.cumsum(counts)

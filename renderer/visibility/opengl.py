@@ -25,6 +25,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from renderer.errors import InputError
 
@@ -55,26 +56,13 @@ void main() {
 FLOAT_BYTES = 4
 
 
-def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def rasterize(
+    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
+) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
     coordinates and the rounding.
-
-    Args:
-        points: The V vertices, projected to each of N views, finite, float64,
-            shape (N, V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: True leaves out faces that are clockwise in the image.
-
-    Returns:
-        Index of the nearest face at each sample, or -1 without a face, int32,
-        shape (N, R, R).
-
-    Raises:
-        InputError: If there is no EGL device, or if the driver fails or renders
-            wrong indices of faces.
     """
     # Sort the corners, so that two faces with the same corners in another order get exactly
     # the same depth. If the orientation of faces matters, the corners are only rotated, so
@@ -89,30 +77,14 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 
 
 def device() -> str:
-    """Return the name of the device on which OpenGL draws.
-
-    Returns:
-        Name of the device, such as the name of a GPU or "llvmpipe".
-
-    Raises:
-        InputError: If there is no EGL device, or if the driver fails or renders
-            wrong indices of faces.
-    """
+    """Return the name of the device on which OpenGL draws."""
     with _context() as context:
         return context.info["GL_RENDERER"]
 
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
-    """Create an OpenGL context for a `with` block, and check that it draws correctly.
-
-    Yields:
-        Context, which is released at the end of the block.
-
-    Raises:
-        InputError: If there is no EGL device, or if the driver fails or renders
-            wrong indices of faces.
-    """
+    """Create an OpenGL context for a `with` block, and check that it draws correctly."""
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.
     with suppress(ImportError):
@@ -143,9 +115,6 @@ def _check(context: moderngl.Context) -> None:
 
     Face 0 is a large triangle that is seen from behind, face 1 is the same
     triangle seen from the front, and face 2 is a small triangle in front of them.
-
-    Args:
-        context: OpenGL context.
     """
     large_triangle = [[-1, -1, 0], [3, -1, 0], [-1, 3, 0]]
     small_triangle = [[-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]
@@ -167,21 +136,13 @@ def _check(context: moderngl.Context) -> None:
 
 
 def _draw(
-    context: moderngl.Context, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool
-) -> np.ndarray:
-    """Draw N views and read the face ids.
-
-    Args:
-        context: OpenGL context.
-        points: Projected vertices, float64, shape (N, V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: True leaves out faces that are clockwise in the image.
-
-    Returns:
-        Index of the nearest face at each sample, or -1, int32,
-        shape (N, R, R).
-    """
+    context: moderngl.Context,
+    points: Float[np.ndarray, "N V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    resolution: int,
+    closed: bool,
+) -> Int[np.ndarray, "N R R"]:
+    """Draw N views and read the face ids."""
     import moderngl
 
     size = (resolution, resolution)

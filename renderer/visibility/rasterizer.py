@@ -35,6 +35,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from renderer.errors import InputError, require_choice
 from renderer.settings import RASTERIZERS
@@ -59,26 +60,13 @@ class Rasterizer:
     description: str
 
     def rasterize(
-        self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False
-    ) -> np.ndarray:
-        """Find the nearest face at each sample of N images.
-
-        Args:
-            points: Vertices as the N cameras project them, float64,
-                shape (N, V, 3). x and y are in [-1, 1] in the image, and the
-                third coordinate is the depth.
-            faces: Vertex indices of the faces, shape (F, 3).
-            resolution: Number R of samples per side of an image.
-            closed: True promises that the mesh is watertight. Faces that are seen
-                from behind are then left out.
-
-        Returns:
-            Index of the nearest face at each sample, or -1, int32,
-            shape (N, R, R).
-
-        Raises:
-            ValueError: If a point is NaN or infinite.
-        """
+        self,
+        points: Float[np.ndarray, "N V 3"],
+        faces: Int[np.ndarray, "F 3"],
+        resolution: int,
+        closed: bool = False,
+    ) -> Int[np.ndarray, "N R R"]:
+        """Find the nearest face at each sample of N images."""
         lowest = points.min(initial=0)
         highest = points.max(initial=0)
         if not (np.isfinite(lowest) and np.isfinite(highest)):
@@ -92,20 +80,7 @@ class Rasterizer:
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
-    """Choose a rasterizer that works on this machine.
-
-    Args:
-        rasterizer: Name of the rasterizer. "auto" chooses numba if it is
-            installed, and numpy otherwise. Images are then the same on every
-            machine.
-
-    Returns:
-        The rasterizer.
-
-    Raises:
-        InputError: If the name is unknown, if "opengl" does not work on this
-            machine, or if "numba" is chosen but not installed.
-    """
+    """Choose a rasterizer that works on this machine."""
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
         return Rasterizer("opengl", f"opengl ({opengl.device()})")

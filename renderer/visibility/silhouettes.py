@@ -33,10 +33,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -44,9 +45,6 @@ from renderer.camera import Camera
 from renderer.mesh import EDGES
 from renderer.visibility.fragments import Fragments
 from renderer.visibility.numpy import SUBSAMPLES, to_fixed_point
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 # A silhouette counts as visible if it is behind the surface beside it by at most this
 # fraction of the depth range of the mesh. For example, the lower edge of an object that
@@ -82,12 +80,12 @@ class Crossings(NamedTuple):
             NOT_COVERED, shape (2, K).
     """
 
-    ends: Tensor
-    fraction: Tensor
-    normal: Tensor
-    horizontal: Tensor
-    cells: Tensor
-    samples: Tensor
+    ends: Int[Tensor, "2 K"]
+    fraction: Float[Tensor, " K"]
+    normal: Float[Tensor, "2 K"]
+    horizontal: Bool[Tensor, " K"]
+    cells: Float[Tensor, "2 K"]
+    samples: Int[Tensor, "2 K"]
 
 
 def moving_outlines(
@@ -104,20 +102,6 @@ def moving_outlines(
     gradient and does not change the values. Not only the P covered pixels have
     such a gradient, but also E uncovered pixels beside silhouettes. The gradient
     reaches the vertices, and the fields of the camera that are tensors.
-
-    Args:
-        fragments: The S samples of the view that show the mesh.
-        camera: Camera of the view.
-        vertices: Vertex positions in world axes, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        radiance: Linear radiance at the covered samples, shape (3, S).
-        background: Linear background of all pixels, shape (3, size²).
-
-    Returns:
-        A tuple of
-        - the row-major indices of the E uncovered pixels, shape (E,);
-        - zeros to add to the linear values of the P covered pixels and then of
-          the E uncovered pixels, shape (3, P + E).
     """
     positions, nearness = camera.homogeneous(vertices.double())
     sample_indices = torch.arange(
@@ -161,19 +145,10 @@ class _ZerosWithGradient(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, positions: Tensor, view: _MovingView) -> Tensor:
-        """Create the zeros, and store the view and the positions for `backward`.
-
-        Args:
-            ctx: Context of autograd.
-            positions: Homogeneous positions (x w, y w, w) of the V vertices in
-                the image, shape (V, 3).
-            view: View with P covered and E uncovered pixels, whose gradient
-                `backward` computes.
-
-        Returns:
-            Zeros, shape (3, P + E).
-        """
+    def forward(
+        ctx: Any, positions: Float[Tensor, "V 3"], view: _MovingView
+    ) -> Float[Tensor, "3 _"]:
+        """Create the zeros, and store the view and the positions for `backward`."""
         ctx.save_for_backward(positions)
         ctx.view = view
         pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
@@ -181,18 +156,8 @@ class _ZerosWithGradient(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Compute the gradient with respect to the homogeneous positions.
-
-        Args:
-            ctx: Context of autograd.
-            upstream: Gradient with respect to the linear values of the P covered
-                and E uncovered pixels, shape (3, P + E).
-
-        Returns:
-            Gradient with respect to the homogeneous positions (x w, y w, w) of the
-            V vertices, shape (V, 3), and None for the view.
-        """
+    def backward(ctx: Any, upstream: Float[Tensor, "3 _"]) -> tuple[Tensor, None]:
+        """Compute the gradient with respect to the homogeneous positions."""
         (positions,) = ctx.saved_tensors
         view: _MovingView = ctx.view
         # The factor size / (4 s) is a product of three: the image has the width 2, so a
@@ -221,22 +186,15 @@ class _MovingView:
 
     fragments: Fragments
     crossings: Crossings
-    sample_grid: Tensor
-    uncovered_pixels: Tensor
-    radiance: Tensor
-    background: Tensor
+    sample_grid: Int[Tensor, "_ _"]
+    uncovered_pixels: Int[Tensor, " E"]
+    radiance: Float[Tensor, "3 S"]
+    background: Float[Tensor, "3 size²"]
 
-    def gradient_of_surfaces(self, positions: Tensor, upstream: Tensor) -> Tensor:
-        """Compute the gradient with respect to movements of surfaces, without silhouettes.
-
-        Args:
-            positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient with respect to the linear values of the P covered
-                and E uncovered pixels, shape (3, P + E).
-
-        Returns:
-            Gradient with respect to the homogeneous positions, shape (V, 3).
-        """
+    def gradient_of_surfaces(
+        self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]
+    ) -> Float[Tensor, "V 3"]:
+        """Compute the gradient with respect to movements of surfaces, without silhouettes."""
         fragments = self.fragments
         upstream_at_samples = upstream.index_select(1, fragments.sample_to_pixel)
         # Radiance times upstream gradient, summed over the color channels.
@@ -268,22 +226,12 @@ class _MovingView:
         return gradient.T
 
     def _gradient_along(
-        self, axis: int, weighted_image: Tensor, upstream_at_samples: Tensor
-    ) -> Tensor:
-        """Compute the gradient with respect to movements of surfaces along one image axis.
-
-        Args:
-            axis: X for movements to the right, or Y for movements down.
-            weighted_image: Radiance times upstream gradient, summed over the color
-                channels, for each sample of the image, shape (size · s, size · s).
-                NaN for samples that show no mesh.
-            upstream_at_samples: Upstream gradient of the pixel of each covered
-                sample, shape (3, S).
-
-        Returns:
-            Gradient with respect to the position of the surface at each covered
-            sample, shape (S,).
-        """
+        self,
+        axis: int,
+        weighted_image: Float[Tensor, "_ _"],
+        upstream_at_samples: Float[Tensor, "3 S"],
+    ) -> Float[Tensor, " S"]:
+        """Compute the gradient with respect to movements of surfaces along one image axis."""
         # Rows are dimension 0 of the image, so the axis X (0) is dimension 1.
         dim = 1 - axis
         steps = len(self.sample_grid) - 1
@@ -308,21 +256,13 @@ class _MovingView:
         return self.fragments.of_image(gradient)
 
     def _correct_pixel_borders(
-        self, dim: int, difference: Tensor, upstream_at_samples: Tensor
+        self, dim: int, difference: Float[Tensor, "_ _"], upstream_at_samples: Float[Tensor, "3 S"]
     ) -> None:
         """Replace the differences between samples of two neighboring pixels, in place.
 
         The two pixels have different upstream gradients. The correct difference is
         the difference of the two radiances times the mean of the two upstream
         gradients.
-
-        Args:
-            dim: Dimension of the image along which the samples are neighbors.
-            difference: Radiance times upstream gradient of each sample of the
-                image, minus that of the next sample, shape (size · s, size · s).
-                It is changed in place.
-            upstream_at_samples: Upstream gradient of the pixel of each covered
-                sample, shape (3, S).
         """
         samples = self.fragments.samples
         # Slices of the image for the last samples of all pixels but the last one (before),
@@ -344,25 +284,15 @@ class _MovingView:
         corrected = (radiance_difference * upstream_sum).sum(0) / 2
         difference[before].masked_scatter_(are_covered, corrected)
 
-    def gradient_of_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+    def gradient_of_silhouettes(
+        self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]
+    ) -> tuple[Tensor, Tensor]:
         """Compute the gradient with respect to movements of silhouette edges at K crossings.
 
         A crossing is a place where a silhouette edge passes between two samples.
         An edge with the unit normal n that moves by v moves along a row by
         n · v / n_x. Its crossing with the row has the weight n_x², so that the
         product is n_x (n · v).
-
-        Args:
-            positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient with respect to the linear values of the P covered
-                and E uncovered pixels, shape (3, P + E).
-
-        Returns:
-            A tuple of
-            - the vertices at the first ends of the K edges, and then at the
-              second ends, shape (2 K,);
-            - the gradient with respect to the homogeneous positions of these
-              vertices, shape (2 K, 3).
         """
         crossings = self.crossings
         # Component of the edge normal in the direction from the first to the second sample,
@@ -381,18 +311,11 @@ class _MovingView:
             gradients.append(_to_homogeneous(end_gradients, end_position, depth[:, None]))
         return crossings.ends.flatten(), torch.cat(gradients)
 
-    def _crossing_gradients(self, upstream: Tensor) -> Tensor:
+    def _crossing_gradients(self, upstream: Float[Tensor, "3 _"]) -> Float[Tensor, " K"]:
         """Compute the gradient with respect to movements of silhouettes between two samples.
 
         Each of the K crossings lies between a first and a second sample. The
         movement is toward the second sample.
-
-        Args:
-            upstream: Gradient with respect to the linear values of the P covered
-                and E uncovered pixels, shape (3, P + E).
-
-        Returns:
-            Gradient of each crossing, shape (K,).
         """
         # Two rows: pixels of the first samples, and pixels of the second samples.
         pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
@@ -413,51 +336,28 @@ class _MovingView:
             gradient += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
         return gradient
 
-    def _seen_radiance(self, samples: Tensor, pixels: Tensor) -> Tensor:
-        """Look up the radiance at K samples, or the background if a sample shows no mesh.
-
-        Args:
-            samples: Index of each sample among the covered samples, or NOT_COVERED
-                if it shows no mesh, shape (K,).
-            pixels: Row-major index of the pixel whose background is used instead,
-                shape (K,).
-
-        Returns:
-            Radiance, shape (3, K).
-        """
+    def _seen_radiance(
+        self, samples: Int[Tensor, " K"], pixels: Int[Tensor, " K"]
+    ) -> Float[Tensor, "3 K"]:
+        """Look up the radiance at K samples, or the background if a sample shows no mesh."""
         return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
-def _to_homogeneous(gradients: Tensor, places: Tensor, depth: Tensor) -> Tensor:
+def _to_homogeneous(
+    gradients: Float[Tensor, "N 2"], places: Float[Tensor, "N 2"], depth: Float[Tensor, "N 1"]
+) -> Float[Tensor, "N 3"]:
     """Convert gradients of N points from image positions to homogeneous positions.
 
     The image position (x, y) has the homogeneous coordinates (x w, y w, w). With
     the gradient (a, b) with respect to (x, y), the chain rule gives
     (a, b, -(a x + b y)) / w.
-
-    Args:
-        gradients: Gradients with respect to the image positions, shape (N, 2).
-        places: Image positions (x, y), shape (N, 2).
-        depth: Third homogeneous coordinate w, shape (N, 1).
-
-    Returns:
-        Gradients with respect to the homogeneous coordinates, shape (N, 3).
     """
     depth_gradient = -(gradients * places).sum(1, keepdim=True)
     return torch.cat([gradients, depth_gradient], dim=1) / depth
 
 
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
-    """Find the pixels to which samples of an image belong.
-
-    Args:
-        cells: Row-major indices of the samples among all samples of the image,
-            any shape.
-        fragments: View with the size of the image and its samples per pixel.
-
-    Returns:
-        Row-major indices of the pixels, same shape.
-    """
+    """Find the pixels to which samples of an image belong."""
     samples = fragments.samples
     resolution = fragments.size * samples
     row = cells // resolution // samples
@@ -467,27 +367,12 @@ def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
 
 def _find_crossings(
     fragments: Fragments,
-    positions: np.ndarray,
-    nearness: np.ndarray,
-    faces: np.ndarray,
-    sample_grid: np.ndarray,
+    positions: Float[np.ndarray, "V 3"],
+    nearness: Float[np.ndarray, " V"],
+    faces: Int[np.ndarray, "F 3"],
+    sample_grid: Int[np.ndarray, "_ _"],
 ) -> Crossings:
-    """Find where visible silhouette edges pass between neighboring samples.
-
-    Args:
-        fragments: Samples of the view that show the mesh, with tensors on the CPU.
-        positions: Homogeneous positions (x w, y w, w) of the vertices,
-            shape (V, 3).
-        nearness: Number for each vertex that is larger for nearer points, and
-            that is a linear function of the image position on each face (like
-            the reciprocal of the depth), shape (V,).
-        faces: Vertex indices of all faces, shape (F, 3).
-        sample_grid: Index of the covered sample at each sample of the image, or
-            NOT_COVERED, shape (size · s, size · s).
-
-    Returns:
-        Crossings with rows of samples, and then crossings with columns.
-    """
+    """Find where visible silhouette edges pass between neighboring samples."""
     x, y, w = positions.T
     points = np.stack([x / w, y / w, nearness]).T
     # Positions (x, y) of the vertices, with y down, in units of samples. They are rounded
@@ -527,21 +412,14 @@ class _Silhouettes:
     """
 
     fragments: Fragments
-    places: np.ndarray
-    nearness: np.ndarray
-    sample_grid: np.ndarray
-    ends: np.ndarray
-    normal: np.ndarray
+    places: Float[np.ndarray, "2 V"]
+    nearness: Float[np.ndarray, " V"]
+    sample_grid: Int[np.ndarray, "_ _"]
+    ends: Float[np.ndarray, "2 N"]
+    normal: Float[np.ndarray, "2 N"]
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
-        """Find where visible silhouettes pass between samples that are neighbors along an axis.
-
-        Args:
-            axis: X for neighbors in a row, and Y for neighbors in a column.
-
-        Returns:
-            Arrays for the attributes of `Crossings`, in their order.
-        """
+        """Find where visible silhouettes pass between samples that are neighbors along an axis."""
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
@@ -585,24 +463,16 @@ class _Silhouettes:
         )
 
     def _is_visible(
-        self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray
-    ) -> np.ndarray:
+        self,
+        cuts: _Cuts,
+        samples: Int[np.ndarray, "2 K"],
+        surface_nearness: Float[np.ndarray, "2 K"],
+    ) -> Bool[np.ndarray, " K"]:
         """Tell at which of K places (cuts) a silhouette edge is visible.
 
         A cut is the place where an edge crosses a row or a column of samples. The
         edge is hidden there if the surfaces at both samples beside it are nearer to
         the camera. It counts as hidden, too, if no sample beside it shows a surface.
-
-        Args:
-            cuts: The K cuts.
-            samples: Index of the sample before (row 0) and after (row 1) each cut,
-                or NOT_COVERED (-1) if this sample shows no surface, shape (2, K).
-            surface_nearness: Nearness (a number that is larger for nearer points)
-                of the surfaces that the two samples show, extended to the cut,
-                shape (2, K). Minus infinity for NOT_COVERED.
-
-        Returns:
-            True for visible cuts, shape (K,).
         """
         tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
         start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
@@ -614,22 +484,13 @@ class _Silhouettes:
         shows_surface = (samples != NOT_COVERED).any(axis=0)
         return shows_surface & is_in_front
 
-    def _surface_nearness(self, samples: np.ndarray, place: np.ndarray) -> np.ndarray:
+    def _surface_nearness(
+        self, samples: Int[np.ndarray, "2 K"], place: Float[np.ndarray, "2 K"]
+    ) -> Float[np.ndarray, "2 K"]:
         """Compute how near the faces beside K cuts are, if they are extended to the cuts.
 
         A cut is the place where a silhouette edge crosses a row or a column of
         samples. The faces are those that the samples before and after it show.
-
-        Args:
-            samples: Indices of the covered samples before and after each cut, or
-                NOT_COVERED, shape (2, K).
-            place: Image position (x, y) of each cut in units of samples,
-                shape (2, K).
-
-        Returns:
-            Nearness (larger for nearer points) of the plane of the face that each
-            sample shows, at the cut, shape (2, K). It is minus infinity for
-            NOT_COVERED.
         """
         sample_to_seen_face = self.fragments.sample_to_seen_face.numpy()
         # Axes: before or after the cut, cut, corner. The index -1 (NOT_COVERED) selects an
@@ -651,16 +512,10 @@ class _Silhouettes:
         return np.where(samples >= 0, plane, -np.inf)
 
 
-def _smallest_in_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Find the smallest value of each group of values.
-
-    Args:
-        values: N values, shape (N,).
-        groups: Number of the group of each value, at least 0, shape (N,).
-
-    Returns:
-        Index of the smallest value of each group, in ascending order of the groups.
-    """
+def _smallest_in_groups(
+    values: Float[np.ndarray, " N"], groups: Float[np.ndarray, " N"]
+) -> np.ndarray:
+    """Find the smallest value of each group of values."""
     # Sort by the group, and then by the value.
     order = np.lexsort([values, groups])
     is_first_of_group = np.diff(groups[order], prepend=-1) != 0
@@ -681,17 +536,17 @@ class _Cuts(NamedTuple):
             shape (K,).
     """
 
-    edge: np.ndarray
-    line: np.ndarray
-    fraction: np.ndarray
-    next_sample: np.ndarray
+    edge: Int[np.ndarray, " K"]
+    line: Int[np.ndarray, " K"]
+    fraction: Float[np.ndarray, " K"]
+    next_sample: Int[np.ndarray, " K"]
 
 
 def _cut_edges(
-    start_across: np.ndarray,
-    end_across: np.ndarray,
-    start_along: np.ndarray,
-    end_along: np.ndarray,
+    start_across: Float[np.ndarray, " N"],
+    end_across: Float[np.ndarray, " N"],
+    start_along: Float[np.ndarray, " N"],
+    end_along: Float[np.ndarray, " N"],
     resolution: int,
 ) -> _Cuts:
     """Find where N edges cross rows of samples, or columns of samples.
@@ -701,20 +556,6 @@ def _cut_edges(
     way round. Coordinates are in units of samples. Line i has the coordinate i.
     Crossings before the first sample or after the last sample of a line are left
     out.
-
-    Args:
-        start_across: Coordinate of the start of each edge across the lines,
-            shape (N,).
-        end_across: Coordinate of the end of each edge across the lines,
-            shape (N,).
-        start_along: Coordinate of the start of each edge along the lines,
-            shape (N,).
-        end_along: Coordinate of the end of each edge along the lines,
-            shape (N,).
-        resolution: Number of lines, and of samples in a line.
-
-    Returns:
-        Cuts in ascending order of the edge and then of the line.
     """
     lower = np.minimum(start_across, end_across)
     upper = np.maximum(start_across, end_across)
@@ -740,16 +581,10 @@ def _cut_edges(
     )
 
 
-def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image.
-
-    Args:
-        places: Image positions (x, y) of the vertices, shape (2, V).
-        faces: Vertex indices of the faces, shape (F, 3).
-
-    Returns:
-        Vertices at both ends of the N silhouette edges, shape (2, N).
-    """
+def _silhouette_edges(
+    places: Float[np.ndarray, "2 V"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "2 N"]:
+    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image."""
     edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
@@ -781,11 +616,11 @@ class _Edges(NamedTuple):
         face_count: Number of faces at each edge, shape (N,).
     """
 
-    corners: np.ndarray
-    ends: np.ndarray
-    edge_of_face_side: np.ndarray
-    direction: np.ndarray
-    face_count: np.ndarray
+    corners: Int[np.ndarray, "3 F"]
+    ends: Int[np.ndarray, "2 N"]
+    edge_of_face_side: Int[np.ndarray, " 3*F"]
+    direction: Int[np.ndarray, "3 F"]
+    face_count: Float[np.ndarray, " N"]
 
 
 @lru_cache(maxsize=4)
@@ -793,13 +628,6 @@ def _edges(face_bytes: bytes) -> _Edges:
     """Find the edges of a mesh.
 
     Each face has three sides. Sides with the same two vertices are one edge.
-
-    Args:
-        face_bytes: Bytes of an int64 array with the vertex indices of F faces,
-            shape (F, 3). Bytes can be hashed, so that the result can be cached.
-
-    Returns:
-        Edges of the mesh.
     """
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
     corners = np.ascontiguousarray(faces.T)

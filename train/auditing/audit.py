@@ -102,19 +102,6 @@ def run_audit(
 
     Results that an earlier, stopped audit wrote to this folder are not measured
     again.
-
-    Args:
-        settings: Settings of the audit.
-        networks: Network to audit under the key CLASSIFIER and, if there is
-            one, its hardened version under the key HARDENED. None loads the
-            networks that the settings name.
-
-    Returns:
-        Path and content of the report.
-
-    Raises:
-        InputError: If an input cannot be read, if a network lacks a class, or
-            if the folder holds results of other settings.
     """
     is_named = networks is None
     if networks is None:
@@ -166,17 +153,7 @@ def run_audit(
 def _audit_photographs(
     settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
 ) -> page.Audited:
-    """Audit networks without meshes, on photographs in the light of a projector.
-
-    Args:
-        settings: Settings of the audit, with a folder of photographs.
-        networks: Networks by the name of the subfolder for their results.
-        is_named: Whether the settings name the networks. Only then may an audit
-            that was stopped continue.
-
-    Returns:
-        Path and content of the report.
-    """
+    """Audit networks without meshes, on photographs in the light of a projector."""
     device = choose_device(settings.device)
     find_unlabeled(published(Path(str(settings.photographs))))
     out = writable_folder(settings.out, "out")
@@ -200,13 +177,7 @@ def _audit_photographs(
 
 
 def _measure_photographs(network: Classifier, settings: AuditSettings, results: Path) -> None:
-    """Attack a network by the light of a projector on photographs, unless the results exist.
-
-    Args:
-        network: Network to attack.
-        settings: Settings of the audit, with a folder of photographs.
-        results: Folder for all results of this network.
-    """
+    """Attack a network by the light of a projector on photographs, unless the results exist."""
     _write_folder(results / RELIT_FOLDER, partial(measure_photographs, network, settings))
 
 
@@ -214,12 +185,6 @@ def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
     """Choose the names of the networks in the report.
 
     If both networks have the same name, " (hardened)" is added to the second.
-
-    Args:
-        networks: Networks by the name of the subfolder for their results.
-
-    Returns:
-        Names in the report, by the same keys.
     """
     names = {key: network.name for key, network in networks.items()}
     if len(set(names.values())) < len(names):
@@ -269,9 +234,6 @@ class _Plan:
         """Find the ordinary light and the size at which the audited network recognizes most views.
 
         The views of all networks then have this light and this size.
-
-        Args:
-            results: Folder for the results of the audited network.
         """
         results.mkdir(exist_ok=True)
         path = results / page.PLAIN
@@ -281,12 +243,7 @@ class _Plan:
         self.attacked_views = plain.apply_to(self.attacked_views)
 
     def measure(self, key: str, results: Path) -> None:
-        """Test and attack one network, except for results that exist already.
-
-        Args:
-            key: Key of the network in `networks`.
-            results: Folder for the results of this network.
-        """
+        """Test and attack one network, except for results that exist already."""
         network = self.networks[key]
         results.mkdir(exist_ok=True)
         lights = (self.environments, self.random_light_count)
@@ -306,21 +263,12 @@ class _Plan:
 
         This remedy normalizes the colors of an image before the network
         classifies it.
-
-        Args:
-            out: Folder of the audit.
         """
         for key, network in normalizing(self.networks).items():
             self._score(network, out / key)
 
     def _score(self, network: Classifier, results: Path) -> None:
-        """Score a network on all test images, and write the scores to subfolders.
-
-        Args:
-            network: Network, with or without normalized light.
-            results: Folder for the results of this network. It gets a
-                subfolder for each key of `image_folders`.
-        """
+        """Score a network on all test images, and write the scores to subfolders."""
         for name, images in self.image_folders.items():
             results.mkdir(exist_ok=True)
             predictor = Predictor(network, network.classes, network.size, self.device)
@@ -328,21 +276,7 @@ class _Plan:
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
-    """Fill in the class and the hard negatives if the settings leave them out.
-
-    Args:
-        settings: Settings of the audit.
-        classifier: Network to audit, which has the names of the classes.
-
-    Returns:
-        Settings in which `label` is the name of the class, and in which
-        `hard_negatives` is not empty if test images must be rendered.
-
-    Raises:
-        InputError: If the network lacks a class, if neither `label` nor the
-            names of the meshes tell the class, or if a hard negative has this
-            class.
-    """
+    """Fill in the class and the hard negatives if the settings leave them out."""
     if settings.label is None:
         label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
     else:
@@ -362,18 +296,7 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
 
 
 def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
-    """Load the network to audit and, if the settings name one, the hardened network.
-
-    Args:
-        settings: Settings of the audit.
-
-    Returns:
-        Networks under the keys CLASSIFIER and HARDENED, which are also the
-        names of the subfolders for their results.
-
-    Raises:
-        InputError: If a network cannot be loaded.
-    """
+    """Load the network to audit and, if the settings name one, the hardened network."""
     with keyed(name="classifier"):
         classifier = load_chosen(settings)
     networks = {CLASSIFIER: classifier}
@@ -389,18 +312,7 @@ def _require_classes(
     folders: Mapping[str, Path],
     label: str,
 ) -> None:
-    """Check that all networks have the classes of the meshes and of the test images.
-
-    Args:
-        networks: Networks of the audit.
-        items: Settings of the meshes and the hard negatives. The networks need
-            not have classes whose names start with "other_".
-        folders: Folders of labeled test images, "laboratory" and "photographs".
-        label: Class whose objects are tested.
-
-    Raises:
-        InputError: If a network lacks a class.
-    """
+    """Check that all networks have the classes of the meshes and of the test images."""
     labels = {item.label for item in items if not item.label.startswith(OTHER_PREFIX)}
     for network in networks:
         for name in labels:
@@ -411,11 +323,7 @@ def _require_classes(
 
 
 def _size_caveats(networks: Collection[Classifier]) -> list[str]:
-    """Return a sentence for the report if the networks take images of different sizes.
-
-    Returns:
-        List with the sentence. Empty if all networks take the same size.
-    """
+    """Return a sentence for the report if the networks take images of different sizes."""
     sizes = [str(network.size) for network in networks]
     if len(set(sizes)) == 1:
         return []
@@ -438,14 +346,6 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
 
     With `settings.overwrite`, the results of an earlier audit are removed.
     Otherwise an earlier audit in the folder must have the same settings.
-
-    Args:
-        settings: Settings of the audit.
-        out: Folder of the audit.
-        renders: Subfolder of `out` for path-traced renders.
-
-    Raises:
-        InputError: If the folder has an audit with other settings.
     """
     if settings.overwrite:
         networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
@@ -463,13 +363,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
 
 
 def _may_change(key: str, old: Any, new: Any) -> bool:
-    """Return whether a setting may change when a stopped audit continues.
-
-    Args:
-        key: Key of the setting.
-        old: Value when the audit began. Only None may change.
-        new: Value now. Any value is allowed.
-    """
+    """Return whether a setting may change when a stopped audit continues."""
     return old is None and key in SETTABLE_LATER
 
 
@@ -478,14 +372,6 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
 
     They show the meshes and the hard negatives under each pattern of PATTERNS,
     and in each environment map of the audit.
-
-    Args:
-        settings: Settings of the audit.
-        out: Folder for the renders.
-        size: Pixels per side of the renders.
-
-    Returns:
-        Settings of pnb-lab, which renders them.
     """
     meshes, hard_negatives = read_meshes(settings)
     lighting_count = len(PATTERNS) + len(settings.environments)
@@ -507,16 +393,6 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
 
     A hard negative without a label gets a label that starts with "other_",
     which need not be a class of the networks.
-
-    Args:
-        settings: Settings of the audit.
-
-    Returns:
-        Two lists: settings of the meshes of the class `settings.label`, and
-        settings of the hard negatives.
-
-    Raises:
-        InputError: If a mesh has another label than `settings.label`.
     """
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
     hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
@@ -538,14 +414,6 @@ def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
     An audit of networks that the caller passes as objects is never continued.
     config.yaml does not have their names, so the results may be about other
     networks.
-
-    Args:
-        out: Folder of the audit.
-        overwrite: Whether results of other commands may be replaced.
-        is_named: Whether the settings name the networks.
-
-    Raises:
-        InputError: If the folder has other results that may not be replaced.
     """
     # Files with these names are results of this audit, which continues with them.
     own_results: Collection[str] = ()
@@ -558,14 +426,7 @@ def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
 
 
 def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
-    """Write the return value of a function to a JSON file, unless the file exists.
-
-    Args:
-        path: JSON file.
-        measure: Function that measures a result of the audit. It is not called
-            if the file exists.
-        *arguments: Arguments of this function.
-    """
+    """Write the return value of a function to a JSON file, unless the file exists."""
     if not path.exists():
         atomic_write(path, json.dumps(measure(*arguments)) + "\n", durable=True)
 
@@ -576,14 +437,7 @@ def _search(classifier: Classifier, views: Views) -> dict[str, Any]:
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
-    """Score a network on a folder of photographs. Unreadable photographs are left out.
-
-    Args:
-        predictor: Network, with the names of its classes.
-        folder: Folder of photographs.
-        label: Class whose objects are tested.
-        out: Folder for the scores.
-    """
+    """Score a network on a folder of photographs. Unreadable photographs are left out."""
     evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
@@ -591,11 +445,6 @@ def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
     """Write a result of the audit to a folder, unless the folder exists.
 
     The result is written to FOLDER.part, which is renamed when it is complete.
-
-    Args:
-        folder: Folder for the result.
-        write: Function that writes the result to the folder that is passed to
-            it.
     """
     if not folder.exists():
         unfinished = folder.with_name(f"{folder.name}.part")

@@ -110,21 +110,7 @@ def write_audit_page(
     out: Path,
     caveats: Sequence[str],
 ) -> Audited:
-    """Write report.html from the results in the folder of an audit.
-
-    Args:
-        label: Class whose objects were tested.
-        names: Name of each network, by the name of the subfolder of `out` with
-            its results.
-        remedies: For the original network and for each remedy that is
-            compared, the name of the subfolder of `out` with its scores.
-        folders: Folders of test images, "laboratory" and "photographs".
-        out: Folder of the audit.
-        caveats: Sentences at the beginning of the report.
-
-    Returns:
-        Path and content of the report.
-    """
+    """Write report.html from the results in the folder of an audit."""
     results = {name: out / key for key, name in names.items()}
     scored = {}
     for name, folder in results.items():
@@ -186,17 +172,7 @@ def write_audit_page(
 def _recommendation(
     remedies: Mapping[str, str], folders: Mapping[str, Path], out: Path
 ) -> Recommendation | None:
-    """Recommend a remedy by the scores on the first folder of test images.
-
-    Args:
-        remedies: For the original network, which comes first, and for each
-            remedy, the name of the subfolder of `out` with its scores.
-        folders: Folders of test images, "laboratory" and "photographs".
-        out: Folder of the audit.
-
-    Returns:
-        The recommendation. None without test images, or without a remedy.
-    """
+    """Recommend a remedy by the scores on the first folder of test images."""
     images = next(iter(folders), None)
     if images is None or len(remedies) == 1:
         return None
@@ -210,16 +186,6 @@ def _with_remedies(
 
     This remedy normalizes the colors of an image before the network classifies
     it.
-
-    Args:
-        results: Folder of results of each network, by the name of the network.
-        remedies: For the original network and for each remedy, the name of the
-            subfolder of `out` with its scores.
-        out: Folder of the audit.
-
-    Returns:
-        `results` with additional entries. Their names are such as
-        "resnet50, normalized light".
     """
     name_of_folder = {folder.name: name for name, folder in results.items()}
     added = {}
@@ -231,18 +197,7 @@ def _with_remedies(
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Choose the attack that the slider of the report shows, the first that succeeds.
-
-    Args:
-        counts: For the name of each network and for each kind of lighting, the
-            dictionary that `success_by_light` returned. It has the key "slider"
-            if an attack succeeds.
-
-    Returns:
-        Renders of the attack as `frames_of` returned them, with the classes in
-        words. The key "network" has the name of the network, and "light" the
-        title of the lighting. None if no attack succeeds.
-    """
+    """Choose the attack that the slider of the report shows, the first that succeeds."""
     for name, counts_of_network in counts.items():
         for kind, attack_counts in counts_of_network.items():
             if "slider" in attack_counts:
@@ -264,15 +219,6 @@ def _first_screen(
 
     With two networks and test images, it compares the scores of the networks.
     Otherwise it describes the first network.
-
-    Args:
-        label: Class whose objects were tested.
-        results: Folder of results of each network, by the name of the network.
-        folders: Folders of test images, "laboratory" and "photographs".
-        counts: For the name of each network and for each kind of lighting, the
-            dictionary that `success_by_light` returned.
-        plain: Light, exposure and size in which the first network recognizes
-            most views.
     """
     (name, folder), *others = results.items()
     images = next(iter(folders), None)
@@ -303,17 +249,7 @@ def _compare(
     hardened: tuple[str, Path],
     images: Path,
 ) -> FirstScreen | None:
-    """Make the top of a report that compares a network with its hardened version.
-
-    Args:
-        label: Class whose objects were tested.
-        original: Name of the original network, and folder of its scores.
-        hardened: Name of the hardened network, and folder of its scores.
-        images: Folder of test images, on which both were scored.
-
-    Returns:
-        Top of the report. None if a metric is unknown.
-    """
+    """Make the top of a report that compares a network with its hardened version."""
     evaluations = _evaluations(dict([original, hardened]))
     compared = Compared(
         label=in_words(label),
@@ -329,15 +265,7 @@ def _compare(
 
 
 def _evaluations(score_folders: Mapping[str, Path]) -> compare.Evaluations:
-    """Read the predictions of several networks for the same images.
-
-    Args:
-        score_folders: Folder with the scores of each network, by the name of
-            the network.
-
-    Returns:
-        For the name of each network, its evaluation.
-    """
+    """Read the predictions of several networks for the same images."""
     runs = {}
     for name, folder in score_folders.items():
         scores = {folder.name: summary.PhotographScores.read(read_json(folder / SUMMARY))}
@@ -348,15 +276,7 @@ def _evaluations(score_folders: Mapping[str, Path]) -> compare.Evaluations:
 
 
 def _score_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
-    """Collect the plots, tables and pictures of the scores on each folder of test images.
-
-    Args:
-        results: Folder of results of each network, by the name of the network.
-
-    Returns:
-        For each folder of test images, the values that `scores_section`
-        returns.
-    """
+    """Collect the plots, tables and pictures of the scores on each folder of test images."""
     runs = {}
     for name, folder in results.items():
         scores = summary.read_summaries(folder)
@@ -365,14 +285,7 @@ def _score_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
 
 
 def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
-    """Yield a sentence about each folder of test images with files that cannot be read.
-
-    Args:
-        images: Names of the folders of test images: "laboratory",
-            "photographs" or both.
-        folder: Folder of results of one network. All networks read the same
-            images.
-    """
+    """Yield a sentence about each folder of test images with files that cannot be read."""
     for name in images:
         files = read_json(folder / name / SUMMARY)["unreadable"]
         if files:
@@ -381,11 +294,8 @@ def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
 
 
 def _agreement(scored: Predictions) -> Proportion:
-    """Compute the fraction of the test photographs for which all networks predict the same class.
-
-    Args:
-        scored: Predictions by the name of the network and of the folder of test
-            images. Without photographs, the fraction is unknown.
+    """Compute the fraction of the test photographs for which all networks predict the same
+    class.
     """
     by_network = [by_images.get(PHOTOGRAPHS, ()) for by_images in scored.values()]
     is_same = []
@@ -409,19 +319,7 @@ class Finding(NamedTuple):
 
 
 def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -> str:
-    """Write whether a network is safe in unusual lighting, and why it is not.
-
-    Args:
-        label: Class whose objects were tested.
-        name: Name of the network.
-        folder: Folder of results of the network.
-        images: Names of the folders of test images: "laboratory",
-            "photographs", both or none.
-
-    Returns:
-        Question and answer, such as "Is resnet50 safe under unusual lighting?
-        Yes, as far as this audit looks."
-    """
+    """Write whether a network is safe in unusual lighting, and why it is not."""
     if not any(any(views) for views in read_json(folder / RECOGNIZED).values()):
         question = f"Is {name} safe under unusual lighting?"
         return f"{question} Unknown: it does not recognize {label} in plain light, either."
@@ -445,19 +343,7 @@ def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -
 def _find_rates(
     label: str, folder: Path, images: Collection[str]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Find what fraction of the renders and test images a network classifies correctly.
-
-    Args:
-        label: Class whose objects were tested.
-        folder: Folder of results of the network.
-        images: Names of the folders of test images: "laboratory",
-            "photographs", both or none.
-
-    Returns:
-        Two lists: findings about renders in environment lighting and in random
-        lighting; and about recall and false positives on each folder of test
-        images. Unknown fractions are left out.
-    """
+    """Find what fraction of the renders and test images a network classifies correctly."""
     rates = _rates(read_json(folder / RECOGNIZED))
     of_renders = [_recognized(subject, rate) for subject, rate in rates.items()]
     findings = []
@@ -477,15 +363,7 @@ def _known(findings: Sequence[Finding | None]) -> list[Finding]:
 
 
 def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
-    """Describe what fraction of the images of an object a network recognizes.
-
-    Args:
-        subject: Images in words, such as "orange in the photographs".
-        recall: Fraction of the images that the network recognizes.
-
-    Returns:
-        Fraction in words and as numbers. None if it is unknown.
-    """
+    """Describe what fraction of the images of an object a network recognizes."""
     if recall is None or recall.value is None or recall.low is None:
         return None
     text = f"it recognizes {recall.value:.0%} of {subject}"
@@ -493,17 +371,7 @@ def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
 
 
 def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
-    """Describe what fraction of the images of other objects a network mistakes for a class.
-
-    Args:
-        subject: Images and the class in words, such as "other objects for
-            orange in the photographs".
-        error_rate: Fraction of the images that the network mistakes.
-
-    Returns:
-        Fraction in words, and the fraction that is not mistaken. None if it is
-        unknown.
-    """
+    """Describe what fraction of the images of other objects a network mistakes for a class."""
     if error_rate is None or error_rate.value is None or error_rate.high is None:
         return None
     text = f"it takes {error_rate.value:.0%} of {subject}"
@@ -511,16 +379,7 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Describe the attacks after which a network misclassifies half of the views.
-
-    Args:
-        folder: Folder of results of the network.
-
-    Returns:
-        For each kind of lighting with such an attack, a clause with the
-        smallest radius at which at least half of the views that were correct
-        before the attack are misclassified.
-    """
+    """Describe the attacks after which a network misclassifies half of the views."""
     faults = []
     for kind, light in KINDS.items():
         counts = read_json(folder / f"{kind}.json")
@@ -536,14 +395,6 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     """Compute what fraction of renders in environment lights and random lights is recognized.
 
     The intervals are over views.
-
-    Args:
-        correct: For the name of each light, whether each view is recognized.
-            The names of random lights start with "random ".
-
-    Returns:
-        Fractions with their 95% intervals, under the keys "renders in
-        environments" and "renders in random light".
     """
     random_names = {name for name in correct if name.startswith(RANDOM)}
     names_of_title = {
@@ -587,15 +438,6 @@ def _worst(
     The first gallery has the images of the tested class with the lowest
     log-odds of this class. The second gallery has the images of other objects
     with the highest log-odds.
-
-    Args:
-        label: Class whose objects were tested.
-        folders: Folders of test images, "laboratory" and "photographs".
-        scored: Predictions by the name of the network and of the folder of test
-            images.
-
-    Returns:
-        For the title of each gallery, at most WORST pictures.
     """
     galleries: dict[str, list[Picture]] = {}
     for name, by_images in scored.items():
@@ -619,14 +461,7 @@ def _worst(
 
 
 def _draw_image(folders: Mapping[str, Path], scored: Predictions, item: _ScoredImage) -> Picture:
-    """Draw a test image with the predictions of all networks in its caption.
-
-    Args:
-        folders: Folders of test images, "laboratory" and "photographs".
-        scored: Predictions by the name of the network and of the folder of test
-            images.
-        item: Image to draw.
-    """
+    """Draw a test image with the predictions of all networks in its caption."""
     photograph = item.prediction.photograph
     texts = []
     for network, by_images in scored.items():

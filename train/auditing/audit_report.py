@@ -114,15 +114,7 @@ class AuditReport(ShortRepr):
 
 
 def read_audit(audited: Audited) -> AuditReport:
-    """Read the results of an audit from its folder.
-
-    Args:
-        audited: Path and content of the page that the audit wrote to the
-            folder.
-
-    Returns:
-        Report with the results for each network.
-    """
+    """Read the results of an audit from its folder."""
     folder = audited.path.parent
     label = audited.label
     networks = {}
@@ -140,13 +132,7 @@ def read_audit(audited: Audited) -> AuditReport:
 
 
 def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
-    """Read the results of an audit for one network.
-
-    Args:
-        label: Class whose objects were tested.
-        name: Name of the network.
-        folder: Folder of results of this network.
-    """
+    """Read the results of an audit for one network."""
     summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
     # The file has a list for the name of each light: whether each view is recognized.
     recognized_views = read_json(folder / RECOGNIZED)
@@ -164,12 +150,7 @@ def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
 
 
 def _read_attack(kind: str, path: Path) -> AttackCounts:
-    """Read the numbers of misclassified views after the attack on one kind of lighting.
-
-    Args:
-        kind: Kind of lighting: "lighting", "skylight", "projector" or "lamps".
-        path: JSON file with the dictionary that `success_by_light` returned.
-    """
+    """Read the numbers of misclassified views after the attack on one kind of lighting."""
     counts = read_json(path)
     return AttackCounts(
         unit=KINDS[kind].unit,

@@ -30,17 +30,7 @@ Counts = Mapping[str, Mapping[str, Any]]
 
 
 def plain_sentence(label: str, name: str, plain: PlainViews) -> str:
-    """Write how many views a classifier recognizes in plain light, before any attack.
-
-    Args:
-        label: Class whose objects were tested.
-        name: Name of the classifier.
-        plain: Light, exposure and size at which the classifier recognizes most
-            views, and the numbers of recognized views.
-
-    Returns:
-        One or two sentences.
-    """
+    """Write how many views a classifier recognizes in plain light, before any attack."""
     counted = f"{plain.recognized} of {plain.n} views of {in_words(label)}"
     if plain.recognized == 0:
         return (
@@ -58,16 +48,7 @@ def plain_sentence(label: str, name: str, plain: PlainViews) -> str:
 
 
 def strongest_kind(counts: Counts) -> str | None:
-    """Return the kind of lighting by which the most views become misclassified.
-
-    Args:
-        counts: For each kind of lighting, the numbers of views that are correct
-            before the attack and misclassified after it.
-
-    Returns:
-        Kind of lighting, such as "lamps". None if no view is recognized before
-        the attacks.
-    """
+    """Return the kind of lighting by which the most views become misclassified."""
     attacked = [kind for kind in KINDS if counts[kind]["correct"]]
     if not attacked:
         return None
@@ -75,13 +56,7 @@ def strongest_kind(counts: Counts) -> str | None:
 
 
 def _misclassified_fraction(attack_counts: Mapping[str, Any]) -> float:
-    """Return which fraction of the correct views the attack at the largest radius changes.
-
-    Args:
-        attack_counts: Result of an attack. "correct" is the number of views
-            that are correct before. "adversarial" has the number of them that
-            are misclassified, for each radius in ascending order.
-    """
+    """Return which fraction of the correct views the attack at the largest radius changes."""
     return attack_counts["adversarial"][-1] / attack_counts["correct"]
 
 
@@ -93,20 +68,7 @@ def screen_of_one(
     counts: Counts,
     pool: Pool | None,
 ) -> FirstScreen:
-    """Make the top of the report of an audit of one network.
-
-    Args:
-        label: Class whose objects were tested.
-        name: Name of the network.
-        answer: Headline, which says whether the network is safe.
-        plain: How many views the network recognizes in plain light.
-        counts: For each kind of lighting, the numbers of views that are correct
-            before the attack and misclassified after it.
-        pool: Predictions for the test images. None without test images.
-
-    Returns:
-        Headline, main numbers and sentences.
-    """
+    """Make the top of the report of an audit of one network."""
     numbers = [
         ShownMetric(
             title="Views recognized in plain light",
@@ -147,15 +109,7 @@ def screen_of_one(
 
 
 def _score_sentence(label: str, pool: Pool) -> list[str]:
-    """Write a sentence about recall and false positives on test images.
-
-    Args:
-        label: Class whose objects were tested.
-        pool: Predictions for the test images.
-
-    Returns:
-        List with the sentence. Empty if one of the two metrics is unknown.
-    """
+    """Write a sentence about recall and false positives on test images."""
     recall = pool.metrics.recall
     mistaken = pool.metrics.false_positive_rate
     if recall.value is None or mistaken.value is None:
@@ -168,18 +122,7 @@ def _score_sentence(label: str, pool: Pool) -> list[str]:
 
 
 def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
-    """Read a picture for each kind of lighting: one view before and after the attack.
-
-    Args:
-        folder: Folder of results of one network.
-        counts: For each kind of lighting, the numbers of views that are correct
-            before the attack and misclassified after it.
-
-    Returns:
-        Pictures with the two predictions, and with the number of views that the
-        attack at the largest radius changes. A kind of lighting by which no attack
-        succeeds has no picture.
-    """
+    """Read a picture for each kind of lighting: one view before and after the attack."""
     compared = []
     for kind, light in KINDS.items():
         answers = _answers(counts[kind])
@@ -195,17 +138,7 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
 
 
 def withstood_sentence(name: str, counts: Counts) -> str:
-    """Name the kinds of lighting by which no attack on a network succeeds.
-
-    Args:
-        name: Name of the network.
-        counts: For each kind of lighting, the numbers of views that are correct
-            before the attack and misclassified after it.
-
-    Returns:
-        Sentence. Empty if an attack with each kind of lighting succeeds, or if
-        the network recognizes no view before it.
-    """
+    """Name the kinds of lighting by which no attack on a network succeeds."""
     withstood = [
         light.title
         for kind, light in KINDS.items()
@@ -217,16 +150,7 @@ def withstood_sentence(name: str, counts: Counts) -> str:
 
 
 def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
-    """Describe the predictions for one view before and after an attack.
-
-    Args:
-        attack_counts: Result of an attack. If the attack succeeds, "predicted"
-            has the two predicted classes, and "confidence" their probabilities.
-
-    Returns:
-        The right prediction before the attack, and the wrong one after it.
-        Empty if the attack does not succeed.
-    """
+    """Describe the predictions for one view before and after an attack."""
     texts = [in_words(name) for name in attack_counts.get("predicted", ())]
     # Earlier versions of the library did not write the key "confidence".
     for index, probability in enumerate(attack_counts.get("confidence", ())):
@@ -238,18 +162,7 @@ def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
 
 
 def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
-    """Plot the fraction of recognized views against the radius of attacks.
-
-    Args:
-        counts_by_network: For the name of each network and for each kind of
-            lighting, the numbers of views that are correct before the attack
-            and misclassified after it.
-
-    Returns:
-        One plot for each kind of lighting. It has a line for the attack on each
-        network, and one for random draws. Networks that recognize no view
-        before the attacks are left out.
-    """
+    """Plot the fraction of recognized views against the radius of attacks."""
     pictures = []
     for kind, light in KINDS.items():
         lines = {}
@@ -264,29 +177,12 @@ def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
 
 
 def _remaining(attack_counts: Mapping[str, Any], method: str) -> list[Estimate]:
-    """Compute the fraction of views that stay correctly classified, for each radius.
-
-    Args:
-        attack_counts: Result of an attack. "correct" is the number of views that
-            are correct before. The entry named `method` has the number of them
-            that are misclassified, for each radius.
-        method: "adversarial" for the attack, or "random" for random draws.
-
-    Returns:
-        Fractions of the views that are correct before the attack: first all of
-        them, at the radius 0, and then the fraction at each radius.
-    """
+    """Compute the fraction of views that stay correctly classified, for each radius."""
     correct = attack_counts["correct"]
     misclassified_by_radius = (0, *attack_counts[method])
     return [fraction(correct - count, correct) for count in misclassified_by_radius]
 
 
 def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> plots.Picture:
-    """Plot fractions of recognized views against the radius of attacks on one kind of lighting.
-
-    Args:
-        light: Kind of lighting, with the radii of its attacks.
-        lines: For the name of each line, the fractions at the radius 0 and at
-            each radius of `light`.
-    """
+    """Plot fractions of recognized views against the radius of attacks on one kind of lighting."""
     return plots.by_radius(lines, (0, *light.radii), light.title, f"radius ({light.unit})")

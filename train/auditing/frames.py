@@ -5,6 +5,7 @@ import io
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -29,20 +30,6 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
 
     Frame i of n has the light start + i / (n - 1) · (end - start). If the
     attack may use two lights, it may use all lights between them, too.
-
-    Args:
-        result: Result of an attack with one view per example.
-        example: Index of the example.
-
-    Returns:
-        Dictionary with these keys:
-
-        - classes: names of the right class and of the CLASS_COUNT - 1 other
-          classes with the highest probability in any frame;
-        - label: name of the right class;
-        - frames: for each frame, a dictionary of "image" (the object), "ball"
-          (a white ball in the same light) and "probabilities" (of each of the
-          classes). Images are JPEG files in base64.
     """
     start = result.problem.start[example]
     end = result.descent.values[example]
@@ -75,13 +62,8 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     return {"classes": names, "label": names[0], "frames": frames}
 
 
-def _jpeg(image: Tensor, side: int) -> str:
-    """Resize an image, and encode it as a JPEG file in base64.
-
-    Args:
-        image: Image with values in [0, 1], shape (3, H, W).
-        side: Width and height of the resized image in pixels.
-    """
+def _jpeg(image: Float[Tensor, "3 H W"], side: int) -> str:
+    """Resize an image, and encode it as a JPEG file in base64."""
     pixels = to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy()
     file = io.BytesIO()
     Image.fromarray(pixels).resize((side, side)).save(file, "JPEG", quality=85)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -144,16 +145,7 @@ class Views:
     size: float = 1.0
 
     def scene(self, size: int, kind: str = "lighting") -> Scene:
-        """Build a scene with one example for each view.
-
-        Args:
-            size: Pixels per side of the renders.
-            kind: Kind of lighting that will be attacked, a key of KINDS. The
-                scene has the projector or the lamps of this kind.
-
-        Returns:
-            Scene with `count` examples.
-        """
+        """Build a scene with one example for each view."""
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
         local_lights = [build_local_light(light) for light in KINDS[kind].local]
         natural_light = load_light(self.light) * self.exposure
@@ -179,18 +171,7 @@ def recognize_in_environments(
     environments: Sequence[str],
     random_light_count: int,
 ) -> dict[str, list[bool]]:
-    """Test whether a classifier recognizes views in several environment lights.
-
-    Args:
-        classifier: Classifier to test.
-        views: Views of objects of one class.
-        environments: Names or files of environment lights, as `load_light`
-            takes them.
-        random_light_count: Number of additional random lights.
-
-    Returns:
-        For the name of each light, whether each view is classified correctly.
-    """
+    """Test whether a classifier recognizes views in several environment lights."""
     noise = generator(views.seed, "lights")
     random_lights = perturb(
         load_light(LIGHT), random_light_count, AMPLITUDE, radius=None, generator=noise
@@ -211,17 +192,10 @@ def recognize_in_environments(
     return recognized_by_light
 
 
-def is_correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
-    """Test whether a classifier predicts the right class for the images of a scene.
-
-    Args:
-        classifier: Classifier to test.
-        scene: Scene with E examples, all with the same class and one view.
-        images: Images of the examples, shape (E, 1, 3, H, W).
-
-    Returns:
-        Whether each image is classified correctly, bool, shape (E,).
-    """
+def is_correct(
+    classifier: Classifier, scene: Scene, images: Float[Tensor, "E 1 3 H W"]
+) -> Bool[Tensor, " E"]:
+    """Test whether a classifier predicts the right class for the images of a scene."""
     logits = logits_of(classifier, images, BATCH)[:, 0]
     return logits.argmax(1) == classifier.label(scene.labels[0])
 
@@ -237,17 +211,6 @@ def adversaries(
     Each step changes all values of the lighting by a quarter of the radius, in
     the direction of the sign of the gradient. A classifier without gradients is
     attacked by a random search with QUERIES forward passes.
-
-    Args:
-        classifier: Classifier to attack.
-        views: Views whose lighting is attacked.
-        kind: Kind of lighting, a key of KINDS.
-        additional: True always takes ADDITIONAL_STEPS steps. False takes at
-            most STEPS steps, and stops when the prediction is wrong even with
-            the noise of a camera.
-
-    Returns:
-        Result of the attack.
     """
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
@@ -283,31 +246,6 @@ def success_by_light(
     The attacked lighting of the largest radius is written to out/KIND.npz, which
     `transfer_success` reads. If an attack succeeds, a picture of the first
     success, before and after the attack, is written to out/KIND.png.
-
-    Args:
-        classifier: Classifier to attack.
-        views: Views whose lighting is attacked.
-        kind: Kind of lighting, a key of KINDS.
-        out: Existing folder for the files.
-
-    Returns:
-        Dictionary with these keys. The last three are missing if no attack
-        succeeds.
-
-        - n: number of views;
-        - correct: number of views that are classified correctly before the
-          attack;
-        - adversarial: for each radius, the number of correct views that an
-          attack or random draws make misclassified, even with the noise of a
-          camera;
-        - random: for each radius, the same number for random draws alone;
-        - adversarial_without_noise, random_without_noise: the same two numbers
-          for images without noise;
-        - predicted: class that is predicted for the picture before the attack,
-          and class after it;
-        - confidence: probabilities of these two classes;
-        - slider: renders of the picture in light between natural and attacked,
-          as `frames_of` returns them.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
@@ -340,17 +278,7 @@ def success_by_light(
 
 
 def _draw_pair(result: AttackResult, example: int) -> Image.Image:
-    """Draw the image of an example before and after the attack, side by side.
-
-    Args:
-        result: Result of an attack with one view per example.
-        example: Index of the example.
-
-    Returns:
-        Picture with a width of 2 · SIDE pixels and a height of SIDE pixels.
-        Smaller renders are enlarged without smoothing, so that their pixels are
-        visible.
-    """
+    """Draw the image of an example before and after the attack, side by side."""
     before = result.images_before[example]
     after = result.images[example]
     pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
@@ -371,20 +299,6 @@ def transfer_success(
     `success_by_light` wrote, whose attack ended at its first success. "further"
     comes from attacks that continue after their success. The views are rendered
     again at the image size of the other classifier.
-
-    Args:
-        attacked: Classifier that was attacked.
-        other: Classifier to test.
-        views: Views whose lighting was attacked.
-        out: Folder in which `success_by_light` wrote files for the attacked
-            classifier.
-
-    Returns:
-        For each kind of lighting and for "further" and "first", three numbers:
-        tested views that the other classifier misclassifies even with the noise
-        of a camera; tested views; and tested views that it misclassifies
-        without noise. A view is tested if its attacked lighting fools the
-        attacked classifier, and if the other one recognizes it before.
     """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
@@ -419,21 +333,11 @@ class _TransferTest:
         self.criterion = Criterion(torch.full_like(result.criterion.source, label))
         self.model = preprocessed_model(result.settings, other)
 
-    def count(self, is_wrong: Tensor, values: Tensor) -> list[int]:
+    def count(self, is_wrong: Bool[Tensor, " E"], values: Float[Tensor, "E D"]) -> list[int]:
         """Count the views whose attacked lighting also fools the second classifier.
 
         A view is tested if its attacked lighting fools the first classifier, and
         if the second classifier recognizes it before the attack.
-
-        Args:
-            is_wrong: Whether the lighting of each example fools the first
-                classifier, shape (E,).
-            values: Attacked lighting of each example, shape (E, D).
-
-        Returns:
-            Three numbers: tested views that the second classifier misclassifies
-            even with the noise of a camera; tested views; and tested views that
-            it misclassifies without noise.
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))

@@ -55,13 +55,6 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
 
     All combinations are tried, until one is found at which the classifier
     recognizes a fraction of ENOUGH.
-
-    Args:
-        classifier: Classifier to test.
-        views: Views of objects of one class.
-
-    Returns:
-        The best combination. The first one, if no view is ever recognized.
     """
     best: PlainViews | None = None
     candidates = list(_candidates(views))

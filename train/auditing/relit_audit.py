@@ -74,16 +74,7 @@ class RelitSection:
 
 
 def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
-    """Attack a network by changing the light of a projector on photographs.
-
-    Args:
-        classifier: Network to attack.
-        settings: Settings of the audit, with the folder `photographs`.
-        out: Folder for the results.
-
-    Raises:
-        InputError: If the folder holds no photograph that can be read.
-    """
+    """Attack a network by changing the light of a projector on photographs."""
     # A path below pretrained/ is found from any working folder.
     folder = published(Path(str(settings.photographs)))
     attack_folder(
@@ -97,15 +88,7 @@ def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Pa
 
 
 def relit_sections(results: Mapping[str, Path]) -> list[RelitSection]:
-    """Make a section about photographs in the light of a projector for each network.
-
-    Args:
-        results: Folder of results of each network, by the name of the network.
-            A network without such results has no section.
-
-    Returns:
-        Sections of the report.
-    """
+    """Make a section about photographs in the light of a projector for each network."""
     sections = []
     for name, path in results.items():
         folder = path / RELIT_FOLDER
@@ -115,16 +98,7 @@ def relit_sections(results: Mapping[str, Path]) -> list[RelitSection]:
 
 
 def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
-    """Make the top of the report of an audit without meshes.
-
-    Args:
-        results: Folder of results of each network, by the name of the network.
-            There are one or two networks. The second is compared with the
-            first.
-
-    Returns:
-        Headline, main numbers and sentences.
-    """
+    """Make the top of the report of an audit without meshes."""
     scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
     first = scores[0]
     last = scores[-1]
@@ -149,17 +123,7 @@ def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
 def write_photographs_page(
     screen: FirstScreen, results: Mapping[str, Path], out: Path, caveats: Sequence[str]
 ) -> Path:
-    """Write the report of an audit without meshes.
-
-    Args:
-        screen: Top of the report: headline, main numbers and sentences.
-        results: Folder of results of each network, by the name of the network.
-        out: Folder of the audit.
-        caveats: Sentences at the beginning of the report.
-
-    Returns:
-        Path of the report.
-    """
+    """Write the report of an audit without meshes."""
     return write_page(
         out,
         "relit.html.jinja",
@@ -185,24 +149,14 @@ def _answer(scores: RelitScores) -> str:
 
 
 def _sentence(name: str, scores: RelitScores) -> str:
-    """Write how many photographs keep their class in each kind of light.
-
-    Args:
-        name: Name of the network.
-        scores: Predictions of the network for the photographs.
-    """
+    """Write how many photographs keep their class in each kind of light."""
     counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
     kept = join_words(counts, "and")
     return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {kept}."
 
 
 def _section(name: str, folder: Path) -> RelitSection:
-    """Make the section of a report about one network.
-
-    Args:
-        name: Name of the network.
-        folder: Folder to which `attack_folder` wrote the results.
-    """
+    """Make the section of a report about one network."""
     scores = read_relit(folder)
     sentences = [
         _sentence(name, scores),

@@ -68,14 +68,6 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
 
     This remedy normalizes the colors of an image before the network classifies
     it.
-
-    Args:
-        networks: Networks under the keys CLASSIFIER and HARDENED.
-
-    Returns:
-        Networks with the remedy, under keys such as
-        "hardened_normalized_light". Networks that normalize the light already
-        are left out.
     """
     return {
         key + NORMALIZED: network.normalizing_light()
@@ -85,16 +77,7 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
 
 
 def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Name the remedies that an audit compares, and find their results.
-
-    Args:
-        networks: Networks under the keys CLASSIFIER and HARDENED.
-
-    Returns:
-        Names of the subfolders with the results of the compared networks. The
-        keys are "the original network", and then the names of the remedies,
-        from the cheapest to the most expensive.
-    """
+    """Name the remedies that an audit compares, and find their results."""
     subfolders = {ORIGINAL: CLASSIFIER}
     for key, network in {**normalizing(networks), **networks}.items():
         if key == CLASSIFIER:
@@ -115,14 +98,6 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     above 0. It helps more than a cheaper one if the interval of its gain over
     the cheaper one is above 0, too. The metric is the recall at 10% false
     positives. With several positive classes, it is top-1 accuracy.
-
-    Args:
-        evaluations: Evaluation of the original network, and then of each
-            remedy, from the cheapest to the most expensive. The keys are their
-            names.
-
-    Returns:
-        The recommendation. None if the metric of a network is unknown.
     """
     original, *remedies = evaluations
     metric = _metric_for(evaluations[original])
@@ -159,27 +134,12 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
 
 
 def _metric_for(evaluations: Sequence[Evaluation]) -> str:
-    """Choose the metric by which remedies are compared.
-
-    Args:
-        evaluations: Evaluations of the original network.
-
-    Returns:
-        Top-1 accuracy if there are several positive classes. Otherwise the
-        recall at 10% false positives.
-    """
+    """Choose the metric by which remedies are compared."""
     labels = {prediction.label for prediction in evaluations[0].pools[ALL].positives}
     return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 
 def _is_gain(evaluations: Evaluations, name: str, reference: str, metric: str) -> bool:
-    """Return whether the 95% interval of the gain of one network over another is above 0.
-
-    Args:
-        evaluations: Evaluations by the name of the network.
-        name: Name of the network that may be better.
-        reference: Name of the other network.
-        metric: Name of the metric in which the gain is measured.
-    """
+    """Return whether the 95% interval of the gain of one network over another is above 0."""
     gain = difference(evaluations[name], evaluations[reference], ALL, metric)
     return gain is not None and gain.low is not None and gain.low > 0

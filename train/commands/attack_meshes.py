@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from warnings import catch_warnings, filterwarnings
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
@@ -132,14 +133,7 @@ class TransferTargets:
         return bool(self.classifiers or self.azimuths or self.objects)
 
     def transfer(self, result: AttackResult) -> list[dict[str, Any]]:
-        """Test whether the successful attacks of a result also succeed with each target.
-
-        Args:
-            result: Result of an attack.
-
-        Returns:
-            A dictionary for each target, as `nb.transfer` returns them.
-        """
+        """Test whether the successful attacks of a result also succeed with each target."""
         return transfer(
             result,
             classifiers=self.classifiers,
@@ -154,13 +148,6 @@ def run(settings: AttackExperimentSettings) -> None:
     If the settings name photographs, their lighting is attacked instead. With
     `settings.reload`, the predictions for a saved adversary are printed, and
     the attack, if there is one, starts at this adversary.
-
-    Args:
-        settings: Settings of pnb-attack.
-
-    Raises:
-        InputError: If a setting or an input file is wrong, or if the classifier
-            misclassifies a mesh before the attack.
     """
     if settings.attack.relighting is not None:
         attack_photographs.run(settings)
@@ -202,23 +189,13 @@ def run(settings: AttackExperimentSettings) -> None:
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
-    """Create the rasterizer that the settings of the renderer choose.
-
-    Raises:
-        InputError: If the rasterizer is not available. The message names the
-            setting.
-    """
+    """Create the rasterizer that the settings of the renderer choose."""
     with keyed(**keys_of("renderer", settings.renderer)):
         return choose_rasterizer(settings.renderer)
 
 
 def _require_attack_settings(settings: AttackExperimentSettings) -> None:
-    """Check the settings of the transfer and of the renderers before any file is read.
-
-    Raises:
-        InputError: If the attack cannot be tested with the other views or
-            meshes of `settings.transfer`, or if a renderer is not installed.
-    """
+    """Check the settings of the transfer and of the renderers before any file is read."""
     with keyed("transfer", **keys_of("transfer", settings.transfer)):
         require_transferable(
             settings.attack.parameters,
@@ -235,21 +212,7 @@ def _write_attacks(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> tuple[list[Outcome], dict[str, Sweep]]:
-    """Run the attacks on several meshes, and write each result to its own folder.
-
-    Args:
-        mesh_attacks: Iterator that runs the next attack when it is advanced.
-        out: Folder for the folders of the results.
-        settings: Settings of pnb-attack.
-        targets: Other classifiers, views and objects with which successful
-            attacks are tested.
-
-    Returns:
-        Two values:
-        - what is printed about each attack;
-        - the success at each radius of `attack.radius_scales`, by the name of
-          the folder of the result. Empty if no radii are set.
-    """
+    """Run the attacks on several meshes, and write each result to its own folder."""
     sweeps: dict[str, Sweep] = {}
     outcomes = []
     for index, mesh_attack in enumerate(mesh_attacks):
@@ -273,19 +236,7 @@ def _write_attack(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> Outcome:
-    """Check the result of the attack on one mesh, and write it to a folder.
-
-    Args:
-        mesh_attack: Attack on the mesh.
-        folder: Folder for the files of the result.
-        settings: Settings of pnb-attack.
-        targets: Other classifiers, views and objects with which successful
-            attacks are tested.
-
-    Returns:
-        Text and numbers to print. With --verbose, the text has the results of
-        the checks.
-    """
+    """Check the result of the attack on one mesh, and write it to a folder."""
     name = mesh_attack.name
     result = mesh_attack.result
     is_correct_before = result.clean_correct
@@ -319,16 +270,7 @@ def _write_attack(
 
 
 def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
-    """Format the summary that pnb-attack prints about the attacks on all meshes.
-
-    Args:
-        outcomes: Text and numbers about the attack on each mesh.
-
-    Returns:
-        Lines: for a single mesh, the sentence about its attack. For several
-        meshes, the number of successes and a table with a row for each mesh.
-        Then the details about all meshes.
-    """
+    """Format the summary that pnb-attack prints about the attacks on all meshes."""
     (first, *others) = outcomes
     lines = [first.heading]
     if others:
@@ -357,21 +299,6 @@ def attacks(
 
     If a mesh is misclassified in its scene, a search looks for another scene in
     which it is recognized. This scene is then attacked.
-
-    Args:
-        settings: Settings of pnb-attack.
-        classifier: Classifier to attack.
-        device: Device of the light and the images.
-        adversary: Saved adversary, or None to attack the meshes. The attack
-            starts at the values of the adversary, which are also the centers of
-            the norm-balls.
-
-    Yields:
-        Result of the attack on each mesh, or on the adversary.
-
-    Raises:
-        InputError: If a mesh is misclassified before the attack, or if the
-            adversary has changed pixels instead of a changed scene.
     """
     if adversary is not None:
         yield _attack_adversary(settings, classifier, device, adversary)
@@ -392,18 +319,7 @@ def _attack_adversary(
     device: torch.device,
     adversary: Adversary,
 ) -> MeshAttack:
-    """Attack the scene of a saved adversary, starting at its attacked values.
-
-    Args:
-        settings: Settings of pnb-attack.
-        classifier: Classifier to attack.
-        device: Device of the light and the images.
-        adversary: Saved adversary.
-
-    Raises:
-        InputError: If the adversary has changed pixels instead of a changed
-            scene.
-    """
+    """Attack the scene of a saved adversary, starting at its attacked values."""
     if adversary.pixels is not None:
         raise InputError(
             f"reload={settings.reload} is an adversary with changed pixels, from which an attack "
@@ -432,12 +348,6 @@ def _attack_mesh(
     The search looks for a scene in which the classifier recognizes the mesh.
     There is no search if `scene.search` is 0, or if `attack.force` allows to
     attack a misclassified mesh.
-
-    Args:
-        settings: Settings of pnb-attack.
-        classifier: Classifier to attack.
-        device: Device of the light and the images.
-        mesh: Settings of the mesh.
     """
     build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
     scene_settings = settings.scene
@@ -475,20 +385,6 @@ def build_attacked(
     With `attack.shared`, one attack must succeed in all views, so the scene has
     one example for each background. Otherwise it has one example for each pair
     of a view and a background.
-
-    Args:
-        settings: Settings of pnb-attack.
-        item: Settings of the mesh.
-        scene: Settings of the scene, which replace `settings.scene`.
-        size: Pixels per side of the images.
-        device: Device of the light and the images.
-
-    Returns:
-        Scene to attack.
-
-    Raises:
-        InputError: If a setting of the scene is wrong. The message names the
-            setting.
     """
     rasterizer = _start_rasterizer(settings)
     with keyed("scene", **keys_of("scene", scene)):
@@ -510,22 +406,7 @@ def load_targets(
     attacked: Classifier,
     device: torch.device,
 ) -> TransferTargets:
-    """Load the other classifiers and meshes with which successful attacks are tested.
-
-    Args:
-        settings: Settings of pnb-attack. `settings.transfer` names the
-            classifiers, azimuths and meshes.
-        attacked: Classifier that is attacked. It also classifies the other
-            meshes.
-        device: Device of the other classifiers.
-
-    Returns:
-        Loaded classifiers and meshes. May be empty.
-
-    Raises:
-        InputError: If a classifier or a mesh cannot be loaded, or if a
-            classifier lacks the class of a mesh.
-    """
+    """Load the other classifiers and meshes with which successful attacks are tested."""
     label = ""
     if settings.transfer.classifiers or settings.transfer.meshes:
         # The class is compared by name, because its index may differ in other classifiers.
@@ -550,17 +431,7 @@ def load_targets(
 
 
 def _load_classifier(item: Any, trust: bool) -> Classifier:
-    """Load one classifier that the setting `transfer.classifiers` names.
-
-    Args:
-        item: Name of the classifier, or a dictionary with the keys "classifier"
-            and "weights".
-        trust: Whether it may be a file of TorchScript or `torch.export`.
-
-    Raises:
-        InputError: If the dictionary has another key, or if the classifier
-            cannot be loaded.
-    """
+    """Load one classifier that the setting `transfer.classifiers` names."""
     values = item if isinstance(item, dict) else {"classifier": item}
     for key in values:
         if key not in ("classifier", "weights"):
@@ -574,15 +445,7 @@ def _load_classifier(item: Any, trust: bool) -> Classifier:
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
-    """Write the settings that the search for a scene changed, as a command line takes them.
-
-    Args:
-        scene: Settings of the scene after the search.
-        before: Settings of the scene before the search.
-
-    Returns:
-        Changed settings, such as "scene.polar=80.0 scene.exposure=2.0".
-    """
+    """Write the settings that the search for a scene changed, as a command line takes them."""
     words = []
     for name in SEARCHED_SETTINGS:
         value = getattr(scene, name)
@@ -593,27 +456,12 @@ def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
 
 def format_reloaded(
     adversary: Adversary,
-    images: Tensor,
+    images: Float[Tensor, "V 3 size size"],
     classifier: Classifier,
     settings: AttackSettings,
     seed: int,
 ) -> list[str]:
-    """Classify the images of a reloaded adversary, and describe the predictions.
-
-    Args:
-        adversary: Adversary that was loaded from files, with its saved images.
-        images: Images of its V views, rendered again, in [0, 1], shape
-            (V, 3, size, size).
-        classifier: Classifier that classifies the images.
-        settings: Settings of the attack, with the standard deviation of the
-            noise of a camera.
-        seed: Seed of the noise.
-
-    Returns:
-        A line for each view: the predicted class, whether it stays the same
-        with the noise, and the largest difference between the image and the
-        saved image.
-    """
+    """Classify the images of a reloaded adversary, and describe the predictions."""
     model = preprocessed_model(settings, classifier)
     # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
     logits = logits_of(model, images[None], len(images))

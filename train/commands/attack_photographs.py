@@ -20,16 +20,7 @@ MAX_UNREADABLE = 3
 
 
 def run(settings: AttackExperimentSettings) -> None:
-    """Attack a network by the light of a projector on photographs, and print the results.
-
-    Args:
-        settings: Settings of pnb-attack. `attack.relighting` has the settings
-            of the light, and `photographs` the folder of the photographs.
-
-    Raises:
-        InputError: If one of these two settings is missing, or if the
-            photographs or the network cannot be read.
-    """
+    """Attack a network by the light of a projector on photographs, and print the results."""
     relighting = settings.attack.relighting
     if relighting is None or settings.photographs is None:
         raise InputError(

@@ -5,11 +5,7 @@ from train.command_settings import AuditSettings
 
 
 def audit(settings: AuditSettings) -> None:
-    """Test a network in unusual lighting, and print the main numbers and the path of the report.
-
-    Args:
-        settings: Settings of pnb-audit.
-    """
+    """Test a network in unusual lighting, and print the main numbers and the path of the report."""
     audited = run_audit(settings)
     print(audited.screen)
     print(f"report: {audited.path}")

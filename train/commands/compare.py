@@ -13,12 +13,6 @@ def print_comparison(settings: CompareSettings) -> None:
 
     With --verbose, intervals, settings, differences and other tables are
     printed, too.
-
-    Args:
-        settings: Settings of pnb-compare, with the folders of the runs.
-
-    Raises:
-        InputError: If a folder holds no finished training run.
     """
     runs = finished_runs([Path(run) for run in settings.runs])
     options = (settings.exclude, settings.photographs, settings.by)

@@ -17,15 +17,7 @@ from train.system.verbosity import is_verbose
 
 
 def evaluate(settings: EvaluateSettings) -> None:
-    """Score a network on photographs, write tables and images, and print a summary.
-
-    Args:
-        settings: Settings of pnb-evaluate.
-
-    Raises:
-        InputError: If the network cannot be loaded, if it lacks a class, or if
-            the photographs cannot be read.
-    """
+    """Score a network on photographs, write tables and images, and print a summary."""
     network = _load_network(settings)
     label = settings.label
     if (
@@ -59,11 +51,7 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _load_network(settings: EvaluateSettings) -> Classifier:
-    """Load the network of the training run `settings.run`, or else `settings.classifier`.
-
-    Raises:
-        InputError: If the network cannot be loaded.
-    """
+    """Load the network of the training run `settings.run`, or else `settings.classifier`."""
     if settings.run is None:
         # Error messages about the argument `name` begin with the setting `classifier` instead.
         with keyed(name="classifier"):

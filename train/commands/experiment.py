@@ -52,12 +52,7 @@ SHARED_IN_TRAIN = (
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Train a network and its baselines, in this process or in each process of torchrun.
-
-    Args:
-        config: Configuration that Hydra composed from files and overrides.
-        overrides: Settings on the command line, such as "train.epochs=3".
-    """
+    """Train a network and its baselines, in this process or in each process of torchrun."""
     threading.excepthook = _report_thread_error
     with process_group():
         _train(config, overrides)
@@ -74,13 +69,7 @@ def _report_thread_error(error: threading.ExceptHookArgs) -> None:
 
 
 def _train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Read all settings, and train a network and its baselines.
-
-    Args:
-        config: Configuration that Hydra composed. `config.run`, the folder of
-            the training run, is replaced by its absolute path.
-        overrides: Settings on the command line, such as "train.epochs=3".
-    """
+    """Read all settings, and train a network and its baselines."""
     command = format_command(overrides)
     # The default name of the folder has the time, which differs between processes. All
     # processes take the name of the first one.
@@ -102,16 +91,6 @@ def _train_on_photographs(
     """Train on photographs first, as the setting `photographs_first` asks.
 
     If this first training is already finished, it is not repeated.
-
-    Args:
-        settings: Settings of the main training.
-        folder: Folder of the main training. The first training gets a
-            subfolder.
-        command: Command line of the user, which is recorded.
-
-    Returns:
-        Settings of the main training, which starts from the network of the
-        first training.
     """
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
@@ -151,15 +130,6 @@ def _train_in(
     """Check that the folders can be written to, and train a network and its baselines.
 
     If the training is interrupted, the command that resumes it is printed.
-
-    Args:
-        folder: Folder of the main training run. Baselines get subfolders.
-        settings: Settings of the main training run.
-        command: Command line of the user, which each run records.
-        resuming: Words of the command line that resumes the training, without
-            run=FOLDER and train.resume=true.
-        resumed_folder: FOLDER in the command line that resumes the training.
-            None for `folder`.
     """
     settings_of_runs = _settings_of_runs(settings, folder)
     for path, run_settings in settings_of_runs.items():
@@ -183,17 +153,7 @@ def _train_in(
 
 
 def _settings_of_runs(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """List the training runs of a command: the baselines, and then the main run.
-
-    Args:
-        settings: Settings of the main run. `settings.compare` names the kinds
-            of renders of the baselines.
-        folder: Folder of the main run. Each baseline has a subfolder with the
-            name of its kind of renders.
-
-    Returns:
-        For the folder of each run, its settings.
-    """
+    """List the training runs of a command: the baselines, and then the main run."""
     settings_of_runs = {}
     for mode in settings.compare:
         with keyed("compare"):
@@ -208,13 +168,7 @@ def _train_runs(
     folder: Path,
     command: str,
 ) -> None:
-    """Train and score several runs, print a table that compares them, and write a report.
-
-    Args:
-        settings_of_runs: For the folder of each run, its settings.
-        folder: Folder of the main run, in which the report is written.
-        command: Command line of the user, which each run records.
-    """
+    """Train and score several runs, print a table that compares them, and write a report."""
     for run in load_runs(settings_of_runs, command):
         mode = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"
@@ -260,11 +214,6 @@ def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterat
 
     The file gets all messages. The terminal gets messages of at least `level`,
     or with --verbose all messages.
-
-    Args:
-        path: Log file. Its folder is created if it does not exist.
-        prefix: Text at the beginning of each line on the terminal.
-        level: Lowest level of the messages on the terminal without --verbose.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = _LogFile(path, encoding="utf-8", errors="backslashreplace")

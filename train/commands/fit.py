@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from PIL import Image
 
 from augment.scene.objects import load_object
@@ -41,15 +42,7 @@ GRAB_CUT_STEPS = 5
 
 
 def fit(settings: FitSettings) -> None:
-    """Find camera and lighting of a photograph, and print a command that attacks the lighting.
-
-    Args:
-        settings: Settings of pnb-fit.
-
-    Raises:
-        InputError: If a file cannot be read, or if no object is found in the
-            photograph.
-    """
+    """Find camera and lighting of a photograph, and print a command that attacks the lighting."""
     image = read_file(settings.photograph)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
@@ -89,14 +82,6 @@ def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> fl
     """Compare the photograph with a render in the camera and lighting that were found.
 
     Both images are written to comparison.png, side by side.
-
-    Args:
-        attacked: Settings with which pnb-attack renders the scene.
-        out: Folder with mask.png, the mask of the object.
-        encoding: Encoding of both images, "srgb" or "linear".
-
-    Returns:
-        Relative error of the rendered pixels of the object.
     """
     photograph, rendered = render_attacked(attacked)
     write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
@@ -107,16 +92,7 @@ def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> fl
 
 
 def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackExperimentSettings:
-    """Choose settings with which pnb-attack attacks the lighting of the photograph.
-
-    Args:
-        settings: Settings of pnb-fit.
-        camera: Camera that was found. It looks at the center of the mesh.
-        out: Folder with the background and the lighting that were found.
-
-    Returns:
-        Settings of pnb-attack. Numbers are rounded as in the printed command.
-    """
+    """Choose settings with which pnb-attack attacks the lighting of the photograph."""
     fov = None
     if isinstance(camera, PerspectiveCamera):
         fov = round(camera.angle, 3)
@@ -139,14 +115,7 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
 
 
 def attack_command(settings: AttackExperimentSettings) -> list[str]:
-    """Write the command line of pnb-attack that attacks the lighting of the photograph.
-
-    Args:
-        settings: Settings of pnb-attack, as `attack_settings` returns them.
-
-    Returns:
-        Words of the command line.
-    """
+    """Write the command line of pnb-attack that attacks the lighting of the photograph."""
     scene = settings.scene
     renderer = settings.renderer
     [mesh] = scene.meshes
@@ -175,15 +144,7 @@ def attack_command(settings: AttackExperimentSettings) -> list[str]:
 
 
 def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render the scene that pnb-attack would attack, as it is before the attack.
-
-    Args:
-        settings: Settings of pnb-attack.
-
-    Returns:
-        Background and rendered image, encoded, shape
-        (3, ATTACKED_SIZE, ATTACKED_SIZE) each.
-    """
+    """Render the scene that pnb-attack would attack, as it is before the attack."""
     mesh = read_object(settings.scene.meshes[0], settings.label or "", "scene.meshes[0]")
     device = torch.device("cpu")
     scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
@@ -194,35 +155,14 @@ def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, t
 
 
 def relative_error(rendered: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
-    """Compute the relative root mean square error of rendered pixels, in linear RGB.
-
-    Args:
-        rendered: Encoded pixels of the render, shape (3, N).
-        photograph: Encoded pixels of the photograph at the same places, shape
-            (3, N).
-        encoding: Encoding of both, "srgb" or "linear".
-
-    Returns:
-        Root mean square of the difference, divided by the root mean square of
-        the photograph.
-    """
+    """Compute the relative root mean square error of rendered pixels, in linear RGB."""
     expected = decode(photograph.double(), encoding)
     difference = decode(rendered.double(), encoding) - expected
     return float(difference.norm() / expected.norm())
 
 
-def read_file(path: str) -> np.ndarray:
-    """Read an image file at its full size.
-
-    Args:
-        path: Image file. The image is rotated as its EXIF orientation says.
-
-    Returns:
-        Pixels in sRGB, uint8, shape (H, W, 3).
-
-    Raises:
-        InputError: If the file is missing or is not an image.
-    """
+def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
+    """Read an image file at its full size."""
     require_file(path, "give an image file")
     try:
         return np.asarray(read_rgb(Path(path), 10**6))
@@ -231,20 +171,8 @@ def read_file(path: str) -> np.ndarray:
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
 
 
-def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
-    """Segment the object inside a box with OpenCV's GrabCut (Rother et al. 2004).
-
-    Args:
-        image: Photograph in sRGB, uint8, shape (H, W, 3).
-        box: Left, top, right and bottom of the box in pixels.
-
-    Returns:
-        Mask, uint8, shape (H, W): 255 for pixels of the object, 0 for others.
-
-    Raises:
-        InputError: If OpenCV is not installed, or if the box is empty or
-            exceeds the photograph.
-    """
+def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndarray, "H W"]:
+    """Segment the object inside a box with OpenCV's GrabCut (Rother et al. 2004)."""
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
@@ -280,13 +208,7 @@ def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
 
 
 def _is_box_within(box: list[int], height: int, width: int) -> bool:
-    """Return whether a box is not empty and lies within an image.
-
-    Args:
-        box: Left, top, right and bottom of the box in pixels.
-        height: Height of the image in pixels.
-        width: Width of the image in pixels.
-    """
+    """Return whether a box is not empty and lies within an image."""
     if len(box) != 4:
         return False
     left, top, right, bottom = box
@@ -294,11 +216,6 @@ def _is_box_within(box: list[int], height: int, width: int) -> bool:
 
 
 def write_values(path: Path, image: torch.Tensor) -> None:
-    """Write an image to a file with 8 bits per channel.
-
-    Args:
-        path: File to write. The format follows from its suffix.
-        image: Image with values in [0, 1], shape (3, H, W).
-    """
+    """Write an image to a file with 8 bits per channel."""
     pixels = to_bytes(image.permute(1, 2, 0)).numpy()
     write_image(path, Image.fromarray(pixels))

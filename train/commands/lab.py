@@ -9,15 +9,7 @@ from train.settings import label_names
 
 
 def render_laboratory(settings: LabSettings) -> None:
-    """Render a test set of objects in unusual lighting, and print the number of renders.
-
-    Args:
-        settings: Settings of pnb-lab.
-
-    Raises:
-        InputError: If the folder for the renders holds other results, or if a
-            setting is wrong.
-    """
+    """Render a test set of objects in unusual lighting, and print the number of renders."""
     require_replaceable(Path(settings.out), "out", settings.overwrite)
     count = write_laboratory(settings)
     classes = " and ".join(label_names(settings.label))

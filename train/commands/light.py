@@ -16,13 +16,6 @@ def export_light(settings: LightSettings) -> None:
     """Write environment lighting to an image file, without its negative radiance.
 
     The function prints how much the irradiance changes by this.
-
-    Args:
-        settings: Settings of pnb-light.
-
-    Raises:
-        InputError: If the light cannot be read, or if the file cannot be
-            written.
     """
     out = Path(settings.out)
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):

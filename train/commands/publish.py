@@ -19,15 +19,7 @@ from train.system.verbosity import shortened
 
 
 def publish_network(settings: PublishSettings) -> None:
-    """Write the network of a training run with its settings and scores, and print the folder.
-
-    Args:
-        settings: Settings of pnb-publish.
-
-    Raises:
-        InputError: If the folder has no network, or if the published network
-            could not be loaded again.
-    """
+    """Write the network of a training run with its settings and scores, and print the folder."""
     out = writable_folder(settings.out, "out")
     folder = Path(settings.run)
     path, state = load_selected(folder)
@@ -62,18 +54,7 @@ def publish_network(settings: PublishSettings) -> None:
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
-    """Collect the settings and scores of a training run for the file of the published network.
-
-    Args:
-        folder: Folder of the training run.
-
-    Returns:
-        Dictionary with these keys:
-        - settings: value of each setting, with keys such as "train.epochs";
-        - versions: version of each package;
-        - scores: value of each metric, and scores on each folder of
-          photographs.
-    """
+    """Collect the settings and scores of a training run for the file of the published network."""
     run = summarize(folder)
     photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
     return {
@@ -84,12 +65,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
 
 
 def _without_folder(text: str) -> str:
-    """Remove the folders from an absolute path, because other machines do not have them.
-
-    Args:
-        text: Value of a setting. Other values than absolute paths are returned
-            as they are.
-    """
+    """Remove the folders from an absolute path, because other machines do not have them."""
     return Path(text).name if text.startswith("/") else text
 
 
@@ -99,18 +75,7 @@ def _calibrate(
     label: Any,
     false_positive_rate: float,
 ) -> list[dict[str, Any]]:
-    """Choose a detection threshold for each positive class on photographs, and print it.
-
-    Args:
-        network: Network to publish. The function rounds its weights to 16 bits.
-        folder: Folder of photographs.
-        label: Positive class, or a list of several.
-        false_positive_rate: Largest false-positive rate of each threshold, in
-            (0, 1).
-
-    Returns:
-        For each positive class, the attributes of its `OperatingPoint`.
-    """
+    """Choose a detection threshold for each positive class on photographs, and print it."""
     # Published weights have 16 bits, so the thresholds are chosen with rounded weights.
     network.half().float()
     with keyed(folder="calibrate"):

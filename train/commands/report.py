@@ -10,16 +10,7 @@ from train.system.user_errors import writable_folder
 
 
 def report(settings: ReportSettings) -> None:
-    """Write a report page about training runs and attacks, and print its path.
-
-    Args:
-        settings: Settings of pnb-report, with the folders of the runs and
-            attacks.
-
-    Raises:
-        InputError: If a folder has neither a training run nor an attack, or if
-            the page cannot be written.
-    """
+    """Write a report page about training runs and attacks, and print its path."""
     folders = [Path(run) for run in settings.runs]
     parent = Path(os.path.commonpath([folder.absolute() for folder in folders]))
     out = writable_folder(settings.out or parent, "out")

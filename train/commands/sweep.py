@@ -45,18 +45,7 @@ MAX_UNFINISHED = 3
 
 
 def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
-    """Train all runs of a sweep, print a table of their results, and write a report.
-
-    Args:
-        start: Function that starts Hydra, which trains the runs.
-        words: Words of the command line: settings and flags.
-
-    Raises:
-        InputError: If a run has a wrong setting or cannot read its inputs, if
-            two runs have the same settings, or if the folder of a run has a run
-            with other settings. This is checked before the training.
-        SystemExit: With status 1, if a run is not finished at the end.
-    """
+    """Train all runs of a sweep, print a table of their results, and write a report."""
     runs = _expand([word for word in words if not word.startswith("-")])
     first_config = compose("train", runs[0])
     if first_config.photographs_first:
@@ -96,31 +85,13 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
 
 
 def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
-    """List the settings on the command line that have the same value in all runs of a sweep.
-
-    Args:
-        runs: Settings of each run, such as ("seed=0", "train.epochs=3").
-
-    Returns:
-        Keys of these settings, such as "train.epochs".
-    """
+    """List the settings on the command line that have the same value in all runs of a sweep."""
     shared = set.intersection(*map(set, runs))
     return [override.partition("=")[0] for override in shared]
 
 
 def _is_new(folder: Path, settings: ExperimentSettings, overwrite: bool) -> bool:
-    """Return whether a run of a sweep is new: its folder holds no run that goes on there.
-
-    Args:
-        folder: Folder of the run.
-        settings: Settings of the run.
-        overwrite: Whether results of other commands in the folder may be
-            replaced.
-
-    Raises:
-        InputError: If the folder has a training run with other settings, or
-            results of another command.
-    """
+    """Return whether a run of a sweep is new: its folder holds no run that goes on there."""
     if is_finished(folder) or checkpoint.exists(folder):
         require_same_run(folder, settings, finished=True)
         return False
@@ -135,20 +106,7 @@ def _is_text(override: str) -> bool:
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
-    """List the settings of each run of a sweep, in the order in which Hydra starts them.
-
-    Args:
-        overrides: Settings on the command line, such as "seed=0,1" and
-            "train.epochs=3".
-
-    Returns:
-        For each combination of values, settings such as
-        ("seed=0", "train.epochs=3").
-
-    Raises:
-        InputError: If `run` is set, which names the folder of a single run, or
-            if Slurm is chosen and not installed.
-    """
+    """List the settings of each run of a sweep, in the order in which Hydra starts them."""
     choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
@@ -175,9 +133,6 @@ def run_in_sweep(config: DictConfig) -> None:
     If the run fails, the reason is written to failed.txt in its folder, and the
     sweep continues with the next run. SystemExit and KeyboardInterrupt stop the
     sweep.
-
-    Args:
-        config: Configuration of the run. `config.run` is its folder.
     """
     folder = Path(config.run)
     with locked(folder) as has_lock:
@@ -198,12 +153,7 @@ def _print_detail(line: str) -> None:
 
 
 def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
-    """Train one run of a sweep. If it fails, write the reason to failed.txt.
-
-    Args:
-        config: Configuration of the run.
-        folder: Folder of the run.
-    """
+    """Train one run of a sweep. If it fails, write the reason to failed.txt."""
     job = HydraConfig.get()
     # Hydra's joblib launcher trains several runs at once. Their lines on the terminal
     # then start with the number of the run.
@@ -224,13 +174,7 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
 
 
 def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
-    """Train, score and export one run. If it has a checkpoint, the training is resumed.
-
-    Args:
-        config: Configuration of the run.
-        folder: Folder of the run.
-        overrides: Settings of the run, such as "seed=0", as Hydra escapes them.
-    """
+    """Train, score and export one run. If it has a checkpoint, the training is resumed."""
     settings = with_label(read_settings(ExperimentSettings, config))
     settings.train.resume = checkpoint.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
@@ -253,16 +197,7 @@ def _unescaped(override: str) -> str:
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
-    """Format the results of the training runs of a sweep.
-
-    Args:
-        folders: Folders of all runs of the sweep.
-
-    Returns:
-        The number of finished runs; a table of their results, averaged over
-        seeds; and the state of each unfinished run. Without --verbose, the
-        table and the list are cut off after a few lines.
-    """
+    """Format the results of the training runs of a sweep."""
     finished = [folder for folder in folders if is_finished(folder)]
     lines = [f"{len(finished)} of {len(folders)} runs are finished", ""]
     unfinished = [folder for folder in folders if folder not in finished]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment import distributed
@@ -44,7 +45,7 @@ class TrainingImages(NamedTuple):
     """
 
     split: Split
-    rows: Tensor
+    rows: Int[Tensor, " N"]
     renders: Split
 
 
@@ -61,7 +62,7 @@ class Round(NamedTuple):
 
     number: int
     epoch: int
-    rows: Tensor
+    rows: Int[Tensor, " M"]
 
 
 @dataclass(frozen=True)
@@ -80,22 +81,13 @@ class Draws:
             data set is in memory, because its images are not cropped.
     """
 
-    order: Tensor
-    shifts: Tensor
-    flips: Tensor
-    seeds: Tensor | None = None
+    order: Float[Tensor, "N B"]
+    shifts: Float[Tensor, "2 N B"]
+    flips: Bool[Tensor, "N B"]
+    seeds: Float[Tensor, "N B"] | None = None
 
     def of_columns(self, first: int, columns: slice) -> "Draws":
-        """Select some batches of a round, and some images of each of them.
-
-        Args:
-            first: Index of the first selected batch. All later batches are
-                selected, too.
-            columns: Range of the places in a batch whose images are selected.
-
-        Returns:
-            Draws for the selected images.
-        """
+        """Select some batches of a round, and some images of each of them."""
         return Draws(
             order=self.order[first:, columns],
             shifts=self.shifts[:, first:, columns],
@@ -112,21 +104,7 @@ def rounds_of_epoch(
     images_per_epoch: int | None,
     images_per_round: int | None,
 ) -> list[Round]:
-    """Divide the training images of an epoch into rounds. Each round shows all renders.
-
-    Args:
-        image_count: Number of training images of the data set.
-        render_count: Number of renders.
-        seed: Seed of the training run.
-        epoch: Number of epochs before this epoch.
-        images_per_epoch: Number of images of the data set that the epoch shows.
-            They are drawn at random in each epoch. None shows all images.
-        images_per_round: Number of images of the data set that a round shows.
-            None makes a single round.
-
-    Returns:
-        Rounds of the epoch.
-    """
+    """Divide the training images of an epoch into rounds. Each round shows all renders."""
     draws = generator(seed, epoch, "rounds")
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
     render_numbers = torch.arange(image_count, image_count + render_count)
@@ -152,19 +130,6 @@ def training_batches(
     have the same size: the last batch is filled up with the first images of the
     round. All random draws are made on the CPU, so they are the same for every
     device and every number of processes.
-
-    Args:
-        images: Images of the data set, and renders.
-        batch_size: Number of images of a batch in all processes together.
-        seed: Seed of the training run.
-        this_round: Round, a part of the epoch, whose images are shown.
-        flips: "random" flips each image with probability 0.5. "alternating"
-            flips each image in every other epoch.
-        first: Index of the first batch that is yielded.
-
-    Yields:
-        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
-        each image is a render, bool, shape (B,). B is `batch_size` / P.
     """
     draws = _draw(images, batch_size, seed, this_round, flips)
     own_size = batch_size // distributed.world_size()
@@ -178,19 +143,7 @@ def training_batches(
 def _draw(
     images: TrainingImages, batch_size: int, seed: int, this_round: Round, flips: str
 ) -> Draws:
-    """Draw the order, shift, flip and crop of each image of a round at random.
-
-    Args:
-        images: Images of the data set, and renders.
-        batch_size: Number of images of a batch in all processes together.
-        seed: Seed of the training run.
-        this_round: Round, a part of the epoch, whose images are shown.
-        flips: "random" flips each image with probability 0.5. "alternating"
-            flips each image in every other epoch.
-
-    Returns:
-        Draws for all batches of the round.
-    """
+    """Draw the order, shift, flip and crop of each image of a round at random."""
     shown_count = len(this_round.rows)
     permutation = torch.randperm(
         shown_count, generator=generator(seed, this_round.number, "batches")
@@ -217,20 +170,11 @@ def _draw(
     return Draws(order, shifts, is_flipped, crop_seeds)
 
 
-def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Tensor:
+def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Bool[Tensor, " _"]:
     """Return whether each image is flipped in an epoch, if flips alternate.
 
     A random half of the images is flipped in even epochs. The other images are
     flipped in odd epochs.
-
-    Args:
-        images: Images of the data set, and renders.
-        seed: Seed of the training run.
-        epoch: Number of epochs before this epoch.
-
-    Returns:
-        Whether each image is flipped, bool, shape (N + R,) for N images of the
-        data set and R renders.
     """
     count = len(images.rows) + len(images.renders)
     draws = generator(seed, "flips")
@@ -243,15 +187,6 @@ def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) ->
 
     A chunk of several batches is shifted and flipped in one call, which takes
     less time than one call for each batch.
-
-    Args:
-        images: Images of the data set, and renders.
-        batch_size: Number of images of a batch in this process, B.
-        draws: Random draws for the images of this process.
-
-    Yields:
-        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
-        each image is a render, bool, shape (B,).
     """
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
@@ -297,16 +232,6 @@ def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws)
 
     Worker processes read random crops of the images, and flip half of them.
     Renders are in memory. They are shifted and flipped here.
-
-    Args:
-        images: Images of the data set, and renders.
-        files: Image files of the data set.
-        draws: Random draws for the images of this process, in batches of B
-            images.
-
-    Yields:
-        Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether
-        each image is a render, bool, shape (B,).
     """
     split, rows, renders = images
     device = split.labels.device
@@ -338,21 +263,16 @@ def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws)
         yield shown, labels, is_render.to(device)
 
 
-def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
+def crop_and_flip(
+    images: Float[Tensor, "N 3 H W"],
+    chosen: Int[Tensor, " B"],
+    shifts: Float[Tensor, "2 B"],
+    flips: Bool[Tensor, " B"],
+) -> Float[Tensor, "B 3 H W"]:
     """Select images, shift each by whole pixels, and flip some of them left to right.
 
     A shift uncovers pixels at a border of the image. They are filled by
     reflection at this border.
-
-    Args:
-        images: Images, shape (N, 3, H, W).
-        chosen: Indices of the selected images, shape (B,).
-        shifts: Vertical and horizontal shift of each selected image in pixels,
-            shape (2, B). Positive shifts move the image up and to the left.
-        flips: Whether each selected image is then flipped, bool, shape (B,).
-
-    Returns:
-        Shifted and flipped images, shape (B, 3, H, W).
     """
     height, width = images.shape[2:]
     device = images.device
@@ -377,11 +297,6 @@ def _reflect(index: Tensor, size: int) -> Tensor:
     """Reflect pixel indices outside an image at its border, as `torch.nn.ReflectionPad2d` does.
 
     The index -1 becomes 1, and the index `size` becomes `size` - 2.
-
-    Args:
-        index: Indices of rows or columns. Each is less than `size` outside the
-            image.
-        size: Number of rows or columns of the image.
     """
     last = size - 1
     return last - (last - index.abs()).abs()

@@ -24,16 +24,7 @@ CHECKSUM_BYTES = 32
 
 
 def cache_folder(choice: str | None) -> Path | None:
-    """Return the folder of the cache that a user chooses.
-
-    Args:
-        choice: Path of a folder; "auto" for a folder in the user's cache, which
-            is $XDG_CACHE_HOME or ~/.cache; or None for no cache.
-
-    Returns:
-        Folder of the cache. None without a cache, or if "auto" finds no home
-        folder.
-    """
+    """Return the folder of the cache that a user chooses."""
     if not choice:
         return None
     if choice != "auto":
@@ -47,13 +38,6 @@ def source_key(*packages: Path) -> str:
 
     As part of the key of a cache, the hash makes cached results of other code
     unused.
-
-    Args:
-        packages: Folders of the packages.
-
-    Returns:
-        Hash of all Python files in these folders, and of the versions of torch
-        and NumPy.
     """
     files = []
     for folder in packages:
@@ -78,14 +62,7 @@ class TensorCache:
         self.writable = folder is not None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
-        """Read the tensors that were written under a key.
-
-        Args:
-            key: Name of the file, such as a hash of `content_hash`.
-
-        Returns:
-            Tensors by name. None if there is no such file, or if it is damaged.
-        """
+        """Read the tensors that were written under a key."""
         if self.folder is None:
             return None
         try:
@@ -103,10 +80,6 @@ class TensorCache:
 
         Other processes never read a partly written file: they read the old file
         or the new one.
-
-        Args:
-            key: Name of the file, such as a hash of `content_hash`.
-            tensors: Tensors by name, on the CPU.
         """
         if self.folder is None or not self.writable:
             return

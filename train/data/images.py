@@ -73,46 +73,18 @@ class ImageFiles:
         return [(str(path), (self.folder / path).stat().st_size) for path in self.paths]
 
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Read the central squares of images, batch by batch.
-
-        Args:
-            rows: For each batch, the indices of its images in `paths`, shape
-                (B,).
-
-        Returns:
-            For each batch, its images, uint8, shape (B, 3, size, size).
-        """
+        """Read the central squares of images, batch by batch."""
         return self._read([(row, None) for row in batch.tolist()] for batch in rows)
 
     def crops(self, rows: Iterable[Tensor], seeds: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Read random crops of images, batch by batch. A random half of the crops is flipped.
-
-        Args:
-            rows: For each batch, the indices of its images in `paths`, shape
-                (B,).
-            seeds: For each batch, the seed of each crop, shape (B,).
-
-        Returns:
-            For each batch, its images, uint8, shape (B, 3, size, size).
-        """
+        """Read random crops of images, batch by batch. A random half of the crops is flipped."""
         return self._read(
             list(zip(batch_rows.tolist(), batch_seeds.tolist(), strict=True))
             for batch_rows, batch_seeds in zip(rows, seeds, strict=True)
         )
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
-        """Read batches of images in worker processes.
-
-        Args:
-            batches: For each batch, the index of each image in `paths`, with
-                the seed of its random crop, or None for its central square.
-
-        Yields:
-            Images of each batch, uint8, shape (B, 3, size, size).
-
-        Raises:
-            InputError: If an image cannot be read, and `self.skip` is False.
-        """
+        """Read batches of images in worker processes."""
         errors: ReadErrors = {}
         loader: DataLoader = DataLoader(
             _Reader(self),
@@ -154,17 +126,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
 
     def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
-        """Read an image, or another image of its subfolder if it cannot be read.
-
-        Args:
-            key: Index of the image in `ImageFiles.paths`, and seed of its
-                random crop. The seed None reads the central square.
-
-        Returns:
-            The image, uint8, shape (3, size, size), and the error message for
-            each file that could not be read. The image is black if no file
-            could be read.
-        """
+        """Read an image, or another image of its subfolder if it cannot be read."""
         index, seed = key
         errors: ReadErrors = {}
         for path in self._candidates(index):
@@ -186,9 +148,6 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
 
         These are the paths of the other images in the same subfolder. The next
         one in the list of paths comes first.
-
-        Args:
-            index: Index of the image in `ImageFiles.paths`.
         """
         paths = self._files.paths
         for path in (*paths[index:], *paths[:index]):
@@ -206,16 +165,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
 
 
 def _collate(items: Sequence[tuple[Tensor, ReadErrors]]) -> tuple[Tensor, ReadErrors]:
-    """Stack the images of a batch, and join their error messages.
-
-    Args:
-        items: For each image, a tensor of shape (3, size, size) and the error
-            message for each file that could not be read.
-
-    Returns:
-        Images of the batch, shape (B, 3, size, size), and all error messages by
-        the path of the file.
-    """
+    """Stack the images of a batch, and join their error messages."""
     all_errors: ReadErrors = {}
     for _, errors in items:
         all_errors |= errors

@@ -1,6 +1,7 @@
 """Read masks, which tell the pixels of an object in a photograph from the others."""
 
 import numpy as np
+from jaxtyping import UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import ImageOps
 
@@ -15,25 +16,12 @@ TINT = 8
 ADVICE = "save white where the object is and black elsewhere"
 
 
-def read_mask(path: str, height: int, width: int) -> np.ndarray:
+def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height width"]:
     """Read the mask of the object in a photograph.
 
     The opaque part of an image with transparency is the object. In an image of two
     values or colors, of which one is black, the other one is the object. Otherwise,
     white is the object. What is not plain white on black is printed.
-
-    Args:
-        path: Image file.
-        height: Height of the photograph in pixels.
-        width: Width of the photograph in pixels.
-
-    Returns:
-        Mask, uint8, shape (height, width): 255 where the object is, and less where
-        the object covers a part of a pixel.
-
-    Raises:
-        InputError: If the file is not an image, has another size than the
-            photograph, or does not say where the object is.
     """
     require_file(path, "give an image file as mask")
     try:

@@ -13,6 +13,7 @@ from typing import NoReturn
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from augment.classifiers.adapter import Label, class_index, nearest
@@ -95,13 +96,6 @@ def require_outside(out: Path, folder: Path) -> None:
 
     Otherwise the pictures among the results would later be scored as
     photographs.
-
-    Args:
-        out: Folder for results.
-        folder: Folder of photographs.
-
-    Raises:
-        InputError: If `out` lies inside `folder`.
     """
     if out.resolve().is_relative_to(folder.resolve()):
         raise InputError(
@@ -130,21 +124,6 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     - hard_negatives: names of other sources, separated by ";". A positive image
       is ranked against their negatives, too;
     - mesh: name of the photographed object.
-
-    Args:
-        folder: Folder of photographs.
-        classes: Names of the classes of the network.
-        label: Positive class, or a list of several.
-
-    Returns:
-        Images, sorted by path.
-
-    Raises:
-        InputError: If the folder is missing, unreadable or empty, or mixes both
-            layouts; if `label` is not a class; if the name of a subfolder is
-            not a class but resembles `label`; if no subfolder is named after a
-            class; or if photos.csv lacks a column, contradicts itself, or names
-            only missing files or a source without images.
     """
     labels = label_names(label)
     classes = [*map(composed, classes)]
@@ -185,15 +164,6 @@ def _require_files_of_rows(
     """Check that the rows of photos.csv name files that exist.
 
     A warning tells how many rows name a missing file.
-
-    Args:
-        table: Path of photos.csv.
-        rows: Rows of the table by the path of the image.
-        files: Paths of all files in the folder.
-        example: Path of an image, as an example for the error message.
-
-    Raises:
-        InputError: If all rows name missing files.
     """
     missing = sorted(rows.keys() - set(map(_composed_path, files)))
     if not missing:
@@ -208,18 +178,7 @@ def _require_files_of_rows(
 
 
 def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
-    """List the classes for which a folder has a subfolder.
-
-    Args:
-        folder: Folder of photographs.
-        classes: Names of the classes of the network.
-
-    Returns:
-        Names of the classes that have a subfolder, sorted.
-
-    Raises:
-        InputError: If the folder is missing.
-    """
+    """List the classes for which a folder has a subfolder."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
     names = {*folder_names(folder)}
@@ -233,17 +192,7 @@ def folder_names(folder: Path) -> list[str]:
 
 
 def find_unlabeled(folder: Path) -> list[Photograph]:
-    """Find all images of a folder and its subfolders, without their classes.
-
-    Args:
-        folder: Folder of the images.
-
-    Returns:
-        Images, sorted by path. The label of each is empty.
-
-    Raises:
-        InputError: If the folder is missing or holds no image.
-    """
+    """Find all images of a folder and its subfolders, without their classes."""
     image_paths, _ = _image_files(folder)
     return [Photograph(path, label="", source=None) for path in image_paths]
 
@@ -252,13 +201,6 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     """List the image files, and all files, of a folder and its subfolders.
 
     Hidden files are left out.
-
-    Returns:
-        Two lists of paths relative to the folder: the images, sorted, and all
-        files.
-
-    Raises:
-        InputError: If the folder does not exist or holds no image.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
@@ -277,12 +219,6 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
 
     Files that the library itself reads or writes there, photos.csv and
     lab.json, are left out.
-
-    Args:
-        folder: Folder of images.
-
-    Returns:
-        Sorted paths, relative to the folder.
     """
     own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
     other_files = [path for path in visible_files(folder) if path not in own_files]
@@ -309,14 +245,7 @@ def _warn_once(text: str) -> None:
 
 
 def is_hidden(name: str) -> bool:
-    """Return whether a file or folder is hidden, or was added by macOS.
-
-    Args:
-        name: Name of the file or folder.
-
-    Returns:
-        Whether the name begins with a dot or is "__MACOSX".
-    """
+    """Return whether a file or folder is hidden, or was added by macOS."""
     return name.startswith(".") or name == MACOS_FOLDER
 
 
@@ -350,22 +279,7 @@ def _has_class_folders(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> bool:
-    """Return whether a folder has a subfolder for each class, and check their names.
-
-    Args:
-        folder: Folder of photographs.
-        paths: Paths of its images, relative to the folder.
-        classes: Names of the classes of the network.
-        labels: Positive classes.
-
-    Returns:
-        False if the folder has no subfolders. Otherwise True.
-
-    Raises:
-        InputError: If no subfolder is named after a class; if the name of a
-            subfolder is no class but resembles a label; or if the folder has
-            both subfolders and images outside of them.
-    """
+    """Return whether a folder has a subfolder for each class, and check their names."""
     names = folder_names(folder)
     no_classes = [
         name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)
@@ -400,19 +314,7 @@ def _is_like(name: str, label: str) -> bool:
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
-    """Read the table photos.csv, which has the source and the object of each photograph.
-
-    Args:
-        table: Path of the table. The file may be missing.
-
-    Returns:
-        Rows of the table by the path of the photograph. Empty if the file is
-        missing.
-
-    Raises:
-        InputError: If the table cannot be read, lacks a column, or has two
-            different rows for a photograph.
-    """
+    """Read the table photos.csv, which has the source and the object of each photograph."""
     rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
         return rows
@@ -440,14 +342,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
 
 
 def split_sources(cell: str) -> tuple[str, ...]:
-    """Split a cell of the column hard_negatives into the names of sources.
-
-    Args:
-        cell: Text of the cell, such as "lab;shop".
-
-    Returns:
-        Names of the sources, such as ("lab", "shop").
-    """
+    """Split a cell of the column hard_negatives into the names of sources."""
     return tuple(name.strip() for name in cell.split(SEPARATOR) if name.strip())
 
 
@@ -465,24 +360,6 @@ def load_photographs(
     channels are converted to 8 bits. The central
     square is reduced with Pillow's Lanczos filter. The filter is wider for a
     larger reduction, which prevents aliasing.
-
-    Args:
-        folder: Folder of the photographs.
-        photographs: Photographs to read.
-        size: Pixels per side of the returned images.
-        skip_unreadable: Whether images that are damaged or too large are
-            skipped.
-        advice: How to skip these images, as the end of the error message.
-
-    Returns:
-        Three values:
-        - the photographs that could be read;
-        - their images, uint8 sRGB, shape (N, 3, size, size);
-        - the paths of the photographs that could not be read.
-
-    Raises:
-        InputError: If an image is damaged or too large, and `skip_unreadable`
-            is False; if no image can be read; or if memory is too small.
     """
     shape = (len(photographs), 3, size, size)
     cpu = torch.device("cpu")
@@ -511,20 +388,11 @@ def load_photographs(
 
 
 def _read_into(
-    images: Tensor,
+    images: UInt8[Tensor, "N 3 size size"],
     folder: Path,
     photographs: Sequence[Photograph],
 ) -> list[Exception | None]:
-    """Read the central squares of photographs into a tensor, in several threads.
-
-    Args:
-        images: Tensor to fill, uint8, shape (N, 3, size, size).
-        folder: Folder of the photographs.
-        photographs: N photographs to read.
-
-    Returns:
-        For each photograph, the error that occurred, or None.
-    """
+    """Read the central squares of photographs into a tensor, in several threads."""
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
     # it decodes and resizes.
@@ -537,16 +405,8 @@ def _read_into(
         pool.shutdown(cancel_futures=True)
 
 
-def _read_image(image: Tensor, path: Path) -> Exception | None:
-    """Read the central square of a photograph into a tensor.
-
-    Args:
-        image: Tensor to fill, uint8, shape (3, size, size).
-        path: File of the photograph.
-
-    Returns:
-        The error that occurred, or None.
-    """
+def _read_image(image: UInt8[Tensor, "3 size size"], path: Path) -> Exception | None:
+    """Read the central square of a photograph into a tensor."""
     try:
         # `np.array` copies the pixels, because the memory of Pillow is read-only.
         pixels = np.array(read_square(path, image.shape[-1]))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 import augment
@@ -49,19 +50,7 @@ def load_shapes(
     seed: int,
     cache: TensorCache | None = None,
 ) -> DataSet:
-    """Render a data set with one class for each kind of solid, or read it from a cache.
-
-    Args:
-        train: Number of training images of each class. Every 20 images show
-            another shape of the solid.
-        test: Number of test images of each class.
-        size: Pixels per side of the images.
-        seed: Seed of the shapes, cameras, backgrounds and lights.
-        cache: Cache of the images. None renders the images every time.
-
-    Returns:
-        The data set.
-    """
+    """Render a data set with one class for each kind of solid, or read it from a cache."""
     count = len(CLASSES) * (train + test)
     require_memory(f"{count} images of {size} pixels", 3 * size**2 * count, torch.device("cpu"))
     cache = cache or TensorCache()
@@ -79,17 +68,12 @@ def load_shapes(
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
-def soft_front_light(to_camera: Tensor, draws: torch.Generator) -> Tensor:
+def soft_front_light(
+    to_camera: Float[Tensor, " 3"], draws: torch.Generator
+) -> Float[Tensor, "49 3"]:
     """Draw uniform ambient light plus a directional light from near the camera.
 
     The direction, color and strength of the light are random.
-
-    Args:
-        to_camera: Unit vector from the object to the camera, shape (3,).
-        draws: Random number generator.
-
-    Returns:
-        Spherical-harmonics coefficients of the light, linear RGB, shape (49, 3).
     """
     direction = F.normalize(to_camera + 0.5 * torch.randn(3, generator=draws), dim=0)
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
@@ -97,20 +81,10 @@ def soft_front_light(to_camera: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
 
 
-def _render(split_name: str, images_per_class: int, seed: int, settings: ImageSettings) -> Tensor:
-    """Render the images of all classes for one split of the data set.
-
-    Args:
-        split_name: "train" or "test". The two splits have different random
-            draws.
-        images_per_class: Number of images of each class.
-        seed: Seed of the shapes, cameras, backgrounds and lights.
-        settings: Settings of the images, such as their size.
-
-    Returns:
-        Images, one class after the other, uint8, shape
-        (classes · images_per_class, 3, size, size).
-    """
+def _render(
+    split_name: str, images_per_class: int, seed: int, settings: ImageSettings
+) -> UInt8[Tensor, "_ 3 size size"]:
+    """Render the images of all classes for one split of the data set."""
     solids_per_class = math.ceil(images_per_class / (CAMERAS * BACKGROUNDS))
     draws = generator(seed, split_name)
     images = []
@@ -123,18 +97,12 @@ def _render(split_name: str, images_per_class: int, seed: int, settings: ImageSe
     return torch.cat(images)
 
 
-def _render_solid(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> Tensor:
+def _render_solid(
+    mesh: Mesh, settings: ImageSettings, draws: torch.Generator
+) -> UInt8[Tensor, "_ 3 size size"]:
     """Render one solid for each pair of a random camera and a random background.
 
     Each image has another light.
-
-    Args:
-        mesh: Mesh of the solid.
-        settings: Settings of the images, such as their size.
-        draws: Random number generator of the cameras, backgrounds and lights.
-
-    Returns:
-        Images, uint8, shape (CAMERAS · BACKGROUNDS, 3, size, size).
     """
     polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
     cameras = []

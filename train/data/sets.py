@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from augment.classifiers.adapter import class_index
@@ -44,7 +45,7 @@ class Split:
     """
 
     images: Tensor | ImageFiles
-    labels: Tensor
+    labels: Int[Tensor, " N"]
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -71,29 +72,14 @@ class Split:
         """Yield images of the split, batch by batch.
 
         Images on disk are reduced to their central squares.
-
-        Args:
-            rows: For each batch, the indices of its images in the split, shape
-                (B,).
-
-        Returns:
-            For each batch, its images, uint8, shape (B, 3, H, W).
         """
         if isinstance(self.images, ImageFiles):
             return self.images.squares(rows)
         images = self.images
         return (images[batch] for batch in rows)
 
-    def sample(self, count: int) -> Tensor:
-        """Return images whose indices are evenly spread from the first to the last image.
-
-        Args:
-            count: Number of images to return. If the split has fewer, all are
-                returned.
-
-        Returns:
-            Images, uint8, shape (count, 3, H, W).
-        """
+    def sample(self, count: int) -> UInt8[Tensor, "count 3 H W"]:
+        """Return images whose indices are evenly spread from the first to the last image."""
         indices = torch.linspace(0, len(self) - 1, min(count, len(self))).long()
         return next(iter(self.squares([indices])))
 
@@ -128,19 +114,7 @@ class DataSet:
 
 
 def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
-    """Replace the labels of a data set by the class indices of a network.
-
-    Args:
-        data: Data set. Each of its classes must be a class of the network.
-        classes: Names of the classes of the network.
-        subject: Name of the data set at the start of the error message.
-
-    Returns:
-        Data set with the same images. Its labels are indices into `classes`.
-
-    Raises:
-        InputError: If a class of the data set is not in `classes`.
-    """
+    """Replace the labels of a data set by the class indices of a network."""
     # The new label of each old label.
     new_labels = torch.tensor([class_index(classes, name, subject) for name in data.classes])
     train = Split(data.train.images, new_labels[data.train.labels])
@@ -148,25 +122,13 @@ def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
     return replace(data, classes=tuple(classes), train=train, test=test)
 
 
-def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fraction") -> Tensor:
+def held_out_rows(
+    split: Split, fraction: float, seed: int, argument: str = "fraction"
+) -> Bool[Tensor, " N"]:
     """Draw a fraction of the images of every class at random, to hold them out.
 
     With the same seed, a larger fraction holds out the same images and
     additional ones.
-
-    Args:
-        split: N images and their labels.
-        fraction: Fraction of each class that is held out, between 0 and 1. The
-            number of images is rounded.
-        seed: Seed of the random draws.
-        argument: Name of the argument with the fraction, for error messages.
-
-    Returns:
-        Whether each image is held out, bool, shape (N,).
-
-    Raises:
-        InputError: If `fraction` is not between 0 and 1, or if it holds out
-            none or all of the images of a class.
     """
     if not 0 < fraction < 1:
         raise InputError(
@@ -190,19 +152,11 @@ def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fra
     return is_held_out
 
 
-def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
+def channel_statistics(images: UInt8[Tensor, "N 3 H W"]) -> tuple[list[float], list[float]]:
     """Compute the mean and the standard deviation of the pixels of each color channel.
 
     They are computed in float64 from a histogram of the 256 pixel values. This
     makes rounding errors negligible.
-
-    Args:
-        images: Images, uint8, shape (N, 3, H, W).
-
-    Returns:
-        Two lists for red, green and blue: the means and the standard
-        deviations. Pixel values are scaled to [0, 1]. A standard deviation is
-        at least 0.001.
     """
     values = torch.arange(256, dtype=torch.float64) / 255
     means = []
@@ -223,15 +177,6 @@ def load_cifar100(path: str) -> DataSet:
 
     If the folder lacks the data set, or if its checksum is wrong, it is
     downloaded to the folder.
-
-    Args:
-        path: Folder of the data set.
-
-    Returns:
-        The data set.
-
-    Raises:
-        InputError: If the data set cannot be downloaded.
     """
     # This import is here because torchvision takes a second to import.
     from torchvision.datasets import CIFAR100
@@ -260,17 +205,6 @@ def load_npz(path: str) -> DataSet:
     - train_images and test_images: uint8 RGB, shape (N, 3, S, S);
     - train_labels and test_labels: index of the class of each image, shape (N,);
     - classes: names of the C classes, shape (C,).
-
-    Args:
-        path: The .npz file.
-
-    Returns:
-        The data set.
-
-    Raises:
-        InputError: If the file is missing or damaged, if an array has another
-            type or shape, or if an array is pickled. A pickled array could run
-            code.
     """
     if not Path(path).is_file():
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
@@ -288,15 +222,7 @@ def load_npz(path: str) -> DataSet:
 
 
 def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
-    """Read a data set from the arrays of an open .npz file.
-
-    Args:
-        archive: The open file, with the arrays train_images, train_labels,
-            test_images, test_labels and classes.
-
-    Raises:
-        ValueError: If an array has a wrong type or shape.
-    """
+    """Read a data set from the arrays of an open .npz file."""
     classes = archive["classes"]
     splits = []
     for split_name in progress(("train", "test"), "reading the data"):
@@ -312,18 +238,10 @@ def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
     return DataSet(tuple(names), train, test)
 
 
-def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
-    """Check arrays of images and labels, and convert them to a `Split`.
-
-    Args:
-        images: Images, which must be uint8 of shape (N, 3, S, S).
-        labels: Labels, which must be integers from 0 to `class_count` - 1,
-            shape (N,). At least one is needed.
-        class_count: Number of classes.
-
-    Raises:
-        ValueError: If a shape, a type or a label is wrong.
-    """
+def _npz_split(
+    images: UInt8[np.ndarray, "N 3 S S"], labels: Int[np.ndarray, " N"], class_count: int
+) -> Split:
+    """Check arrays of images and labels, and convert them to a `Split`."""
     is_square = images.ndim == 4 and images.shape[1] == 3 and images.shape[2] == images.shape[3]
     if not is_square or images.dtype != np.uint8:
         given = f"images are {images.dtype} of shape {images.shape}"
@@ -350,21 +268,6 @@ def load_folder(
 
     If `size` is at most `MAX_SIZE_IN_MEMORY`, the central squares of all images
     are read and reduced to this size. Otherwise the images stay on disk.
-
-    Args:
-        path: Folder of the data set.
-        size: Pixels per side of the images.
-        test_fraction: Fraction of the images of each class that becomes the
-            test split, in (0, 1). It is not used with a subfolder `test`.
-        skip_unreadable: Whether images that cannot be read are skipped.
-        workers: Number of processes that read images which stay on disk.
-
-    Returns:
-        The data set.
-
-    Raises:
-        InputError: If the folder has neither of the two layouts, or if an image
-            cannot be read.
     """
     root = Path(path)
     if not root.is_dir():
@@ -412,22 +315,7 @@ def load_unlabeled(
     skip_unreadable: bool,
     workers: int,
 ) -> DataSet:
-    """Load all images of a folder and its subfolders as an unlabeled data set.
-
-    Args:
-        path: Folder of the images.
-        size: Pixels per side of the images.
-        test_fraction: Fraction of the images that becomes the test split, in
-            (0, 1). The test split has at most `HELD_OUT` images.
-        skip_unreadable: Whether images that cannot be read are skipped.
-        workers: Number of processes that read images which stay on disk.
-
-    Returns:
-        The data set. It has no classes, and every label is 0.
-
-    Raises:
-        InputError: If the folder holds no image, or if an image cannot be read.
-    """
+    """Load all images of a folder and its subfolders as an unlabeled data set."""
     found = find_unlabeled(Path(path))
     _, images = _read(Path(path), found, size, skip_unreadable, workers)
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
@@ -443,15 +331,7 @@ def _folder_split(
     skip_unreadable: bool,
     workers: int,
 ) -> Split:
-    """Load the images of a folder that has a subfolder for each class.
-
-    Args:
-        root: The folder.
-        classes: Names of the classes. A label is an index into them.
-        size: Pixels per side of the images.
-        skip_unreadable: Whether images that cannot be read are skipped.
-        workers: Number of processes that read images which stay on disk.
-    """
+    """Load the images of a folder that has a subfolder for each class."""
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)
     labels = [class_index(classes, item.label, str(root)) for item in found]
@@ -461,21 +341,7 @@ def _folder_split(
 def _read(
     root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
 ) -> tuple[list[Photograph], Tensor | ImageFiles]:
-    """Read photographs into memory if `size` is small. Otherwise leave them on disk.
-
-    Args:
-        root: Folder of the photographs.
-        found: Photographs in the folder.
-        size: Pixels per side of the images. If it is more than
-            MAX_SIZE_IN_MEMORY, the photographs stay on disk.
-        skip_unreadable: Whether images that cannot be read are skipped.
-        workers: Number of processes that read images which stay on disk.
-
-    Returns:
-        Photographs, and their images: uint8 of shape (N, 3, size, size), or
-        files on disk. Skipped images are missing in both. Files on disk are not
-        read, so it is not yet known which of them must be skipped.
-    """
+    """Read photographs into memory if `size` is small. Otherwise leave them on disk."""
     if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
         return found, ImageFiles(root, paths, size, workers, skip_unreadable)

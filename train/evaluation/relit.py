@@ -109,14 +109,7 @@ class RelitScores(ShortRepr):
         return list(self.photographs[0].kept)
 
     def kept(self, light: str) -> Proportion:
-        """Compute the fraction of photographs whose predicted class no slide changes.
-
-        Args:
-            light: Kind of light, such as "random".
-
-        Returns:
-            Fraction of the photographs, with its 95% interval.
-        """
+        """Compute the fraction of photographs whose predicted class no slide changes."""
         is_kept = [photograph.kept[light] == self.slides for photograph in self.photographs]
         return fraction(sum(is_kept), len(is_kept))
 
@@ -149,12 +142,7 @@ class RelitScores(ShortRepr):
 
 
 def _sum_of_kept_fractions(row: Sequence[Any]) -> float:
-    """Add up the fractions of photographs that keep their class in each kind of light.
-
-    Args:
-        row: Name of a class, number of its photographs, and for each kind of
-            light the number of these photographs that keep their class.
-    """
+    """Add up the fractions of photographs that keep their class in each kind of light."""
     _, photograph_count, *kept_counts = row
     return sum(kept_counts) / photograph_count
 
@@ -170,27 +158,7 @@ def attack_folder(
     seed: int = 0,
     limit: int | None = None,
 ) -> RelitScores:
-    """Attack a network by the light of a projector on photographs, and write the results.
-
-    Args:
-        classifier: Network to attack.
-        folder: Folder of photographs. Subfolders are searched, too.
-        settings: Settings of the attack, such as the number of slides.
-        out: Folder for the results. It is created if it does not exist.
-        sensor_noise: Standard deviation of the simulated noise of a camera, in
-            units of 1/255.
-        batch_size: Number of photographs in one pass through the network.
-        seed: Seed of the slides, the random searches and the noise.
-        limit: Largest number of photographs to attack. If the folder has more,
-            photographs at equal distances in the list are chosen. None attacks
-            all photographs.
-
-    Returns:
-        Predictions for each photograph in each kind of light.
-
-    Raises:
-        InputError: If the folder holds no photograph that can be read.
-    """
+    """Attack a network by the light of a projector on photographs, and write the results."""
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, limit or len(found))
     readable, images, unreadable = load_photographs(
@@ -220,17 +188,7 @@ def attack_folder(
 
 
 def read_relit(folder: Path) -> RelitScores:
-    """Read the predictions that `attack_folder` wrote to relit.json.
-
-    Args:
-        folder: Folder of the results.
-
-    Returns:
-        Predictions for each photograph in each kind of light.
-
-    Raises:
-        InputError: If the file is missing or damaged.
-    """
+    """Read the predictions that `attack_folder` wrote to relit.json."""
     content = read_json(folder / RELIT)
     photographs = [RelitPhotograph(**item) for item in content["photographs"]]
     pictures = {int(index): name for index, name in content["pictures"].items()}
@@ -240,16 +198,7 @@ def read_relit(folder: Path) -> RelitScores:
 def _describe(
     result: PhotographAttackResult, photographs: Sequence[Photograph]
 ) -> list[dict[str, Any]]:
-    """Convert the result of an attack to entries of relit.json.
-
-    Args:
-        result: Result of the attack on N photographs.
-        photographs: The N photographs, in the same order.
-
-    Returns:
-        For each photograph, a dictionary of the attributes of
-        `RelitPhotograph`.
-    """
+    """Convert the result of an attack to entries of relit.json."""
     classes = result.classifier.classes
     described = []
     for index, photograph in enumerate(photographs):
@@ -276,13 +225,6 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     in only one kind of light come first, which is usually the gradient attack.
     Photographs whose class changes in more kinds of light follow. Photographs
     whose class never changes come last.
-
-    Args:
-        result: Result of the attack.
-        out: Folder for the pictures.
-
-    Returns:
-        For the index of each chosen photograph, the file name of its picture.
     """
     # Each entry is about one kind of light: whether any slide changes the class of each
     # photograph, shape (N,).
@@ -306,16 +248,7 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
 
 
 def _slide_to_show(result: PhotographAttackResult, photograph: int) -> int:
-    """Choose the slide with which a picture shows a photograph.
-
-    Args:
-        result: Result of the attack.
-        photograph: Index of the photograph.
-
-    Returns:
-        Index of the first slide that changes the predicted class in the
-        strongest kind of light. 0 if no slide changes it.
-    """
+    """Choose the slide with which a picture shows a photograph."""
     # The kinds of light are in the order of their strength.
     *_, changed_in_strongest = result.changed.values()
     return int(changed_in_strongest[photograph].int().argmax())

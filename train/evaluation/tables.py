@@ -91,15 +91,7 @@ def _align(cells: Sequence[str]) -> Column:
 
 
 def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
-    """Divide the columns of a table into several tables that fit the width of the terminal.
-
-    Args:
-        columns: Columns of a table. The first one has the titles of the rows.
-
-    Returns:
-        One list of columns for each table. Each begins with the first column.
-        If the output is a file, there is one table.
-    """
+    """Divide the columns of a table into several tables that fit the width of the terminal."""
     terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     first, *others = columns
     tables = [[first]]
@@ -141,26 +133,13 @@ def as_text(value: object) -> str:
 
 
 def join_words(items: Sequence[str], conjunction: str) -> str:
-    """Join items to a list in words, such as "a, b and c".
-
-    Args:
-        items: At least one item.
-        conjunction: Word before the last item, such as "and".
-    """
+    """Join items to a list in words, such as "a, b and c"."""
     *others, last = items
     return f"{', '.join(others)} {conjunction} {last}" if others else last
 
 
 def fraction(hits: int, n: int) -> Proportion:
-    """Compute hits / n with its 95% Wilson score interval (Wilson 1927).
-
-    Args:
-        hits: Number of images that meet a condition.
-        n: Number of images. If it is 0, the fraction is unknown.
-
-    Returns:
-        Fraction with its interval, all in [0, 1].
-    """
+    """Compute hits / n with its 95% Wilson score interval (Wilson 1927)."""
     if n == 0:
         return Proportion()
     # This import is here because it takes a second.
@@ -178,14 +157,7 @@ def fraction(hits: int, n: int) -> Proportion:
 
 
 def format_fraction(proportion: Proportion) -> str:
-    """Format a fraction of images with its interval.
-
-    Args:
-        proportion: Fraction of images, as `fraction` returns it.
-
-    Returns:
-        Text such as "8 of 40 [10%, 35%]". If there are no images, "-".
-    """
+    """Format a fraction of images with its interval."""
     if proportion.n == 0:
         return "-"
     counts = f"{proportion.hits} of {proportion.n}"
@@ -193,16 +165,7 @@ def format_fraction(proportion: Proportion) -> str:
 
 
 def format_interval(estimate: Estimate | None, sign: str = "") -> str:
-    """Format the value of a metric with its interval.
-
-    Args:
-        estimate: Value and interval. None if the metric was not computed.
-        sign: "+" writes positive numbers with a plus sign.
-
-    Returns:
-        Text such as "0.500 [0.250, 0.750]". If the interval is unknown, only
-        the value. If the value is unknown, "-".
-    """
+    """Format the value of a metric with its interval."""
     if estimate is None or estimate.value is None:
         return "-"
     value = f"{estimate.value:{sign}.3f}"
@@ -212,12 +175,7 @@ def format_interval(estimate: Estimate | None, sign: str = "") -> str:
 
 
 def describe_intervals(estimates: Iterable[Estimate | None]) -> str:
-    """Say what the intervals of metrics are over.
-
-    Returns:
-        Text such as "95% intervals over objects, or over images, for these objects". Empty if
-        no metric has an interval.
-    """
+    """Say what the intervals of metrics are over."""
     over = {item.over for item in estimates if item is not None and item.low is not None}
     # A set has no order, and the more general statement comes first.
     units = sorted(over - {""}, key=lambda words: (THESE_OBJECTS in words, words))

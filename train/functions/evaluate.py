@@ -148,21 +148,7 @@ def evaluate(
 def _choose_labels(
     classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
 ) -> list[str]:
-    """Choose the positive classes, on whose photographs recall is measured.
-
-    Args:
-        classifier: Network with the names of its classes.
-        folder: Folder of photographs with a sub-folder for each class.
-        label: Positive classes by name or index. None for all classes of the
-            network that have a sub-folder.
-
-    Returns:
-        Names of the positive classes.
-
-    Raises:
-        InputError: If a class is unknown, or if no sub-folder is named after a
-            class.
-    """
+    """Choose the positive classes, on whose photographs recall is measured."""
     if label is not None:
         return [classifier.classes[classifier.label(name)] for name in label_names(label)]
     labels = class_folders(folder, classifier.classes)
@@ -182,16 +168,7 @@ def _choose_labels(
 
 
 def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
-    """Return the operating points (thresholds on the log-odds) that are stored with a network.
-
-    Args:
-        classifier: The network.
-        labels: Positive classes.
-
-    Returns:
-        Operating point of each positive class. Empty if one of these classes has
-        no operating point.
-    """
+    """Return the operating points (thresholds on the log-odds) that are stored with a network."""
     by_label = {point.label: point for point in classifier.operating_points}
     has_all = by_label.keys() >= set(labels)
     return [by_label[name] for name in labels] if has_all else []
@@ -204,18 +181,7 @@ def _choose_operating_points(
     rate: float,
     skip_unreadable: bool,
 ) -> list[OperatingPoint]:
-    """Choose a threshold on the log-odds of each positive class, on a folder of photographs.
-
-    Args:
-        predictor: Network with its classes and the size of its images.
-        folder: Folder of photographs.
-        labels: Positive classes.
-        rate: False-positive rate that the thresholds should have, in (0, 1).
-        skip_unreadable: Whether to leave out photographs that cannot be read.
-
-    Returns:
-        Operating point of each positive class.
-    """
+    """Choose a threshold on the log-odds of each positive class, on a folder of photographs."""
     path = published(Path(folder))
     # The caller of `evaluate` knows this folder as the argument `calibrate`.
     with keyed(folder="calibrate"):

@@ -178,15 +178,7 @@ def harden(
 
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
-    """Copy a network, and check that the weights of the copy can be trained.
-
-    Args:
-        network: Classifier, or plain network in evaluation mode.
-
-    Raises:
-        InputError: If a plain network is in training mode, or if the copy cannot
-            be trained.
-    """
+    """Copy a network, and check that the weights of the copy can be trained."""
     if not isinstance(network, Classifier):
         require_evaluation_mode(network, "network")
     copy = deepcopy(network)
@@ -203,15 +195,7 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
 def _read_settings(
     changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
 ) -> ExperimentSettings:
-    """Combine the settings of the experiment "classifier" with the arguments of `harden`.
-
-    Args:
-        changes: Nested settings that follow from arguments such as `meshes` and
-            `seed`. They replace settings of the experiment.
-        sections: Groups of settings that the caller gave, by the name of the
-            group, such as "train". They replace settings of the experiment and
-            of `changes`.
-    """
+    """Combine the settings of the experiment "classifier" with the arguments of `harden`."""
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
@@ -223,13 +207,7 @@ def _read_settings(
 
 
 def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
-    """Return the fields that a caller gave for a group of settings, by the name of the field.
-
-    Args:
-        name: Name of the group, such as "train", for the error message.
-        section: Settings with all fields, a mapping of some fields, or None for
-            no fields.
-    """
+    """Return the fields that a caller gave for a group of settings, by the name of the field."""
     if isinstance(section, Settings):
         return asdict(cast(Any, section))
     if section is None or isinstance(section, Mapping):
@@ -255,16 +233,7 @@ def _restores_torch() -> Iterator[None]:
 
 
 def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier, and write the files of the training to its folder.
-
-    Args:
-        settings: Settings of the training. `settings.run` is the folder.
-        classifier: Classifier to train.
-        has_report: Whether to write a report and to print its path.
-
-    Returns:
-        The network with the weights that the training selected.
-    """
+    """Train a copy of a classifier, and write the files of the training to its folder."""
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
     # The caller of `harden` knows the setting data.path as the argument `photographs`.
@@ -282,17 +251,7 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
 
 
 def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
-    """Return a copy of the network of the caller with the weights after the training.
-
-    Args:
-        network: Classifier or plain network that the caller gave.
-        classifier: Classifier that contains a copy of this network.
-        trained: Network after the training, of the same architecture.
-
-    Returns:
-        Classifier if the caller gave a classifier. It has no operating points,
-        because its logits differ. Otherwise a copy of the plain network.
-    """
+    """Return a copy of the network of the caller with the weights after the training."""
     if isinstance(network, Classifier):
         target = deepcopy(classifier.function)
         copy: nn.Module = Classifier(target, classifier.size, classifier.classes, classifier.name)

@@ -74,16 +74,7 @@ def published_names() -> list[str]:
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the results of a published network from the scores in its file.
-
-    Args:
-        scores: Scores by name. "test/accuracy" has a number. The name of a
-            folder of photographs, such as "photographs", has a mapping of the
-            metrics on these photographs.
-
-    Returns:
-        Results by name, such as "test/accuracy" and "photographs/auc".
-    """
+    """Read the results of a published network from the scores in its file."""
     results = {ACCURACY: Estimate(scores[ACCURACY])}
     for folder, metrics in scores.items():
         if not isinstance(metrics, Mapping):

@@ -29,21 +29,7 @@ EXPECTED = (
 def as_mappings(
     name: str, meshes: Sequence[MeshItem], classifier: Classifier, folder: Path
 ) -> list[dict[str, Any]]:
-    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
-
-    Args:
-        name: Name of the argument that has the meshes, for error messages.
-        meshes: Meshes, with or without their classes.
-        classifier: Classifier whose classes are given, by name or by index.
-        folder: Folder to which meshes in memory are written, because settings
-            can only name files.
-
-    Returns:
-        A mapping for each mesh. It has the key "label" if the class is given.
-
-    Raises:
-        InputError: If an item is not a mesh, or if the classifier lacks a class.
-    """
+    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`."""
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
@@ -63,16 +49,7 @@ def as_mappings(
 
 
 def _mesh_fields(source: MeshSource, folder: Path) -> dict[str, Any]:
-    """Return the fields of `ObjectSettings` that describe a mesh.
-
-    Args:
-        source: File, "solid:NAME", or mesh in memory.
-        folder: Folder to which a mesh in memory is written.
-
-    Returns:
-        Mapping with the key "mesh". For a mesh in memory, it also has the key
-        "gloss", which says whether the written file has a glossy material.
-    """
+    """Return the fields of `ObjectSettings` that describe a mesh."""
     if not isinstance(source, Mesh):
         return {"mesh": str(source)}
     with TemporaryDirectory() as temporary:
@@ -93,23 +70,7 @@ def find_positive_classes(
     mappings: Sequence[dict[str, Any]],
     classifier: Classifier,
 ) -> list[str]:
-    """Return the names of the classes that the meshes of a caller show.
-
-    Args:
-        label: Class of all meshes, by name or index. None if each mesh is given
-            with its class, or is named by it, as "orange.glb".
-        meshes: Meshes as the caller gave them.
-        mappings: Settings of the same meshes, as `as_mappings` returns them.
-        classifier: Classifier that has the classes.
-
-    Returns:
-        Name of `label`. Without a label, the classes of the meshes, each class
-        once, in the order of the meshes.
-
-    Raises:
-        InputError: If the classifier lacks a class, or if the class of a mesh is
-            unknown.
-    """
+    """Return the names of the classes that the meshes of a caller show."""
     if label is not None:
         return [classifier.classes[classifier.label(label)]]
     for index, item in enumerate(meshes):

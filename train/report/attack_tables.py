@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from augment.attacks.attack import AttackResult
@@ -49,19 +50,7 @@ def format_attack(
     checks: Mapping[str, Any] | None,
     lines: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
-    """Describe the attack on one mesh in lines of text for the console.
-
-    Args:
-        name: Name of the mesh.
-        result: Result of `nb.attack`.
-        checks: Result of `nb.check`. None if nothing was checked.
-        lines: Lines of attack.jsonl, as `nb.save` returns them.
-
-    Returns:
-        Lines of text. The first line says how often the attack succeeds. Lines
-        about the checks, and about the images of the adversaries (the successful
-        examples) when they are computed in other ways, follow.
-    """
+    """Describe the attack on one mesh in lines of text for the console."""
     has_noise = bool(result.settings.sensor_noise)
     text = [_heading(name, result)]
     if checks is not None:
@@ -74,17 +63,7 @@ def format_attack(
 
 
 def _heading(name: str, result: AttackResult) -> str:
-    """Write the line that sums up an attack.
-
-    Args:
-        name: Name of the mesh.
-        result: Result of the attack.
-
-    Returns:
-        Line with the attacked parameters, the classifier, the success rate, the
-        median number of steps of the successes, the number of passes through the
-        classifier, and the seconds.
-    """
+    """Write the line that sums up an attack."""
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
     heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
     steps = result.steps[result.success & ~result.success_before].double()
@@ -107,15 +86,6 @@ def _success(result: AttackResult) -> str:
     """Write on how many examples an attack succeeds.
 
     Only examples that are classified correctly before the attack count.
-
-    Args:
-        result: Result of the attack.
-
-    Returns:
-        Text with the number of successes. It also has the number of successes
-        without noise if the settings ask for noise of a sensor, the number of
-        successes with a margin of the logits if they ask for a margin, and the
-        number of views that are misclassified if examples have several views.
     """
     clean = result.clean_correct
     rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
@@ -138,20 +108,7 @@ def _success(result: AttackResult) -> str:
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
-    """Describe the results of the checks of an attack in lines of text.
-
-    Args:
-        checks: Result of `nb.check`.
-        has_noise: Whether only an attack that succeeds in spite of the simulated
-            noise of a sensor counts as a success.
-        uses_gradients: Whether the attack takes steps along a gradient.
-            Otherwise its budget is a number of queries.
-
-    Returns:
-        A line about the log-probability before and after the attack, a line that
-        compares the attack with random changes and with longer attacks, and
-        warnings if a check casts doubt on the attack.
-    """
+    """Describe the results of the checks of an attack in lines of text."""
     unit = "step" if uses_gradients else "query"
     units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
@@ -176,33 +133,14 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
 
 
 def _format_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a success rate and, if success is measured with noise, the rate without noise.
-
-    Args:
-        rate: Success rate, in [0, 1].
-        without_noise: Success rate in images without noise, in [0, 1].
-        has_noise: Whether `rate` is measured in images with the simulated noise
-            of a sensor.
-
-    Returns:
-        Text such as "62%" or "62% (70% without noise)".
-    """
+    """Write a success rate and, if success is measured with noise, the rate without noise."""
     if not has_noise:
         return f"{rate:.0%}"
     return f"{rate:.0%} ({without_noise:.0%} without noise)"
 
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
-    """Write how often adversaries still succeed if their images are made in another way.
-
-    Args:
-        version: Key of VERSIONS that says how the images are made, such as
-            "mitsuba".
-        adversaries: Lines of attack.jsonl of the successful examples. Their
-            entry "versions" has the results for each version of the images.
-        has_noise: Whether success is measured in images with the simulated noise
-            of a sensor.
-    """
+    """Write how often adversaries still succeed if their images are made in another way."""
     results = [line["versions"][version] for line in adversaries]
     success = sum(result["success"] for result in results)
     without_noise = ""
@@ -223,18 +161,7 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
 
 
 def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
-    """Write the success of transferred adversaries to a file, and return it as a table.
-
-    Args:
-        transfers: Results of `nb.transfer`. Each is for one other classifier,
-            view or mesh. The first key, such as "classifier", says what kind of
-            thing that is, and its value is the name.
-        path: File that gets a line of JSON for each result.
-
-    Returns:
-        Table with a row for each result. It has the success rate on the images
-        that are classified correctly before the attack.
-    """
+    """Write the success of transferred adversaries to a file, and return it as a table."""
     lines = []
     rows = []
     for result in transfers:
@@ -260,27 +187,13 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
 
 
 def _count_both(is_success: Sequence[bool], is_correct: Sequence[bool]) -> int:
-    """Count the examples that are correct before an attack and on which the attack succeeds.
-
-    Args:
-        is_success: Whether the attack succeeds, for each example.
-        is_correct: Whether the example is classified correctly before the
-            attack, for each example.
-    """
+    """Count the examples that are correct before an attack and on which the attack succeeds."""
     pairs = zip(is_success, is_correct, strict=True)
     return sum(success and correct for success, correct in pairs)
 
 
 def format_sweep(sweep: Sweep) -> str:
-    """Write the success of an attack and of a random search at each radius as a table.
-
-    Args:
-        sweep: Result of `nb.success_by_radius`.
-
-    Returns:
-        Table with a row for each radius. For each of the two methods, it has the
-        success rate, and the number of successes in images without noise.
-    """
+    """Write the success of an attack and of a random search at each radius as a table."""
     rows = []
     for row in sweep:
         radii = [f"{name} {radius:g}" for name, radius in row["radii"].items()]
@@ -295,12 +208,8 @@ def format_sweep(sweep: Sweep) -> str:
     return str(Table("", header, rows))
 
 
-def _success_rate(is_success: Tensor) -> Proportion:
-    """Compute the fraction of examples on which an attack succeeds, with its interval.
-
-    Args:
-        is_success: Whether it succeeds on each example, bool, shape (examples,).
-    """
+def _success_rate(is_success: Bool[Tensor, " examples"]) -> Proportion:
+    """Compute the fraction of examples on which an attack succeeds, with its interval."""
     return fraction(int(is_success.sum()), len(is_success))
 
 
@@ -312,11 +221,6 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     classified correctly before the attack count. With several meshes, rows with
     the mesh "all" have the examples of all meshes together. The figure shows
     these rows, or else the rows of the only mesh.
-
-    Args:
-        sweeps: Result of `nb.success_by_radius` for each mesh, by its name.
-        norms: Norm of the radius of each attacked parameter, such as "l2".
-        out: Folder that the files are written to.
     """
     methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
     if len(sweeps) > 1:
@@ -338,16 +242,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
 
 
 def _pool_meshes(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
-    """Concatenate the examples of all meshes at each radius.
-
-    Args:
-        sweeps: Result of `nb.success_by_radius` for each mesh. All meshes have
-            the same radii.
-        methods: Names of the methods in these results.
-
-    Returns:
-        The same result as for one mesh, with the examples of all meshes.
-    """
+    """Concatenate the examples of all meshes at each radius."""
     pooled = []
     for rows in zip(*sweeps.values(), strict=True):
         success = {method: torch.cat([row[method] for row in rows]) for method in methods}
@@ -356,14 +251,7 @@ def _pool_meshes(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
 
 
 def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
-    """Draw the success rate of each method against the radius.
-
-    Args:
-        records: Rows of sweep.csv with one mesh.
-        norms: Norm of the radius of each attacked parameter. The x axis shows
-            the radius of the first parameter.
-        path: File of the figure.
-    """
+    """Draw the success rate of each method against the radius."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
@@ -391,14 +279,7 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
 def _draw_method(
     axes: "Axes", method: str, rows: Sequence[Mapping[str, Any]], parameter: str
 ) -> None:
-    """Draw the success rate of one method as a line, in a band that is the 95% interval.
-
-    Args:
-        axes: Axes to draw on.
-        method: Name of the method in METHODS.
-        rows: Rows of sweep.csv with this method, one for each radius.
-        parameter: Attacked parameter whose radius is the x coordinate.
-    """
+    """Draw the success rate of one method as a line, in a band that is the 95% interval."""
     radii = [row[parameter] for row in rows]
     values = [row["value"] for row in rows]
     color, line, marker = STYLES[method]

@@ -65,15 +65,7 @@ class Subset:
     name: str = ""
 
     def title(self, overall: str = "all") -> str:
-        """Return the title of the row of this subset in a table.
-
-        Args:
-            overall: Title of the row of all images.
-
-        Returns:
-            `overall`, "label=orange" for a label, or the name of the source,
-            mesh or class.
-        """
+        """Return the title of the row of this subset in a table."""
         if self == ALL:
             return overall
         if self.by == "label":
@@ -109,17 +101,7 @@ Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
 def pools_of(pooled: Pooled, *properties: str) -> dict[Subset, Pool]:
-    """Return the predictions and metrics for all images and for subsets of the images.
-
-    Args:
-        pooled: Predictions and metrics of one evaluation.
-        *properties: Properties by which the images are divided into subsets:
-            "label", "source", "mesh" or "class".
-
-    Returns:
-        A pool, which has predictions and their metrics, for each subset. The
-        first subset is `ALL`. A subset for each value of each property follows.
-    """
+    """Return the predictions and metrics for all images and for subsets of the images."""
     pools_of_property = {
         "label": pooled.by_label,
         "source": pooled.by_source,
@@ -134,23 +116,7 @@ def pools_of(pooled: Pooled, *properties: str) -> dict[Subset, Pool]:
 
 
 def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "source") -> Evaluations:
-    """Read the predictions of runs that were scored on the same images.
-
-    Args:
-        group: For each method, the runs with their scores on these images, as
-            `group_by_images` returns them.
-        exclude: Sources whose images do not count among all images.
-        by: Property by which the images are divided into subsets: "source",
-            "mesh" or "class".
-
-    Returns:
-        Evaluations of each method. A published network has no file of
-        predictions, and is left out.
-
-    Raises:
-        InputError: If predictions.csv cannot be read, if no image has a source
-            in `exclude`, or if `by` is "mesh" and no mesh is known.
-    """
+    """Read the predictions of runs that were scored on the same images."""
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
@@ -161,16 +127,7 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
 
 
 def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Evaluation:
-    """Read the predictions of one run for one folder of photographs.
-
-    Args:
-        scored: Run with the folder of its scores, which holds predictions.csv.
-        exclude: Sources whose images do not count among all images.
-        by: Property by which the images are divided into subsets.
-
-    Raises:
-        InputError: See `read_evaluations`.
-    """
+    """Read the predictions of one run for one folder of photographs."""
     path = scored.folder / PREDICTIONS
     scores = scored.scores
     predictions = read_predictions(path, scores.labels)
@@ -185,15 +142,7 @@ def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Eval
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Check that each source that a user excludes is the source of some photograph.
-
-    Args:
-        names: Names of the excluded sources.
-        predictions: Predictions for all photographs, with their sources.
-
-    Raises:
-        InputError: If an excluded source has no photograph.
-    """
+    """Check that each source that a user excludes is the source of some photograph."""
     sources = {item.photograph.source for item in predictions}
     unknown = set(names) - sources
     if unknown:
@@ -204,18 +153,7 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
 
 
 def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> Estimate | None:
-    """Average a metric over the seeds of a method.
-
-    Args:
-        evaluations: Evaluations of the method, one for each seed.
-        subset: Subset of the images on which the metric is measured.
-        name: Name of the metric in `METRICS`.
-
-    Returns:
-        With one seed, the metric and its 95% interval. With several seeds, the
-        mean, with the lowest and the highest value as the ends of the interval.
-        None if the metric is unknown for every seed.
-    """
+    """Average a metric over the seeds of a method."""
     known: list[Estimate] = []
     values: list[float] = []
     for evaluation in evaluations:
@@ -233,17 +171,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
 
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
-    """Make a table of the metrics of each method on each subset of the images.
-
-    Args:
-        methods: Evaluations of each method, a way to train a network.
-        overall: Title of the rows of all images.
-        by: Title of the first column: "source", "mesh" or "class".
-
-    Returns:
-        Table with a row for each subset and each method. Cells hold means over
-        the seeds of the method.
-    """
+    """Make a table of the metrics of each method on each subset of the images."""
     # A dictionary has each subset once, in order.
     subsets: dict[Subset, None] = {}
     for evaluations in methods.values():
@@ -264,13 +192,6 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
 
     Each method is compared with its initial network, the network with whose
     weights its runs began. It is also compared with the first method.
-
-    Args:
-        methods: Evaluations of each method. An initial network counts as a
-            method.
-
-    Returns:
-        Pairs of a method and the reference that it is compared with.
     """
     first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
     pairs = []
@@ -290,14 +211,6 @@ def class_table(group: Scored) -> Table:
     """Make a table of the top-1 and top-5 accuracy for the images of each class.
 
     The accuracies are among all classes of the network.
-
-    Args:
-        group: For each method, the runs with their scores on the same images,
-            as `group_by_images` returns them.
-
-    Returns:
-        Table with a row for each class and each method. Only classes that the networks have
-        count. The table has no rows if there is one such class, or more than MAX_CLASSES.
     """
     methods = read_evaluations(group, by="class")
     header = ["class", "images", "network", "top-1", "top-5"]
@@ -340,16 +253,6 @@ def difference(
     The 95% interval is paired: both methods are measured without the same
     objects. With several seeds, it is also over seeds. With one seed, it says
     nothing about other seeds.
-
-    Args:
-        evaluations: Evaluations of the method, one for each seed.
-        reference: Evaluations of the reference, another method, one for each
-            seed.
-        subset: Subset of the images on which the metric is measured.
-        name: Name of the metric in `METRICS`.
-
-    Returns:
-        Difference of the means. None if the metric of a run is unknown.
     """
     pools = [evaluation.pools[subset] for evaluation in evaluations]
     reference_pools = [evaluation.pools[subset] for evaluation in reference]
@@ -365,12 +268,7 @@ def difference(
 
 
 def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
-    """Return whether the runs of two methods have the same seeds, in the same order.
-
-    Args:
-        evaluations: Evaluations of a method, one for each seed.
-        reference: Evaluations of the other method, one for each seed.
-    """
+    """Return whether the runs of two methods have the same seeds, in the same order."""
     seeds = [evaluation.run.seed or 0 for evaluation in evaluations]
     reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
     return seeds == reference_seeds
@@ -382,19 +280,7 @@ def difference_tables(
     by: str = "source",
     overall_only: bool = False,
 ) -> list[Table]:
-    """Make a table of the differences of the metrics for each pair of methods.
-
-    Args:
-        methods: Evaluations of each method, a way to train a network.
-        overall: Title of the row of all images.
-        by: Title of the first column: "source", "mesh" or "class".
-        overall_only: Whether to leave out the rows of single sources, meshes or classes.
-
-    Returns:
-        A table for each pair of methods that `choose_pairs` returns, such as a
-        method and the network with whose weights it began. It has a row for each
-        subset of the images.
-    """
+    """Make a table of the differences of the metrics for each pair of methods."""
     tables = []
     for method, base in progress(choose_pairs(methods), "differences"):
         evaluations = methods[method]
@@ -416,15 +302,7 @@ def difference_tables(
 
 
 def overall_differences(methods: Evaluations) -> Table:
-    """Make one table of the differences between methods on the images of all sources.
-
-    Args:
-        methods: Evaluations of each method, a way to train a network.
-
-    Returns:
-        Table with a row for each pair of methods from `choose_pairs`. With
-        several positive classes, rows for each of these classes follow.
-    """
+    """Make one table of the differences between methods on the images of all sources."""
     rows = []
     for table in difference_tables(methods, overall="", overall_only=True):
         for name, *cells in table.rows:
@@ -434,16 +312,7 @@ def overall_differences(methods: Evaluations) -> Table:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """Compare runs in the tables that pnb-train --verbose prints after training.
-
-    Args:
-        runs: Finished runs.
-
-    Returns:
-        Markdown tables of the accuracy, of the metrics and of their differences.
-        A line that explains the kinds of renders, and the paths of images of
-        scored photographs, follow.
-    """
+    """Compare runs in the tables that pnb-train --verbose prints after training."""
     methods = group_by_method(runs)
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
@@ -473,26 +342,7 @@ def format_comparison(
     photographs: str = PHOTOGRAPHS,
     by: str = "source",
 ) -> str:
-    """Compare runs in the tables that pnb-compare prints.
-
-    Args:
-        runs: Finished runs and scored networks.
-        exclude: Sources of photographs that do not count in the metrics on all
-            photographs.
-        photographs: Name of the sub-folder of each run with its scores on
-            photographs.
-        by: Property of photographs: "source", "mesh" or "class". The tables have
-            a row for each of its values.
-
-    Returns:
-        Markdown tables of the accuracy, of the metrics, of their differences and
-        of the seconds of an epoch.
-
-    Raises:
-        InputError: If the runs were scored on different photographs or classes,
-            if no run has the sub-folder and its name is not the usual one, or if
-            predictions cannot be read.
-    """
+    """Compare runs in the tables that pnb-compare prints."""
     methods = group_by_method(runs)
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
@@ -512,24 +362,7 @@ def format_short_comparison(
     photographs: str = PHOTOGRAPHS,
     by: str = "source",
 ) -> str:
-    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
-
-    Args:
-        runs: Finished runs and scored networks.
-        exclude: Sources of photographs that do not count.
-        photographs: Name of the sub-folder of each run with its scores on
-            photographs. If no run has the usual sub-folder "photographs", the
-            first photographs on which the runs were scored are compared.
-        by: "mesh" or "class" for a row for each method and each mesh or class.
-            "source" for a row for each method only.
-
-    Returns:
-        Markdown table of means over the runs of a method. A row for each method
-        ends with the gain in AUC over the first method, with its 95% interval.
-
-    Raises:
-        InputError: See `format_comparison`.
-    """
+    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose."""
     methods = group_by_method(runs)
     groups = group_by_images(methods)
     group = _find_group(list(groups.values()), photographs)
@@ -558,40 +391,18 @@ def format_short_comparison(
 
 
 def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:
-    """Average the accuracy on the test images over runs.
-
-    Args:
-        runs: Runs of one method. The accuracy of some of them may be unknown.
-
-    Returns:
-        Mean of the known accuracies, without an interval. None if all are unknown.
-    """
+    """Average the accuracy on the test images over runs."""
     accuracies = [run.accuracy for run in runs if run.accuracy is not None]
     return Estimate(fmean(accuracies)) if accuracies else None
 
 
 def _title_of_all(exclude: Sequence[str]) -> str:
-    """Return the title of the row of all images.
-
-    Args:
-        exclude: Sources whose images do not count.
-
-    Returns:
-        "all", or "all but A, B" if the sources A and B are excluded.
-    """
+    """Return the title of the row of all images."""
     return f"all but {', '.join(exclude)}" if exclude else "all"
 
 
 def _mean_stored_metric(scored_runs: Sequence[ScoredRun], name: str) -> Estimate | None:
-    """Average a metric over the stored scores of runs, which lack the file predictions.csv.
-
-    Args:
-        scored_runs: Runs of one method with their scores on the same images.
-        name: Name of the metric in `METRICS`.
-
-    Returns:
-        Mean without an interval. None if the scores of no run have the metric.
-    """
+    """Average a metric over the stored scores of runs, which lack the file predictions.csv."""
     values = []
     for scored in scored_runs:
         metric = scored.scores.metrics[name]
@@ -606,16 +417,7 @@ def _format_value(metric: Estimate | None) -> str:
 
 
 def _format_gain(methods: Evaluations, method: str) -> str:
-    """Write the gain in AUC: the AUC of a method minus the AUC of the first method.
-
-    Args:
-        methods: Evaluations of each method, a way to train a network.
-        method: Name of the method.
-
-    Returns:
-        The gain with its 95% interval. "-" for the first method itself, and for
-        a method without evaluations.
-    """
+    """Write the gain in AUC: the AUC of a method minus the AUC of the first method."""
     first = next(iter(methods), method)
     if method == first or method not in methods:
         return "-"
@@ -624,22 +426,7 @@ def _format_gain(methods: Evaluations, method: str) -> str:
 
 
 def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
-    """Find the runs whose scores lie in a sub-folder of a given name.
-
-    Args:
-        groups: Groups of scored runs. All runs of a group were scored on the
-            same images.
-        photographs: Name of the sub-folder with the scores in the folder of
-            each run.
-
-    Returns:
-        Group of these runs. None if no run has the usual sub-folder
-        "photographs".
-
-    Raises:
-        InputError: If runs of several groups have this sub-folder, or if no run
-            has it and its name is not the usual one.
-    """
+    """Find the runs whose scores lie in a sub-folder of a given name."""
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
         first = _first_folder(found[0])
@@ -668,11 +455,6 @@ def _is_scored_on(group: Scored, photographs: str) -> bool:
     A run has its scores in a sub-folder, whose name the user chooses. A network
     that is not a run, such as a published network, has no seed and no such
     sub-folder. Its scores may be compared with those in any sub-folder.
-
-    Args:
-        group: Networks with their scores on the same images, by method.
-        photographs: Name of the sub-folder with the scores in the folder of each
-            run.
     """
     for scored_runs in group.values():
         for scored in scored_runs:

@@ -56,12 +56,7 @@ class ShownMetric:
         return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
 
     def cells(self) -> list[str]:
-        """Write the cells of the row of this metric in a table.
-
-        Returns:
-            Title of the metric, and its value for each network, such as
-            "67% [60%, 73%]". The 95% interval is left out if it is unknown.
-        """
+        """Write the cells of the row of this metric in a table."""
         cells = [self.title]
         for estimate in (self.before, self.after):
             if estimate is None or estimate.value is None:
@@ -164,14 +159,7 @@ class Compared(NamedTuple):
     trained_objects: Sequence[str] = ()
 
     def difference(self, name: str) -> compare.Difference | None:
-        """Compute the difference of a metric on all images: hardened minus original.
-
-        Args:
-            name: Name of the metric in `METRICS`.
-
-        Returns:
-            Difference with its 95% interval. None if the metric is unknown.
-        """
+        """Compute the difference of a metric on all images: hardened minus original."""
         return compare.difference(self.after, self.before, compare.ALL, name)
 
     @property
@@ -181,16 +169,7 @@ class Compared(NamedTuple):
         return len({prediction.label for prediction in pool.positives}) > 1
 
     def metric(self, title: str, note: str, name: str) -> ShownMetric | None:
-        """Average a metric of both networks over their seeds.
-
-        Args:
-            title: The metric in words.
-            note: Words that say which values are good.
-            name: Name of the metric in `METRICS`.
-
-        Returns:
-            The metric. None if it is unknown for one of the networks.
-        """
+        """Average a metric of both networks over their seeds."""
         before = compare.mean_metric(self.before, compare.ALL, name)
         after = compare.mean_metric(self.after, compare.ALL, name)
         if before is None or after is None:
@@ -202,16 +181,7 @@ class Compared(NamedTuple):
 
 
 def describe_place(folder: Path | None, name: str) -> str:
-    """Write the start of a sentence that says where images are from.
-
-    Args:
-        folder: Folder of the images. None if it is unknown.
-        name: Name of the folder with the scores on these images.
-
-    Returns:
-        For path-traced renders, text with their lighting, such as "Under
-        projected patterns (rings and text)". Otherwise, a text with the name.
-    """
+    """Write the start of a sentence that says where images are from."""
     if folder is None or not is_laboratory(folder):
         return f"In the images of “{name}”"
     settings = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
@@ -231,15 +201,7 @@ def is_laboratory(folder: Path) -> bool:
 def compare_networks(
     compared: Compared, rows: dict[str, list[ComparedImage]]
 ) -> FirstScreen | None:
-    """Make the first screen, which says whether hardening helped, and at what price.
-
-    Args:
-        compared: Evaluations of both networks.
-        rows: Rows of pictures, by the title of the row.
-
-    Returns:
-        The first screen. None if recall, false-positive rate or AUC is unknown.
-    """
+    """Make the first screen, which says whether hardening helped, and at what price."""
     label = compared.label
     false_positive_title = f"Other objects called {label}"
     if compared.has_several_classes:
@@ -276,11 +238,7 @@ def compare_networks(
 
 
 def _describe_rows(label: str) -> str:
-    """Say how the rows of pictures were chosen.
-
-    Args:
-        label: Positive classes in words.
-    """
+    """Say how the rows of pictures were chosen."""
     return (
         f"For other objects, any answer but {label} counts as right. Shown are the images on "
         "which the networks differ most: first one for each kind of object and light, then more."
@@ -288,14 +246,7 @@ def _describe_rows(label: str) -> str:
 
 
 def _describe_images(compared: Compared) -> str:
-    """Say how many images and objects were scored, and which objects the training has shown.
-
-    Args:
-        compared: Evaluations of both networks on the same images.
-
-    Returns:
-        One or two sentences.
-    """
+    """Say how many images and objects were scored, and which objects the training has shown."""
     pool = compared.after[0].pools[compare.ALL]
     auc = pool.metrics.auc
     positives = f"{auc.positives:,} images of {compared.label} ({auc.positive_objects:,} objects)"
@@ -325,12 +276,6 @@ def _direction(change: compare.Difference) -> int:
     """Return the sign of a difference, or 0 if its sign is not proven.
 
     The sign is proven if the 95% interval does not contain 0.
-
-    Args:
-        change: Difference of a metric between two networks.
-
-    Returns:
-        1 for a proven increase, -1 for a proven decrease, otherwise 0.
     """
     assert change.low is not None and change.high is not None
     return int(change.low > 0) - int(change.high < 0)
@@ -346,16 +291,6 @@ def _answer(
 
     A proven change of the AUC decides. Recall and false positives decide what
     the sentence says in addition.
-
-    Args:
-        change: What was done to the network, such as "hardening".
-        recall: Difference of the recall, after minus before the change.
-        false_positives: Difference of the false-positive rate.
-        auc: Difference of the area under the ROC curve.
-
-    Returns:
-        Sentence such as "Hardening improved the ranking (AUC +0.16 [0.10,
-        0.21]), at a price."
     """
     assert auc.value is not None and auc.low is not None and auc.high is not None
     subject = change[0].upper() + change[1:]
@@ -380,18 +315,7 @@ def _sentences(
     recall: compare.Difference,
     false_positives: compare.Difference,
 ) -> list[str]:
-    """Write sentences that say how recall and false positives changed.
-
-    Args:
-        compared: Evaluations of both networks.
-        recall: Difference of the recall between both networks.
-        false_positives: Difference of the false-positive rate.
-
-    Returns:
-        A sentence about the recall, and a sentence about the false-positive
-        rate. Sentences about the recall at 10% false positives and about the
-        top-1 accuracy follow if these metrics are known.
-    """
+    """Write sentences that say how recall and false positives changed."""
     label = compared.label
     original, hardened = compared.subjects
     sentences = [
@@ -415,10 +339,6 @@ def _describe_false_positives(compared: Compared, change: compare.Difference) ->
 
     With several classes, the rate is a mean over the classes, and the images of
     one class count as other objects for the others.
-
-    Args:
-        compared: Evaluations of both networks.
-        change: Difference of the false-positive rate between both networks.
     """
     original, hardened = compared.subjects
     before, after = f"{change.before:.0%}", f"{change.after:.0%}"
@@ -446,16 +366,7 @@ def _describe_false_positives(compared: Compared, change: compare.Difference) ->
 
 
 def gain_sentence(subject: str, change: compare.Difference) -> str:
-    """Write a sentence that compares a metric of two networks.
-
-    Args:
-        subject: Start of the sentence, such as "Recall".
-        change: Difference of the metric between both networks.
-
-    Returns:
-        Sentence with the values of both networks, the 95% interval of the
-        difference, and whether its sign is proven.
-    """
+    """Write a sentence that compares a metric of two networks."""
     assert change.low is not None and change.high is not None
     verdicts = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}
     verdict = verdicts[_direction(change)]
@@ -465,14 +376,7 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
 
 
 def _points(value: float) -> str:
-    """Write a difference of fractions in percentage points.
-
-    Args:
-        value: Difference, in [-1, 1].
-
-    Returns:
-        Rounded percentage points with a sign, such as "+3", "−0.4" or "0".
-    """
+    """Write a difference of fractions in percentage points."""
     return _rounded(100 * value, 0, "+")
 
 
@@ -481,11 +385,6 @@ def _rounded(value: float, decimals: int, sign: str = "") -> str:
 
     A number that would be rounded to 0 keeps one significant digit, so that its
     sign is visible.
-
-    Args:
-        value: The number.
-        decimals: Number of decimals.
-        sign: "+" writes positive numbers with a plus sign.
     """
     text = f"{value:{sign}.{decimals}f}"
     if float(text) == 0:
@@ -508,18 +407,6 @@ def choose_disagreements(
     An image of a positive class is classified correctly if this class is
     predicted. Any other image is classified correctly if no positive class is
     predicted.
-
-    Args:
-        before: Folder of the scores of the original network.
-        after: Folder of the scores of the hardened network on the same images.
-        images: Folder of the images.
-        labels: Positive classes.
-        subjects: Words for both networks, for the titles of the rows.
-
-    Returns:
-        Two rows of at most PICTURES images, by the title of the row: the images
-        that only the hardened network classifies correctly, and the images that
-        only the original network does.
     """
     predictions_before = _read_predictions(before, labels)
     predictions_after = _read_predictions(after, labels)
@@ -550,14 +437,6 @@ def _read_predictions(folder: Path, labels: Sequence[str]) -> list[Prediction]:
     """Read one prediction for each image from predictions.csv.
 
     This file has a line for each image and each positive class.
-
-    Args:
-        folder: Folder of the scores of a network, with predictions.csv.
-        labels: Positive classes.
-
-    Returns:
-        For an image of a positive class, the line of this class. For any other
-        image, the line of the first positive class.
     """
     predictions = []
     for prediction in read_predictions(folder / PREDICTIONS, labels):
@@ -573,10 +452,6 @@ def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:
 
     For an image of a positive class, this class must be predicted. For any other
     image, none of the positive classes must be predicted.
-
-    Args:
-        prediction: Prediction of a network for an image.
-        labels: Positive classes.
     """
     shown = prediction.photograph.label
     if shown in labels:
@@ -590,10 +465,6 @@ def _draw_images(pairs: Iterable[Pair], images: Path) -> list[ComparedImage]:
     The images on whose log-odds the two networks differ most are preferred. Each
     combination of a class and a source gets one image before any of them gets a
     second one.
-
-    Args:
-        pairs: Predictions of both networks for each image.
-        images: Folder of the images.
     """
     ordered = sorted(pairs, key=lambda pair: -abs(pair[1].log_odds - pair[0].log_odds))
     first_of_group: dict[tuple[str, str | None], Pair] = {}
@@ -606,12 +477,7 @@ def _draw_images(pairs: Iterable[Pair], images: Path) -> list[ComparedImage]:
 
 
 def _draw_image(pair: Pair, images: Path) -> ComparedImage:
-    """Draw an image, and describe the predictions of both networks for it.
-
-    Args:
-        pair: Prediction of the original network, and of the hardened network.
-        images: Folder that the path of the image is relative to.
-    """
+    """Draw an image, and describe the predictions of both networks for it."""
     photograph = pair[0].photograph
     subject = in_words(photograph.label)
     if photograph.source:
@@ -624,15 +490,7 @@ def _draw_image(pair: Pair, images: Path) -> ComparedImage:
 
 
 def describe_prediction(prediction: Prediction) -> ShownPrediction:
-    """Describe the class that a network predicts for an image.
-
-    Args:
-        prediction: Prediction with the class of the image, and with the positive
-            class.
-
-    Returns:
-        Text and verdict, as `ShownPrediction` explains them.
-    """
+    """Describe the class that a network predicts for an image."""
     has_positive_class = prediction.predicted == prediction.label
     verdict = ""
     if prediction.predicted == prediction.photograph.label:

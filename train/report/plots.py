@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 from PIL import Image
 
 from renderer.io.images import open_image
@@ -84,14 +85,7 @@ class Picture:
 
 
 def style(index: int) -> dict[str, Any]:
-    """Return the color and the style of the lines of a method, as matplotlib takes them.
-
-    Args:
-        index: Index of the method among the methods of the plot.
-
-    Returns:
-        Keyword arguments "color" and "linestyle".
-    """
+    """Return the color and the style of the lines of a method, as matplotlib takes them."""
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
@@ -100,16 +94,7 @@ def curves(
     title: str,
     x_title: str = "epoch",
 ) -> Picture | None:
-    """Plot a metric over epochs or rounds, with a line for each seed of each method.
-
-    Args:
-        methods: For each method, the points of a line for each seed.
-        title: Name of the metric.
-        x_title: Title of the x axis.
-
-    Returns:
-        The plot. None if the metric is constant in each line.
-    """
+    """Plot a metric over epochs or rounds, with a line for each seed of each method."""
     lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
     for method, seeds in methods.items():
         lines_of_method[method] = []
@@ -134,14 +119,7 @@ def _draw_curves(
     lines_of_method: Mapping[str, list[list[tuple[float, float]]]],
     x_title: str,
 ) -> None:
-    """Draw the lines of each method in the color of the method.
-
-    Args:
-        axes: Axes to draw on.
-        lines_of_method: For each method, a line for each seed. A line is a list
-            of pairs of x and y.
-        x_title: Title of the x axis.
-    """
+    """Draw the lines of each method in the color of the method."""
     for index, (method, lines) in enumerate(lines_of_method.items()):
         name: str | None = method
         for line in lines:
@@ -157,16 +135,7 @@ def _draw_curves(
 
 
 def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
-    """Plot ROC curves, with a curve for each seed of each method.
-
-    Args:
-        methods: For each method, a pair of arrays for each seed: the scores of
-            the positive images, and the scores of the negative images.
-        label: Positive classes in words, for the title of the plot.
-
-    Returns:
-        The plot. None if no seed has both positive and negative images.
-    """
+    """Plot ROC curves, with a curve for each seed of each method."""
     # Seeds of each method that have both positive and negative images.
     known = {}
     for method, pairs in methods.items():
@@ -195,19 +164,7 @@ def by_radius(
     title: str,
     x_title: str,
 ) -> Picture:
-    """Plot which fraction of views is still recognized under attacks of a given radius.
-
-    Args:
-        lines: Fraction of the views at each radius, by the name of the line.
-            Each network has two lines in turn: attacks, and random changes of
-            the same radius.
-        radii: Radii in ascending order.
-        title: Title of the plot.
-        x_title: Title of the x axis, which shows the radii.
-
-    Returns:
-        The plot. The radii stand at equal distances.
-    """
+    """Plot which fraction of views is still recognized under attacks of a given radius."""
     ends = [f"{name} {_percent(values[-1])}" for name, values in lines.items()]
     alt = f"{title}: still recognized at the largest radius: {', '.join(ends)}"
 
@@ -232,23 +189,13 @@ def _percent(estimate: Estimate) -> str:
 
 def _draw_fractions(
     axes: "Axes",
-    positions: np.ndarray,
+    positions: Float[np.ndarray, " radii"],
     values: Sequence[Estimate],
     name: str,
     color: str,
     is_random: bool,
 ) -> None:
-    """Draw a line with the fraction of views that is still recognized at each radius.
-
-    Args:
-        axes: Axes to draw on.
-        positions: Position of each radius on the x axis, shape (radii,).
-        values: Fraction at each radius, with its 95% interval.
-        name: Name of the line in the legend.
-        color: Color of the line.
-        is_random: Whether random changes are drawn, as a dotted line. Otherwise
-            attacks are drawn, as a line with error bars.
-    """
+    """Draw a line with the fraction of views that is still recognized at each radius."""
     heights = np.array([estimate.value for estimate in values], float)
     if is_random:
         axes.plot(positions, heights, color=color, linestyle=":", label=name)
@@ -262,17 +209,7 @@ def _draw_fractions(
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
-    """Draw a plot as a transparent SVG, which fits light and dark pages.
-
-    Args:
-        draw: Function that draws on the axes.
-        title: Caption of the plot.
-        alt: Description for readers who do not see the plot.
-
-    Returns:
-        The plot. Its text and axes are dark on light pages, and light on dark
-        pages.
-    """
+    """Draw a plot as a transparent SVG, which fits light and dark pages."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -295,16 +232,7 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 
 
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
-    """Encode an image for a page: a small image as PNG, a larger one as JPEG.
-
-    Args:
-        image: The image.
-        alt: Description for readers who do not see the image.
-        caption: Text below the image.
-
-    Returns:
-        The encoded image, with one CSS pixel for each pixel.
-    """
+    """Encode an image for a page: a small image as PNG, a larger one as JPEG."""
     file = io.BytesIO()
     if max(image.size) <= SMALL:
         image.save(file, "PNG", optimize=True)
@@ -314,17 +242,7 @@ def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
 
 
 def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
-    """Read an image from a file, and encode it for a page.
-
-    Args:
-        path: The file.
-        alt: Description for readers who do not see the image.
-        widest: Largest width in pixels. A wider image is reduced.
-        caption: Text below the image.
-
-    Returns:
-        List of one encoded image. Empty if the file is missing or damaged.
-    """
+    """Read an image from a file, and encode it for a page."""
     try:
         with open_image(path) as image:
             pixels = image.convert("RGB")

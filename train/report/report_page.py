@@ -76,19 +76,7 @@ CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validat
 
 @progress_message("report")
 def write_report(folders: Sequence[Path], out: Path) -> Path:
-    """Write the page of the runs and attacks in folders and below them.
-
-    Args:
-        folders: Folders of runs and attacks, or folders that hold them.
-        out: Folder that report.html is written to.
-
-    Returns:
-        Path of the page. A run or attack that cannot be read is listed on it.
-
-    Raises:
-        InputError: If a folder is missing, or if no folder holds a run or an
-            attack.
-    """
+    """Write the page of the runs and attacks in folders and below them."""
     found = summary.find(folders)
     methods = summary.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
@@ -123,16 +111,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
 
 def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
-    """Write the line below the title of the page.
-
-    Args:
-        found: Runs and attacks on the page.
-        folders: Folders that the user named.
-
-    Returns:
-        Text with the numbers of finished runs, of unfinished runs and of attacks,
-        with the folders, and with the time of the newest file in them.
-    """
+    """Write the line below the title of the page."""
     counts = []
     if found.runs:
         plural = "s" if len(found.runs) != 1 else ""
@@ -156,18 +135,7 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
 
 
 def _title(found: summary.Findings, methods: Methods) -> str:
-    """Write the title of the page.
-
-    Args:
-        found: Runs and attacks on the page.
-        methods: Runs of each method. An initial network, with whose weights runs
-            began, counts as a method.
-
-    Returns:
-        Title with the positive classes and, if the runs began with random
-        weights, with the methods. Without finished runs, the title is "Attacks"
-        or "Unfinished runs".
-    """
+    """Write the title of the page."""
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
     # Positive classes of all runs.
@@ -188,16 +156,7 @@ Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
 def _collect_epochs(methods: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
-    """Collect the metrics of each epoch that are plotted.
-
-    Args:
-        methods: Finished runs of each method.
-        unfinished: Runs that are not finished.
-
-    Returns:
-        Epochs of the runs of each method. Each of the first MAX_UNFINISHED
-        unfinished runs counts as a method with the name "unfinished: FOLDER".
-    """
+    """Collect the metrics of each epoch that are plotted."""
     epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
     started = [run for run in unfinished if run.epochs]
     for run in started[:MAX_UNFINISHED]:
@@ -207,19 +166,7 @@ def _collect_epochs(methods: Methods, unfinished: Sequence[summary.Unfinished]) 
 
 
 def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
-    """Render a template to HTML, and write it to report.html.
-
-    Args:
-        out: Folder of the page. If it does not exist, it is created.
-        body: File name of the template with the sections of the page. The
-            template page.html.jinja adds the head and the styles of all pages.
-        script: JavaScript of the page. The browser runs no other script.
-        **content: Values for the template. All pages need `title` and `about`,
-            the line below the title.
-
-    Returns:
-        Path of the page.
-    """
+    """Render a template to HTML, and write it to report.html."""
     # This import takes time, and a training run needs it only at its end.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -257,14 +204,6 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
 
     The text says why if the page cannot be written. No error is raised: the runs
     are finished and saved, so their command must not fail.
-
-    Args:
-        folders: Folders of the runs.
-        out: Folder that report.html is written to.
-
-    Returns:
-        Text with the path of the page. A paragraph before it says what hardening
-        changed, if the runs have scores before and after hardening.
     """
     try:
         lines = [f"report: {write_report(folders, out)}"]
@@ -278,16 +217,7 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
 
 
 def _shell_command(config: Mapping[str, Any]) -> str:
-    """Return the shell commands that repeat a run or an attack.
-
-    Args:
-        config: Configuration in config.yaml of the run or the attack.
-
-    Returns:
-        A line `cd FOLDER`, with the folder in which the command was started, and
-        a line with the command. Empty if the configuration records no command,
-        as in earlier versions.
-    """
+    """Return the shell commands that repeat a run or an attack."""
     folder = config.get("working_folder")
     command = config.get("command") or ""
     if folder and command:
@@ -296,14 +226,7 @@ def _shell_command(config: Mapping[str, Any]) -> str:
 
 
 def _plot_metrics(methods: Epochs) -> list[Picture]:
-    """Plot accuracies by epoch, and the success of attacks on renders in training.
-
-    Args:
-        methods: Epochs of the runs of each method.
-
-    Returns:
-        The plots. A plot in which no value changes is left out.
-    """
+    """Plot accuracies by epoch, and the success of attacks on renders in training."""
     pictures = []
     for name, title in CURVES.items():
         # Each run of a method has a line, which is a list of pairs (epoch, metric).
@@ -327,14 +250,6 @@ def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[floa
     A round is a part of the training with the same renders. The metrics of the
     third round of an epoch have names such as "round_3/attack_success". If an
     epoch has only one round, the names begin with "augment/".
-
-    Args:
-        epochs: Metrics of each epoch by name.
-
-    Returns:
-        For each round, in the order of time, the fraction of renders that are
-        misclassified after the attack, among those that are classified correctly
-        before it. None if no render is.
     """
     rates = []
     for epoch in epochs:
@@ -347,16 +262,7 @@ def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[floa
 
 
 def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
-    """Read images of the training renders of the first, the middle and the last epoch of a run.
-
-    Args:
-        run: Finished run. Its folder has the images renders/KIND_EPOCH.png.
-        kind: KIND in these file names: "epoch" or "attacks".
-        title: What the images show, for readers who do not see them.
-
-    Returns:
-        An image for each of at most SHOWN_EPOCHS epochs.
-    """
+    """Read images of the training renders of the first, the middle and the last epoch of a run."""
     path_of_epoch = {}
     for path in (run.folder / RENDERS).glob(f"{kind}_*.png"):
         number = path.stem.removeprefix(f"{kind}_")
@@ -370,15 +276,7 @@ def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
 
 
 def _accuracy_sentences(methods: Methods) -> list[str]:
-    """Compare each method with the network that it began with, on the test images.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        A sentence for each method. A method that began with random weights has
-        no sentence.
-    """
+    """Compare each method with the network that it began with, on the test images."""
     sentences = []
     for method, runs in methods.items():
         sentence = _agreement_sentence(method, runs) or _accuracy_sentence(method, runs)
@@ -388,15 +286,7 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
 
 
 def _agreement_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
-    """Say how often the predictions of a network are those of the network that it began with.
-
-    Args:
-        method: Name of the method.
-        runs: Runs of the method.
-
-    Returns:
-        The sentence. None if the agreement was not measured.
-    """
+    """Say how often the predictions of a network are those of the network that it began with."""
     agreements = [run.scores["test/agreement"] for run in runs if "test/agreement" in run.scores]
     if not agreements:
         return None
@@ -407,15 +297,7 @@ def _agreement_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
 
 
 def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
-    """Say how training changed the accuracy on the test images.
-
-    Args:
-        method: Name of the method.
-        runs: Runs of the method.
-
-    Returns:
-        The sentence. None if the accuracy before the training is unknown.
-    """
+    """Say how training changed the accuracy on the test images."""
     initial_accuracies = [run.before.accuracy for run in runs if run.before]
     known = [accuracy for accuracy in initial_accuracies if accuracy is not None]
     if not known:
@@ -444,15 +326,7 @@ def _is_scored_on_photographs(run: RunSummary) -> bool:
 
 
 def _relit_sentences(methods: Methods) -> list[str]:
-    """Say how training on photographs in the light of a projector changed predictions.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        A sentence for each method that was trained on such photographs, with
-        `experiment=photographs`.
-    """
+    """Say how training on photographs in the light of a projector changed predictions."""
     sentences = []
     for method, runs in methods.items():
         scores = [run.scores for run in runs if "test/relit_agreement_after" in run.scores]
@@ -469,15 +343,7 @@ def _relit_sentences(methods: Methods) -> list[str]:
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
-    """Make the first screen from the first images on which two networks were scored.
-
-    Args:
-        groups: For each set of images, by its title, the runs of each method
-            with their scores on these images.
-
-    Returns:
-        The first screen. None if no two networks can be compared.
-    """
+    """Make the first screen from the first images on which two networks were scored."""
     for group in groups.values():
         with suppress(InputError):
             screen = _compare_on(group)
@@ -487,16 +353,7 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
 
 
 def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
-    """Choose which two networks the first screen compares.
-
-    Args:
-        group: Runs of each method with their scores on the same images.
-        pairs: Pairs of a method and the reference that it can be compared with.
-
-    Returns:
-        The last pair of a method and the trained network that it began with. If
-        all methods began with random weights, the last pair.
-    """
+    """Choose which two networks the first screen compares."""
     hardened = []
     for method, reference in pairs:
         first_run = group[reference][0].run
@@ -506,14 +363,7 @@ def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, 
 
 
 def _compare_on(group: Scored) -> FirstScreen | None:
-    """Make the first screen, which compares two networks on the images that both were scored on.
-
-    Args:
-        group: Runs of each method with their scores on these images.
-
-    Returns:
-        The first screen. None if there is only one network.
-    """
+    """Make the first screen, which compares two networks on the images that both were scored on."""
     evaluations = compare.read_evaluations(group)
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
@@ -552,13 +402,6 @@ def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> lis
 
     These are test images that the run has rendered itself, of classes for which
     the library cannot generate other objects.
-
-    Args:
-        scored: The run with its scores.
-        images: Folder of the scored images. None if it is unknown.
-
-    Returns:
-        Names of the classes in words.
     """
     is_rendered_by_run = images == scored.run.folder / KEPT_ASIDE
     if not is_rendered_by_run:
@@ -568,16 +411,7 @@ def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> lis
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:
-    """Find the folder of the images on which a run was scored.
-
-    Args:
-        run: Finished run.
-        name: Name of the sub-folder of the run with the scores on these images.
-
-    Returns:
-        Folder of the images. None if the configuration does not name the folder,
-        or if the folder has been moved.
-    """
+    """Find the folder of the images on which a run was scored."""
     photos = OmegaConf.select(run.config, "evaluate.photos")
     folders = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
     folder = folders.get(name)
@@ -593,22 +427,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
-    """Collect the content of a section of the page about the scores on the same images.
-
-    Args:
-        title: Title of the images.
-        group: Runs of each method with their scores on these images.
-
-    Returns:
-        Mapping for the macro `scores` of the template page.html.jinja:
-
-        - "name": the title;
-        - "sheets": for each method, an image with the scored images of its first
-          run;
-        - "rocs": plots of ROC curves;
-        - "tables": tables of metrics and of their differences;
-        - "problem": why the differences are unknown, or an empty text.
-    """
+    """Collect the content of a section of the page about the scores on the same images."""
     sheets = {}
     for method, scored_runs in group.items():
         path = scored_runs[0].folder / CONTACT_SHEET
@@ -635,17 +454,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
 
 def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None]:
-    """Plot the ROC curves of all methods.
-
-    Args:
-        methods: Evaluations of each method on the same images.
-        images: Title of these images.
-
-    Returns:
-        A plot for all images and, if there are several positive classes, a plot
-        for each of them. None in place of a plot without positive or without
-        negative images.
-    """
+    """Plot the ROC curves of all methods."""
     first_evaluation = next(iter(methods.values()))[0]
     name = images.partition(":")[0]
     pictures = []
@@ -660,15 +469,7 @@ def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None
 
 
 def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
-    """Make tables of the metrics of methods on the same images.
-
-    Args:
-        methods: Evaluations of each method, a way to train a network.
-
-    Returns:
-        A table of the differences between methods. If the images have several
-        sources or positive classes, a table with rows for each of them follows.
-    """
+    """Make tables of the metrics of methods on the same images."""
     tables = [compare.overall_differences(methods)]
     first_evaluation = next(iter(methods.values()))[0]
     if len(first_evaluation.pools) > 1:
@@ -677,20 +478,7 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
 
 
 def _attack_section(attack: summary.AttackSummary) -> dict[str, Any]:
-    """Collect the content of a section of the page about an attack.
-
-    Args:
-        attack: Outcome of the attack.
-
-    Returns:
-        Mapping for the template runs.html.jinja:
-
-        - "folder": folder of the attack;
-        - "rows": a row of a table for each example;
-        - "checks": pairs of the name of a check and its result;
-        - "images": pictures of some examples, by their title;
-        - "config": settings of the attack. Empty if they are not recorded.
-    """
+    """Collect the content of a section of the page about an attack."""
     images = {}
     for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):
         title = f"Example {row.number}, {row.label}: {row.outcome}"

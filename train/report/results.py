@@ -48,19 +48,7 @@ RESULTS = (
 
 
 def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[str] = ()) -> None:
-    """Check that a command would not replace results of an earlier command.
-
-    Args:
-        path: File or folder that the command will write. It may be missing.
-        key: Setting that has the path, for the error message.
-        overwrite: Whether the user allows the command to replace results.
-        own: Patterns in RESULTS of files that may be there, because the command
-            continues with them.
-
-    Raises:
-        InputError: If the file exists, or if the folder holds results, and
-            `overwrite` is False.
-    """
+    """Check that a command would not replace results of an earlier command."""
     if overwrite or not path.exists():
         return
     if not path.is_dir():
@@ -86,15 +74,6 @@ def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> No
     A folder with a checkpoint is accepted here, because the class `Run` checks
     such a folder. The files of a run that ended before its first checkpoint may
     be replaced, because they are not results.
-
-    Args:
-        folder: Folder of the run. It may be missing.
-        key: Setting that has the folder, for the error message.
-        overwrite: Whether the user allows the command to replace results.
-        resume: Whether the run continues an earlier run in the folder.
-
-    Raises:
-        InputError: If the folder holds other results, and `overwrite` is False.
     """
     if checkpoint.exists(folder):
         return
@@ -120,10 +99,6 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     The metrics go first, without which no run counts as finished, and config.yaml goes last. If
     the removal is stopped, what is left belongs to the run that config.yaml describes. The log
     stays.
-
-    Args:
-        folder: Folder of the run.
-        with_others: False keeps the first training and the baselines, which may be resumed.
     """
     files = [folder / name for name in (*OF_RUN, FAILURE, PAGE)]
     files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
@@ -139,12 +114,7 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
 
 
 def remove_attack(out: Path) -> None:
-    """Remove the results of an earlier pnb-attack, so that no report shows them with new ones.
-
-    Args:
-        out: Folder with a subfolder for the result of each mesh, or with the
-            attack on photographs.
-    """
+    """Remove the results of an earlier pnb-attack, so that no report shows them with new ones."""
     for name in (PAGE, CONFIG, RELIT, TABLE, FIGURE):
         (out / name).unlink(missing_ok=True)
     for lines in out.glob(f"*/{LINES}"):

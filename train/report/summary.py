@@ -70,18 +70,7 @@ class PhotographScores:
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> "PhotographScores":
-        """Read scores from a mapping, also if an earlier version wrote it with fewer entries.
-
-        Args:
-            summary: Contents of summary.json, or the mapping that `to_published`
-                returned.
-
-        Returns:
-            Scores on one folder of photographs.
-
-        Raises:
-            Exception: An error of any type, if an entry is missing or damaged.
-        """
+        """Read scores from a mapping, also if an earlier version wrote it with fewer entries."""
         labels = label_names(summary.get("label", ""))
         points = operating_points(summary)
         by_label = {}
@@ -97,11 +86,7 @@ class PhotographScores:
         )
 
     def to_published(self) -> dict[str, Any]:
-        """Convert the scores to a mapping for the file of a published network.
-
-        Returns:
-            Mapping from which `read` reads the scores.
-        """
+        """Convert the scores to a mapping for the file of a published network."""
         has_several = len(self.labels) > 1
         entries: dict[str, Any] = {
             "images": self.images,
@@ -120,29 +105,12 @@ class PhotographScores:
 
 
 def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
-    """Read the metrics on all photographs, or on those for one positive class.
-
-    Args:
-        summary: Contents of summary.json, or of the entry of one positive class
-            in it.
-
-    Returns:
-        Each metric in `METRICS` by name. None if the contents lack it.
-    """
+    """Read the metrics on all photographs, or on those for one positive class."""
     return {name: read_metric(summary, name) for name in METRICS}
 
 
 def _as_dictionaries(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to dictionaries, which the file of a published network can hold.
-
-    Args:
-        metrics: Metrics by name. None if a metric is unknown.
-
-    Returns:
-        Dictionary for each metric, by the name of the metric. It has the fields
-        of `Estimate`, such as "value", "low" and "high". It is empty if the
-        metric is unknown.
-    """
+    """Convert metrics to dictionaries, which the file of a published network can hold."""
     dictionaries: dict[str, dict[str, Any]] = {}
     for name, estimate in metrics.items():
         dictionaries[name] = {} if estimate is None else asdict(estimate)
@@ -214,33 +182,13 @@ Scored = Mapping[str, Sequence[ScoredRun]]
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether a folder holds a finished run, which has its final scores.
-
-    Args:
-        folder: Folder of a run.
-
-    Returns:
-        Whether the last line of metrics.jsonl has final scores. All lines before
-        it have the number of an epoch.
-    """
+    """Return whether a folder holds a finished run, which has its final scores."""
     lines = read_metrics(folder)
     return bool(lines) and "epoch" not in lines[-1]
 
 
 def summarize(folder: Path) -> RunSummary:
-    """Read the settings and scores in the folder of a run, an evaluation or a published network.
-
-    Args:
-        folder: Folder of a finished run, of the scores that pnb-evaluate wrote,
-            or of a published network. "pretrained/best" is installed.
-
-    Returns:
-        Settings and scores.
-
-    Raises:
-        InputError: If the folder holds none of the three, or if a file is
-            damaged.
-    """
+    """Read the settings and scores in the folder of a run, an evaluation or a published network."""
     folder = published(folder)
     try:
         summary = _read(folder)
@@ -262,11 +210,7 @@ def summarize(folder: Path) -> RunSummary:
 
 
 def trained_labels(folder: Path) -> list[str]:
-    """Return the positive classes for which a run, or a published network, was trained.
-
-    Returns:
-        Names of the classes. Empty if the folder records none.
-    """
+    """Return the positive classes for which a run, or a published network, was trained."""
     try:
         run = summarize(folder)
     except InputError:
@@ -278,15 +222,7 @@ def trained_labels(folder: Path) -> list[str]:
 
 
 def _read(folder: Path) -> RunSummary | None:
-    """Read the settings and scores in a folder.
-
-    Args:
-        folder: Folder of a finished run, of the scores that pnb-evaluate wrote,
-            or of a published network.
-
-    Returns:
-        Settings and scores. None if the folder is none of the three.
-    """
+    """Read the settings and scores in a folder."""
     if is_finished(folder):
         return _read_run(folder)
     path = folder.absolute()
@@ -308,15 +244,7 @@ def _read(folder: Path) -> RunSummary | None:
 
 
 def _read_run(folder: Path) -> RunSummary:
-    """Read a finished run, and the scores of the network with whose weights it began.
-
-    Args:
-        folder: Folder of the run, with config.yaml and metrics.jsonl.
-
-    Returns:
-        The run. Its field `before` has the network before the training, if that
-        was a trained network.
-    """
+    """Read a finished run, and the scores of the network with whose weights it began."""
     # Each line of metrics.jsonl is an epoch. The last line has the final scores.
     *epochs, scores = read_metrics(folder)
     config = read_config(folder / CONFIG)
@@ -345,25 +273,14 @@ def _read_run(folder: Path) -> RunSummary:
 
 
 def _initial_settings(config: DictConfig) -> dict[str, Any]:
-    """Return the settings of a run that determine its initial network.
-
-    Args:
-        config: Settings of the run.
-    """
+    """Return the settings of a run that determine its initial network."""
     keys = ("weights", "classes", "normalization", "normalize_light", "data.size")
     others = {key: OmegaConf.select(config, key) for key in keys}
     return {"train.init_from": config.train.init_from, **others}
 
 
 def read_summaries(folder: Path) -> dict[str, PhotographScores]:
-    """Read the scores on photographs in all sub-folders of a folder.
-
-    Args:
-        folder: Folder of a run, or of the scores of its initial network.
-
-    Returns:
-        Scores by the name of the sub-folder.
-    """
+    """Read the scores on photographs in all sub-folders of a folder."""
     summaries = {}
     for path in sorted(folder.glob(f"*/{SUMMARY}")):
         summaries[path.parent.name] = PhotographScores.read(read_json(path))
@@ -371,15 +288,7 @@ def read_summaries(folder: Path) -> dict[str, PhotographScores]:
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
-    """Find the settings in which runs differ.
-
-    Args:
-        runs: Runs that are compared.
-
-    Returns:
-        Name of each such setting in words, by its dotted key. The kind of
-        renders and the seed are left out, because tables always show them.
-    """
+    """Find the settings in which runs differ."""
     keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
     varied = {}
     for key in sorted(keys):
@@ -392,18 +301,7 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
 
 
 def group_by_method(runs: Sequence[RunSummary]) -> Methods:
-    """Group runs that differ only in the seed, and name each group.
-
-    Args:
-        runs: Finished runs and networks without a run.
-
-    Returns:
-        The runs of each method, by the name of the method. The networks with
-        whose weights runs began come first, each once. The name of a method has
-        the kind of renders, and the settings in which methods with the same kind
-        of renders differ. If there are many such settings, a number replaces
-        them.
-    """
+    """Group runs that differ only in the seed, and name each group."""
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*_initial_networks(runs), *runs):
@@ -428,15 +326,7 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
 
 
 def _name_by_settings(run: RunSummary, varied: Mapping[str, str]) -> str:
-    """Name a method by the kind of renders and by some of its settings.
-
-    Args:
-        run: Run of the method.
-        varied: Settings in the name: their names in words by dotted key.
-
-    Returns:
-        Name such as "adversarial, epochs=5".
-    """
+    """Name a method by the kind of renders and by some of its settings."""
     values = [f"{words}={run.settings.get(key)}" for key, words in varied.items()]
     return ", ".join([run.method, *values])
 
@@ -446,13 +336,6 @@ def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
 
     Two networks are the same if they have the same settings and were scored on
     the same images.
-
-    Args:
-        runs: Finished runs. A run that began with random weights has no initial
-            network.
-
-    Returns:
-        The initial networks in the order of the runs.
     """
     networks = {}
     for run in runs:
@@ -464,15 +347,7 @@ def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
 
 
 def group_by_images(methods: Methods) -> dict[str, Scored]:
-    """Group runs by the images on which they were scored.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        For each set of images, by its title, the runs of each method with their
-        scores on these images.
-    """
+    """Group runs by the images on which they were scored."""
     groups: dict[str, dict[str, list[ScoredRun]]] = {}
     for method, runs in methods.items():
         for run in runs:
@@ -489,15 +364,7 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
 
 
 def _title_of(group: Scored) -> str:
-    """Write a title for the images on which a group of networks was scored.
-
-    Args:
-        group: Runs of each method with their scores on these images.
-
-    Returns:
-        Name of the sub-folder of the scores. The numbers of positive and
-        negative images follow if they are known.
-    """
+    """Write a title for the images on which a group of networks was scored."""
     members = [scored for scored_runs in group.values() for scored in scored_runs]
     # The name of the sub-folder comes from a training run if there is one, because the user
     # has chosen this name. Only a training run has epochs.
@@ -517,19 +384,7 @@ def _title_of(group: Scored) -> str:
 
 
 def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
-    """Make tables of the accuracy, the scores and the settings of runs.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-        groups: For each set of images, by its title, the runs of each method
-            with their scores on these images.
-
-    Returns:
-        A table of the accuracy, and a table of the scores on each set of images.
-        They have a row for each run and, if a method has several seeds, a row
-        with their mean ± standard deviation. If the settings of the methods
-        differ, a table of these settings follows.
-    """
+    """Make tables of the accuracy, the scores and the settings of runs."""
     tables = [_accuracy_table(methods)]
     tables += [score_table(title, group) for title, group in groups.items()]
     settings = _settings_table(methods)
@@ -539,15 +394,7 @@ def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
 
 
 def _settings_table(methods: Methods) -> Table:
-    """Make a table of the settings in which methods differ.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        Table with a row for each method and a column for each setting. It has no
-        rows if the settings are the same.
-    """
+    """Make a table of the settings in which methods differ."""
     # The first run of each method. Networks without a run have no settings of a training.
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
     varied = varied_settings([*heads.values()])
@@ -559,16 +406,7 @@ def _settings_table(methods: Methods) -> Table:
 
 
 def _accuracy_table(methods: Methods) -> Table:
-    """Make a table of the accuracy of each run on the test images.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        Table with the accuracy of the network that the training selected, and
-        with the accuracy of the network after the last epoch. Methods without an
-        accuracy have no row.
-    """
+    """Make a table of the accuracy of each run on the test images."""
     lines: dict[str, list[Line]] = {}
     test_images = []
     for method, runs in methods.items():
@@ -595,16 +433,7 @@ def accuracy_title(runs: Sequence[RunSummary]) -> str:
 
 
 def score_table(title: str, group: Scored) -> Table:
-    """Make a table of the metrics of runs on the same images.
-
-    Args:
-        title: Title of the table.
-        group: Runs of each method with their scores on these images.
-
-    Returns:
-        Table with a row for each run. With several positive classes, it also has
-        a row for each run and each of these classes.
-    """
+    """Make a table of the metrics of runs on the same images."""
     lines: dict[str, list[Line]] = {}
     for method, scored_runs in group.items():
         for scored in scored_runs:
@@ -627,17 +456,7 @@ def label_title(label: str) -> str:
 
 
 def seconds_table(methods: Methods) -> Table:
-    """Make a table of the time that an epoch of each method takes.
-
-    Args:
-        methods: Runs of each method. A method is a way to train a network.
-
-    Returns:
-        Table with a row for each method. Cells are means over the epochs of its
-        first run, in seconds. The columns are the whole epoch, each phase of it
-        (such as "training"), the passes through the classifier within attacks,
-        and the operators from light to image, which are computed once in a run.
-    """
+    """Make a table of the time that an epoch of each method takes."""
     titles = {phase: phase.replace("_", " and ") for phase in PHASES}
     titles["attack_classifier"] = "attack: in the classifier"
     titles["operators"] = "operators, once"
@@ -652,16 +471,7 @@ def seconds_table(methods: Methods) -> Table:
 
 
 def _mean_seconds(run: RunSummary, phase: str) -> float | None:
-    """Average the seconds that a phase of an epoch takes over the epochs of a run.
-
-    Args:
-        run: Run with its metrics.
-        phase: Name of the phase, such as "training". The metric "seconds/PHASE"
-            has its seconds.
-
-    Returns:
-        Mean over the epochs that record this phase. None if no epoch does.
-    """
+    """Average the seconds that a phase of an epoch takes over the epochs of a run."""
     name = f"seconds/{phase}"
     seconds = [line[name] for line in run.epochs if name in line]
     return fmean(seconds) if seconds else None
@@ -672,19 +482,7 @@ Line = tuple[int | None, Sequence[Estimate | None]]
 
 
 def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
-    """Make a table with a row for each run.
-
-    Args:
-        title: Title of the table.
-        header: Titles of the columns that have metrics.
-        lines: For each method, a pair for each of its runs: the seed, and the
-            metrics in the order of `header`.
-
-    Returns:
-        Table with the columns "network", "seed" and those of `header`. If a
-        method has several seeds, a row with the mean ± standard deviation of
-        each metric follows the rows of its runs.
-    """
+    """Make a table with a row for each run."""
     rows = []
     for method, runs in lines.items():
         for seed, metrics in runs:
@@ -698,14 +496,7 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
 
 
 def _format_spread(metrics: Sequence[Estimate | None]) -> str:
-    """Write the mean and the standard deviation of a metric over runs.
-
-    Args:
-        metrics: The metric of each run. None if it is unknown for a run.
-
-    Returns:
-        Text such as "0.912 ± 0.004", or "-" if the metric of a run is unknown.
-    """
+    """Write the mean and the standard deviation of a metric over runs."""
     values = [metric.value for metric in metrics if metric is not None and metric.value is not None]
     if len(values) < len(metrics):
         return "-"
@@ -757,17 +548,7 @@ class AttackSummary:
 
 
 def read_attack(folder: Path) -> AttackSummary:
-    """Read the outcome of an attack from its folder.
-
-    Args:
-        folder: Folder with attack.jsonl.
-
-    Returns:
-        Examples, numbers of successes, and checks.
-
-    Raises:
-        InputError: If attack.jsonl is damaged, or if no attack wrote it.
-    """
+    """Read the outcome of an attack from its folder."""
     path = folder / LINES
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -794,22 +575,12 @@ def read_attack(folder: Path) -> AttackSummary:
 
 
 def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
-    """Return whether the attack on an example succeeds in images without noise.
-
-    Args:
-        line: Line of the example in attack.jsonl. Files of earlier versions have
-            only the key "success", which was measured without noise.
-    """
+    """Return whether the attack on an example succeeds in images without noise."""
     return bool(line.get("success_without_noise", line["success"]))
 
 
 def _example_row(line: Mapping[str, Any]) -> ExampleRow:
-    """Make the row of a table about an example.
-
-    Args:
-        line: Line of the example in attack.jsonl. The values of "label",
-            "predicted" and "confidence" are lists with an item for each view.
-    """
+    """Make the row of a table about an example."""
     return ExampleRow(
         number=int(line["example"]),
         # The dictionary removes the class of a view if an earlier view has the same class.
@@ -821,28 +592,13 @@ def _example_row(line: Mapping[str, Any]) -> ExampleRow:
 
 
 def _format_predictions(names: Sequence[str], probabilities: Sequence[float]) -> str:
-    """Write the predicted class of each view with its probability.
-
-    Args:
-        names: Predicted class of each view.
-        probabilities: Probability of this class for each view, in [0, 1].
-
-    Returns:
-        Text such as "81.0% orange, 55.3% lemon".
-    """
+    """Write the predicted class of each view with its probability."""
     pairs = zip(names, probabilities, strict=True)
     return ", ".join(f"{probability:.1%} {name}" for name, probability in pairs)
 
 
 def _describe_outcome(line: Mapping[str, Any]) -> str:
-    """Say whether the attack on an example succeeded, and in how many steps.
-
-    Args:
-        line: Line of the example in attack.jsonl.
-
-    Returns:
-        Text such as "success in 12 steps".
-    """
+    """Say whether the attack on an example succeeded, and in how many steps."""
     if line["success_before"]:
         return "wrong before any step"
     success = "no success"
@@ -884,18 +640,7 @@ class Findings:
 
 
 def find(folders: Sequence[Path]) -> Findings:
-    """Find the runs and attacks in folders and in all folders below them.
-
-    Args:
-        folders: Folders of runs and attacks, or folders that contain them.
-
-    Returns:
-        Runs and attacks.
-
-    Raises:
-        InputError: If a folder does not exist, or if there is no run and no
-            attack.
-    """
+    """Find the runs and attacks in folders and in all folders below them."""
     # A dictionary has each folder once.
     paths: dict[Path, Path] = {}
     for folder in map(published, folders):
@@ -921,15 +666,7 @@ def find(folders: Sequence[Path]) -> Findings:
 
 
 def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
-    """Read the finished runs in folders and below them, and warn about the others.
-
-    Args:
-        folders: Folders of runs, of scores or of published networks, or folders
-            that contain them, such as those of sweeps.
-
-    Raises:
-        InputError: If one of the folders holds no finished run.
-    """
+    """Read the finished runs in folders and below them, and warn about the others."""
     runs: dict[tuple[Path, str], RunSummary] = {}
     for folder in folders:
         found = find([folder])
@@ -949,12 +686,7 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 
 def _add(found: Findings, path: Path) -> None:
-    """Read a folder, and add its run or attack to the findings.
-
-    Args:
-        found: Findings, one list of which is extended.
-        path: Folder of an attack, of the scores of a network, or of a run.
-    """
+    """Read a folder, and add its run or attack to the findings."""
     if (path / LINES).is_file():
         found.attacks.append(read_attack(path))
     elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
@@ -969,9 +701,6 @@ def _walk(folder: Path) -> Iterator[Path]:
 
     Sub-folders with the scores of a run are left out, because the run includes
     these scores.
-
-    Args:
-        folder: Folder to search.
     """
     files_of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
     files_of_others = {LINES, SUMMARY, PUBLISHED}

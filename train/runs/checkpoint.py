@@ -28,31 +28,14 @@ HASH = "sha256"
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write a checkpoint with the hash of its content. The file is never half written.
-
-    Args:
-        path: Path of the file.
-        state: Content of the checkpoint: tensors and plain values.
-        previous: Path to which an existing file `path` is moved. None to
-            replace it.
-    """
+    """Write a checkpoint with the hash of its content. The file is never half written."""
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
     atomic_write(path, content.getbuffer(), durable=True, previous=previous)
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint that `save` wrote, and check its hash.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Content of the checkpoint, with all tensors on the CPU.
-
-    Raises:
-        InputError: If the file is missing, damaged or not a checkpoint.
-    """
+    """Read a checkpoint that `save` wrote, and check its hash."""
     require_file(path, "give a run folder that holds a checkpoint")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -70,19 +53,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Check that the content of a checkpoint has an architecture and finite weights.
-
-    Args:
-        state: Content of the checkpoint.
-        path: File of the checkpoint, for the error message.
-
-    Returns:
-        The same content.
-
-    Raises:
-        InputError: If the architecture or the weights are missing, if a weight is not finite, or
-            if a later version of the library wrote the file.
-    """
+    """Check that the content of a checkpoint has an architecture and finite weights."""
     try:
         version = state["architecture"].get("version", 1)
         is_finite = all(value.isfinite().all() for value in state["model"].values())
@@ -108,21 +79,7 @@ def exists(folder: Path) -> bool:
 
 
 def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Read the newest undamaged checkpoint of a run: last.pt, or else previous.pt.
-
-    Args:
-        folder: Folder of the run.
-
-    Returns:
-        Two values:
-        - the content of last.pt, or of previous.pt if last.pt is missing or
-          damaged;
-        - None if last.pt was read, or else a sentence that says what is wrong
-          with last.pt.
-
-    Raises:
-        InputError: If there is no undamaged checkpoint.
-    """
+    """Read the newest undamaged checkpoint of a run: last.pt, or else previous.pt."""
     try:
         return load(folder / LAST), None
     except InputError as error:
@@ -132,23 +89,13 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the states of the random generators of torch.
-
-    Returns:
-        Mapping with two keys: "cpu" has the state of the generator of the CPU,
-        and "cuda" a list with the state of the generator of each GPU.
-    """
+    """Return the states of the random generators of torch."""
     states = cuda.get_rng_state_all() if cuda.is_available() else []
     return {"cpu": torch.get_rng_state(), "cuda": states}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Set the random generators of torch to states that `random_state` returned.
-
-    Args:
-        state: The states. If this machine has fewer or more GPUs than the
-            machine of the states, the surplus is ignored.
-    """
+    """Set the random generators of torch to states that `random_state` returned."""
     torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
         cuda.set_rng_state(values, device)

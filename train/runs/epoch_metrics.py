@@ -19,24 +19,7 @@ def epoch_metrics(
     diagnostics: list[Mapping[str, float]],
     seconds: Mapping[str, float],
 ) -> dict[str, float]:
-    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
-
-    Args:
-        trained: Metrics on the training images by name.
-        validated: Metrics on the validation images by name.
-        diagnostics: Measurements of the attack on the renders by name, for each
-            round. A round is a part of the epoch with the same renders.
-        seconds: Seconds of each phase of the epoch by the name of the phase.
-
-    Returns:
-        Metrics by names such as "train/loss". A name begins with:
-
-        - "train/" or "validation/" for metrics on these images;
-        - "augment/" for means of `diagnostics` over the rounds;
-        - "seconds/" for the times;
-        - "round_1/", "round_2/" and so on for `diagnostics` of each round, if
-          there are several rounds.
-    """
+    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have."""
     means = {}
     for name in diagnostics[0]:
         means[name] = fmean(of_round[name] for of_round in diagnostics)
@@ -57,18 +40,7 @@ def epoch_metrics(
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
-    """Write the line that the console shows after an epoch.
-
-    Args:
-        epoch: Number of the epoch, from 1.
-        epochs: Number of all epochs.
-        metrics: Metrics of the epoch, as `epoch_metrics` returns them.
-
-    Returns:
-        Line with the loss, the accuracies and the time. If the renders were
-        attacked, it also has the success rate of the attack among the
-        clean-correct renders, which are classified correctly before the attack.
-    """
+    """Write the line that the console shows after an epoch."""
     total = sum(metrics[f"seconds/{name}"] for name in PHASES)
     parts = [
         f"epoch {epoch}/{epochs}",
@@ -93,15 +65,6 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
 
     With the fraction b of misclassified renders before the attack, and the
     fraction a after it, the rate is (a - b) / (1 - b).
-
-    Args:
-        diagnostics: Values by name. "attack_success_before" is b, and
-            "attack_success" is a.
-        prefix: Text before these names, such as "augment/".
-
-    Returns:
-        The success rate. None if no render is classified correctly before the
-        attack, or if there was no attack.
     """
     before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
     if before == 1:

@@ -62,13 +62,7 @@ def _path_of(text: str) -> Path:
 
 
 def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts in a setting that may be paths of input files.
-
-    Args:
-        value: Value of the setting: a text, a mapping that describes an object
-            with its "mesh" and its "props" (other meshes beside it), or a list
-            of these. Any other value has no path.
-    """
+    """Collect the texts in a setting that may be paths of input files."""
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("props")]
     if isinstance(value, list):

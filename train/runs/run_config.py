@@ -38,18 +38,7 @@ NOT_RECORDED = ("run=", "train.resume=")
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[str]:
-    """Read a text file for a `with` block that parses the text. Errors name the file.
-
-    Args:
-        path: File in UTF-8.
-
-    Yields:
-        Text of the file.
-
-    Raises:
-        InputError: If the file cannot be read, or if the `with` block raises any
-            error. The message names the file.
-    """
+    """Read a text file for a `with` block that parses the text. Errors name the file."""
     try:
         if not path.is_file():
             raise ValueError("there is no such file")
@@ -61,33 +50,13 @@ def opened_text(path: Path) -> Iterator[str]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that contains one object.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Keys and values of the object, at least one.
-
-    Raises:
-        InputError: If the file is missing or damaged.
-    """
+    """Read a JSON file that contains one object."""
     with opened_text(path) as text:
         return parse_object(text)
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """Parse a JSON object.
-
-    Args:
-        text: Text such as '{"epoch": 1}'.
-
-    Returns:
-        Keys and values of the object, at least one.
-
-    Raises:
-        ValueError: If the text is not JSON, not an object, or an empty object.
-    """
+    """Parse a JSON object."""
     parsed = json.loads(text)
     if not isinstance(parsed, dict) or not parsed:
         raise ValueError("it holds no object of keys and values")
@@ -102,16 +71,6 @@ def read_config(path: Path) -> DictConfig:
     Interpolations such as "${oc.env:HOME}" are refused, because they can reveal
     environment variables. Settings that had other names in earlier versions get
     their present names.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        InputError: If the file is missing or damaged, or holds an alias or an
-            interpolation.
     """
     # `opened_text` turns any error in its block into an InputError that names the file.
     with opened_text(path) as text:
@@ -126,16 +85,7 @@ def read_config(path: Path) -> DictConfig:
 
 
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
-    """Write config.yaml: settings, facts, hashes of the input files, and versions of packages.
-
-    Args:
-        folder: Folder of the file. If it does not exist, it is created.
-        settings: Settings of the command, a dataclass.
-        **facts: Facts that are not settings, such as the hardware. A fact that
-            contains "${" is left out, because `read_config` refuses such files.
-            With the fact `command`, the command line, the file also records the
-            folder in which the command was started.
-    """
+    """Write config.yaml: settings, facts, hashes of the input files, and versions of packages."""
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
         facts["working_folder"] = _working_folder(folder, str(facts["command"]))
@@ -149,14 +99,7 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
 
 
 def _working_folder(folder: Path, command: str) -> str:
-    """Return the folder in which the command of a run was started for the first time.
-
-    Args:
-        folder: Folder of the run. It may hold a config.yaml that records an
-            earlier command and its working folder.
-        command: Command line of this command. It continues the run if it begins
-            with the recorded command. The recorded folder is then returned.
-    """
+    """Return the folder in which the command of a run was started for the first time."""
     with suppress(InputError):
         recorded = read_config(folder / CONFIG)
         if command.startswith(str(recorded.get("command"))):
@@ -169,13 +112,6 @@ def decisive_settings(settings: Any) -> dict[str, object]:
 
     The number of threads, for example, is left out. In paths, "<run>" stands for
     the folder of the run. A run whose folder was moved then has equal settings.
-
-    Args:
-        settings: Settings of a command: a dataclass, or a DictConfig that was
-            read from config.yaml.
-
-    Returns:
-        Values by dotted key, such as "train.epochs".
     """
     if isinstance(settings, DictConfig):
         nested: Any = OmegaConf.to_container(settings)
@@ -192,16 +128,7 @@ def decisive_settings(settings: Any) -> dict[str, object]:
 
 
 def _move_paths(value: Any, folder: str, to: str) -> Any:
-    """Replace the path of a folder at the start of all texts in nested settings.
-
-    Args:
-        value: Settings as nested dictionaries and lists. Any text may be a path.
-        folder: Path that is replaced.
-        to: Text that replaces it.
-
-    Returns:
-        Copy of the settings.
-    """
+    """Replace the path of a folder at the start of all texts in nested settings."""
 
     def move(text: str) -> str:
         is_inside = f"{text}/".startswith(f"{folder}/")
@@ -211,15 +138,7 @@ def _move_paths(value: Any, folder: str, to: str) -> Any:
 
 
 def format_command(overrides: Sequence[str]) -> str:
-    """Format the command line of a training run, as config.yaml records it.
-
-    Args:
-        overrides: Arguments of the command, such as "train.epochs=3".
-
-    Returns:
-        Command line without the arguments in NOT_RECORDED, such as the folder of
-        the run.
-    """
+    """Format the command line of a training run, as config.yaml records it."""
     return shlex.join([*program("train"), *_recorded(overrides)])
 
 
@@ -227,29 +146,12 @@ def _recorded(overrides: Sequence[str]) -> list[str]:
     """Return the arguments of a command that config.yaml records.
 
     The folder of the run and the request to resume it are left out.
-
-    Args:
-        overrides: Arguments such as "train.epochs=3".
     """
     return [override for override in overrides if not override.startswith(NOT_RECORDED)]
 
 
 def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
-    """Combine the settings of an earlier run with the arguments of a command that resumes it.
-
-    Args:
-        config: Configuration of the command. `config.run` is the folder of the
-            earlier run.
-        overrides: Arguments of the command, such as "train.epochs=20". They
-            replace settings of the earlier run. `config` has their values.
-
-    Returns:
-        Pair of the combined configuration, and the command line to record: the
-        command of the earlier run followed by the new arguments.
-
-    Raises:
-        InputError: If the folder holds no training run.
-    """
+    """Combine the settings of an earlier run with the arguments of a command that resumes it."""
     folder = Path(config.run).absolute()
     recorded = _read_recorded(folder)
     names = [item.name for item in fields(ExperimentSettings)]
@@ -271,17 +173,7 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
 
 
 def _read_recorded(folder: Path) -> dict[str, Any]:
-    """Read the config.yaml of a training run that is to be resumed.
-
-    Args:
-        folder: Folder of the run.
-
-    Returns:
-        Contents of the file as nested dictionaries.
-
-    Raises:
-        InputError: If the folder holds no training run.
-    """
+    """Read the config.yaml of a training run that is to be resumed."""
     recorded: Any = {}
     if (folder / CONFIG).is_file():
         recorded = OmegaConf.to_container(read_config(folder / CONFIG))
@@ -303,17 +195,6 @@ def require_same_run(
 
     The command may give a run that is not finished more epochs, and other
     photographs to score.
-
-    Args:
-        folder: Folder of the run.
-        settings: Settings of the command.
-        finished: Whether the run is finished.
-
-    Returns:
-        Configuration of the run in the folder.
-
-    Raises:
-        InputError: If another setting differs, or if an input file has changed.
     """
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
@@ -334,22 +215,6 @@ def require_same(
     """Check that an earlier command wrote a folder with the same settings and input files.
 
     Only settings that decide the result are compared (see `decisive_settings`).
-
-    Args:
-        folder: Folder with the config.yaml of the earlier command.
-        settings: Settings of this command, a dataclass.
-        elsewhere: Setting with which the user can choose another folder, for the
-            error message.
-        is_permitted: Function that is called for each setting that differs, with
-            its dotted key, its old value and its new value. It returns whether
-            the setting may differ.
-
-    Returns:
-        Configuration in config.yaml.
-
-    Raises:
-        InputError: If a setting differs and may not, or if an input file has
-            changed.
     """
     config = read_config(folder / CONFIG)
     # A setting that the earlier version did not have has its default value.

@@ -24,12 +24,6 @@ def locked(folder: Path) -> Iterator[bool]:
 
     If this succeeds, temporary files that a stopped process left in the folder
     are removed.
-
-    Args:
-        folder: Folder to lock. If it does not exist, it is created.
-
-    Yields:
-        True if this process has the lock. False if another process has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
@@ -48,13 +42,6 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     """Lock folders until the block ends, so that no other process writes to them.
 
     Folders into which the block has written nothing are removed at the end.
-
-    Args:
-        key: Setting that names the folders, for the error message.
-        *folders: Folders to lock.
-
-    Raises:
-        InputError: If another process has locked one of the folders.
     """
     with ExitStack() as stack:
         for folder in folders:
@@ -79,14 +66,7 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 def state(folder: Path) -> str:
-    """Describe the state of a run that is not finished.
-
-    Args:
-        folder: Folder of the run, which may be missing.
-
-    Returns:
-        "not begun", "in training", "interrupted", or "failed: " and the reason.
-    """
+    """Describe the state of a run that is not finished."""
     if not folder.exists():
         return "not begun"
     with locked(folder) as is_ours:

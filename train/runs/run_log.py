@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -38,15 +39,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 
     The file has a line for each epoch, and then a line with the final scores. An
     incomplete last line, which a crash can leave, is ignored.
-
-    Args:
-        folder: Folder of the run.
-
-    Returns:
-        For each line, the metrics by name. Empty if there is no file.
-
-    Raises:
-        InputError: If the file is damaged.
     """
     path = folder / METRICS
     if not path.is_file():
@@ -72,14 +64,7 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
-        """Begin the log.
-
-        Args:
-            folder: Folder of the run.
-            history: Metrics of the epochs before the checkpoint from which a run
-                is resumed. They replace the lines of metrics.jsonl, because the
-                run repeats the epochs after the checkpoint.
-        """
+        """Begin the log."""
         # This import takes half a second. Programs that only read metrics do not
         # need it.
         from torch.utils.tensorboard import SummaryWriter
@@ -92,15 +77,7 @@ class RunLog:
         self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
-        """Write the metrics of an epoch, or the final scores, to the log.
-
-        Args:
-            values: Metrics by name. In TensorBoard, metrics with the same text
-                before the slash, as in "train/loss", form a group.
-            epoch: Number of the epoch, from 1. None for the final scores, after
-                which nothing is logged. TensorBoard shows them as if they
-                belonged to one more epoch.
-        """
+        """Write the metrics of an epoch, or the final scores, to the log."""
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
@@ -113,14 +90,10 @@ class RunLog:
         else:
             self._board.flush()
 
-    def renders(self, images: Tensor, epoch: int) -> None:
+    def renders(self, images: Float[Tensor, "N 3 H W"], epoch: int) -> None:
         """Write the training renders of an epoch as one image with a grid of renders.
 
         The image goes to TensorBoard and to renders/epoch_EPOCH.png.
-
-        Args:
-            images: Renders in [0, 1], shape (N, 3, H, W).
-            epoch: Number of the epoch, from 1.
         """
         from torchvision.utils import make_grid
 
@@ -142,11 +115,6 @@ class RunLog:
         Each attack has a row with four images: the render before the attack, a
         white ball in the same lighting, and both after the attack. The predicted
         class and the true class stand below a render.
-
-        Args:
-            attack_examples: The attacks.
-            classes: Names of the classes.
-            epoch: Number of the epoch, from 1.
         """
         labels = []
         for label in attack_examples.labels:
@@ -173,22 +141,11 @@ class RunLog:
 
 
 def _captions(
-    probabilities: Tensor,
+    probabilities: Float[Tensor, "N classes"],
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[tuple[str, str]]:
-    """Write the two lines of the caption of each image: predicted class and true class.
-
-    Args:
-        probabilities: Probability of each class for each image, shape
-            (N, classes).
-        classes: Names of the classes.
-        labels: Name of the true class of each image.
-
-    Returns:
-        For each image, the most probable class with its probability, such as
-        "81% orange", and the true class.
-    """
+    """Write the two lines of the caption of each image: predicted class and true class."""
     highest, predicted = torch.max(probabilities, dim=1)
     captions = []
     for value, index, label in zip(highest.tolist(), predicted.tolist(), labels, strict=True):

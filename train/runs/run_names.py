@@ -26,16 +26,6 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     `augment-none+seed-0@7d0a3f52`. It has the settings in alphabetical order,
     and ends with a hash of them. Characters that are special to file systems or
     to Hydra are replaced by "_".
-
-    Args:
-        overrides: Arguments of the command line of the run.
-        fixed: Keys of settings that are equal in all runs of the sweep. They are
-            part of the hash, but are not shown.
-        parent: Folder of the sweep. If it has a folder with the same hash, the
-            name of this folder is returned.
-
-    Returns:
-        Name of the folder.
     """
     pairs = []
     for override in overrides:

@@ -60,21 +60,6 @@ def load_network(
 
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
     its own weights, classes, size and normalization, so these must then be None.
-
-    Args:
-        name: "run:FOLDER" for the network of a run, or a name for `nb.load_classifier`.
-        weights: File of weights.
-        classes: Names of the classes, or a file of them.
-        size: Pixels per side of the images.
-        normalization: Normalization of the images.
-        normalize_light: Normalization of the light of each image.
-        trust_code: Whether a file of TorchScript or `torch.export` may be loaded.
-
-    Returns:
-        The classifier.
-
-    Raises:
-        InputError: If there is no such network, or if the other arguments do not fit it.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     folder = _find_run(Path(name))
@@ -94,14 +79,7 @@ def load_network(
 
 
 def _find_run(path: Path) -> Path | None:
-    """Return the folder of a training run if a path is this folder, or its file weights.pt.
-
-    Args:
-        path: Any path. The folder of a run contains the file best.pt.
-
-    Returns:
-        Folder of the run. None if the path does not belong to a run.
-    """
+    """Return the folder of a training run if a path is this folder, or its file weights.pt."""
     folder = path.parent if path.name == WEIGHTS else path
     return folder if (folder / BEST).is_file() else None
 
@@ -181,13 +159,7 @@ def load_run(
 
 
 def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
-    """Read the operating points (thresholds on the log-odds) that are stored with a network.
-
-    Args:
-        state: Content of the file of a network. The entry "operating_point" is
-            a mapping with the fields of `OperatingPoint`, or a list of such
-            mappings. It may be missing.
-    """
+    """Read the operating points (thresholds on the log-odds) that are stored with a network."""
     stored = state.get("operating_point", [])
     if not isinstance(stored, list):
         stored = [stored]
@@ -196,11 +168,7 @@ def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
 
 @contextmanager
 def checks_architecture(path: Path) -> Iterator[None]:
-    """Raise InputError if the block cannot load weights into a network of another architecture.
-
-    Args:
-        path: File of the weights, for the error message.
-    """
+    """Raise InputError if the block cannot load weights into a network of another architecture."""
     try:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
@@ -212,27 +180,13 @@ def checks_architecture(path: Path) -> Iterator[None]:
 
 
 def is_classifier(name: str) -> bool:
-    """Return whether a name stands for a classifier that no training run has made.
-
-    Args:
-        name: Value of the setting `train.init_from`. A run is named by its folder, and any other
-            classifier as for `nb.load_classifier`, such as "torchvision:resnet50" or
-            "network.onnx".
-    """
+    """Return whether a name stands for a classifier that no training run has made."""
     source, colon, _ = name.partition(":")
     return source + colon in SOURCES or is_network_file(name)
 
 
 def selected_file(run: Path) -> Path | None:
-    """Find the file of the network that a training run selected, or of a published network.
-
-    Args:
-        run: Folder of the run, folder below pretrained/, or the file itself.
-
-    Returns:
-        The file best.pt or model.safetensors in the folder, or `run` if it is a file. None if
-        there is no such file.
-    """
+    """Find the file of the network that a training run selected, or of a published network."""
     found = published(run)
     for file in (found, found / BEST, found / PUBLISHED):
         if file.is_file():
@@ -257,17 +211,7 @@ def is_state_dict(path: Path) -> bool:
 
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
-    """Read the file of the network that a training run selected, or of a published network.
-
-    Args:
-        run: Folder of the run, folder below pretrained/, or the file itself.
-
-    Returns:
-        Pair of the path of the file, and its content.
-
-    Raises:
-        InputError: If there is no such file, or if it is damaged.
-    """
+    """Read the file of the network that a training run selected, or of a published network."""
     path = selected_file(run)
     if path is None:
         raise InputError(
@@ -280,16 +224,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the weights in the file of a network, without a wrapper that normalizes light.
-
-    Args:
-        state: Content of the file, as `load_selected` returns it.
-
-    Returns:
-        State dict of the network itself. If the file has a wrapper that
-        normalizes the light of images before the network, its prefix of the
-        names of the weights is removed.
-    """
+    """Return the weights in the file of a network, without a wrapper that normalizes light."""
     weights: dict[str, Tensor] = state["model"]
     if NORMALIZE_LIGHT not in state["architecture"]:
         return weights
@@ -297,13 +232,7 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write the network of a checkpoint in half precision, as a file for other users.
-
-    Args:
-        path: File to write, in the format safetensors. Its metadata have the
-            entries PUBLISHED_FACTS of the checkpoint as JSON.
-        state: Content of the checkpoint, with the weights under "model".
-    """
+    """Write the network of a checkpoint in half precision, as a file for other users."""
     metadata = {}
     for key in PUBLISHED_FACTS:
         if key in state:
@@ -315,19 +244,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def _load_published(path: Path) -> dict[str, Any]:
-    """Read a file that `publish` wrote.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Mapping with the weights in single precision under "model", and with
-        further entries if the file has them: "architecture", "settings",
-        "scores", "versions" and "operating_point".
-
-    Raises:
-        InputError: If the file is damaged.
-    """
+    """Read a file that `publish` wrote."""
     weights: dict[str, Tensor] = {}
     try:
         with safe_open(path, "pt") as file:
@@ -344,13 +261,7 @@ def _load_published(path: Path) -> dict[str, Any]:
 
 
 def export(path: Path, network: nn.Module) -> None:
-    """Write the trained weights of a classifier of the user, so that the user can load them.
-
-    Args:
-        path: File to write, for `torch.load`. It has a state dict with the names that the weights
-            have in the user's own network.
-        network: Trained network. Wrappers of this library around it are removed.
-    """
+    """Write the trained weights of a classifier of the user, so that the user can load them."""
     state = unwrapped(network).state_dict()
     content = io.BytesIO()
     torch.save({name: value.cpu() for name, value in state.items()}, content)

@@ -36,18 +36,7 @@ RECOMPILE_LIMIT = 4 * len(SIZES)
 
 
 def choose_device(name: str) -> torch.device:
-    """Choose the device that computes.
-
-    Args:
-        name: "auto" for a GPU if there is one, or else the CPU. Otherwise the name of a device of
-            torch. With "cuda", each process that torchrun starts gets its own GPU.
-
-    Returns:
-        The device.
-
-    Raises:
-        InputError: If the device is not available.
-    """
+    """Choose the device that computes."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and "LOCAL_RANK" in os.environ:
@@ -80,14 +69,6 @@ def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
     Small batches get one thread, because several threads would mostly wait for each other. All
     other batches get `most_threads()`. The number changes the last bits of the results, so it
     follows from the settings, and is not measured: the same command gives the same results.
-
-    Args:
-        network: Network to train.
-        batch_size: Number of images in a batch.
-        size: Pixels per side of an image.
-
-    Returns:
-        Number of threads.
     """
     weight_count = sum(parameter.numel() for parameter in network.parameters())
     pixel_count = batch_size * size**2
@@ -96,11 +77,7 @@ def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
 
 
 def set_deterministic(deterministic: bool) -> None:
-    """Set whether a GPU gives exactly the same results in each run. A CPU always does.
-
-    Args:
-        deterministic: Whether to use deterministic algorithms, which are slower.
-    """
+    """Set whether a GPU gives exactly the same results in each run. A CPU always does."""
     if deterministic:
         # The deterministic algorithms of cuBLAS need this variable.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -115,20 +92,6 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     """Choose the precision in which a network computes.
 
     A warning is logged if `precision` is "bfloat16" and the CPU only emulates it.
-
-    Args:
-        precision: "bfloat16", "float16", "float32" or "auto". "auto" chooses bfloat16 if the
-            hardware computes in it. Otherwise it chooses float16 on a GPU and float32 on a CPU.
-        device: Device that computes.
-        trained: Network to train. None if the network is only evaluated. On a CPU, "auto"
-            chooses float32 to train a network with depthwise convolutions, whose gradients take 3
-            times as long in bfloat16.
-
-    Returns:
-        "bfloat16", "float16" or "float32".
-
-    Raises:
-        InputError: If `precision` has another value.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     if device.type == "cuda":
@@ -151,9 +114,6 @@ def _has_depthwise_layer(network: nn.Module | None) -> bool:
     """Return whether a network has a depthwise convolution.
 
     A depthwise convolution has as many groups as input channels, and more than one.
-
-    Args:
-        network: The network. None counts as a network without such a layer.
     """
     modules = network.modules() if network is not None else []
     convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
@@ -174,12 +134,7 @@ class MixedPrecision(nn.Module):
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        """Wrap a network.
-
-        Args:
-            network: The network. Its weights are changed to the channels-last memory format.
-            precision: "bfloat16", "float16" or "float32".
-        """
+        """Wrap a network."""
         super().__init__()
         self.network = network.to(memory_format=torch.channels_last)
         self.precision = precision
@@ -194,17 +149,7 @@ class MixedPrecision(nn.Module):
 
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Return whether to record the passes of a network as CUDA graphs with torch.compile.
-
-    Args:
-        choice: "always", "never", or "auto". "auto" means yes on a GPU if there is one process and
-            if torch.compile works, which needs a C compiler. With several processes, the
-            passes contain communication, and are not recorded.
-        device: Device that computes.
-
-    Raises:
-        InputError: If the choice is "always" and the device is a CPU.
-    """
+    """Return whether to record the passes of a network as CUDA graphs with torch.compile."""
     if choice == "always" and device.type == "cpu":
         raise InputError(
             "choice=always needs a GPU, since it records CUDA graphs, but the device is a CPU: "
@@ -254,17 +199,6 @@ class GraphedModel(nn.Module):
 
 
 def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
-    """Start the rasterizer that the settings choose.
-
-    Args:
-        settings: Settings of the renderer.
-
-    Returns:
-        The rasterizer.
-
-    Raises:
-        InputError: If the rasterizer does not start on this machine, because it lacks OpenGL, for
-            example.
-    """
+    """Start the rasterizer that the settings choose."""
     with keyed("rasterizer"), progress_message("starting the rasterizer"):
         return choose(settings.rasterizer)

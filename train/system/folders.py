@@ -13,16 +13,6 @@ def folder_or_temporary(out: str | Path | None) -> Iterator[Path]:
     """Yield a folder for files: the folder of the caller, or a temporary folder.
 
     A temporary folder is removed at the end of the block.
-
-    Args:
-        out: Folder of the caller. It need not exist. None for a temporary
-            folder.
-
-    Yields:
-        The folder.
-
-    Raises:
-        InputError: If `out` is not a path, or is the path of a file.
     """
     if out is not None:
         yield as_folder("out", out)

@@ -9,29 +9,14 @@ from torch import Tensor
 
 
 def content_hash(state: Any) -> str:
-    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint.
-
-    Args:
-        state: Tensor, number or text, or nested mappings, lists and tuples of
-            these. The hash depends on all keys and values, and on the types and
-            shapes of tensors.
-
-    Returns:
-        The hash as 64 hexadecimal digits.
-    """
+    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint."""
     digest = hashlib.sha256()
     _update(digest, state)
     return digest.hexdigest()
 
 
 def _update(digest: Any, value: Any) -> None:
-    """Add a value, with all values inside it, to a hash.
-
-    Args:
-        digest: Hash object of hashlib, which is updated.
-        value: Tensor, number or text, or nested mappings, lists and tuples of
-            these.
-    """
+    """Add a value, with all values inside it, to a hash."""
     match value:
         case Tensor():
             on_cpu = value.detach().cpu().contiguous()

@@ -55,14 +55,7 @@ def main_process_first() -> Iterator[None]:
 
 
 def broadcast(value: str) -> str:
-    """Send a text from the first process of a run to all other processes.
-
-    Args:
-        value: Text of this process. Only the text of the first process counts.
-
-    Returns:
-        Text of the first process.
-    """
+    """Send a text from the first process of a run to all other processes."""
     values = [value]
     if distributed.world_size() > 1:
         dist.broadcast_object_list(values, src=0)
@@ -70,14 +63,7 @@ def broadcast(value: str) -> str:
 
 
 def all_reduce_sum(values: Tensor) -> Tensor:
-    """Replace a tensor by its sum over all processes of a run, in place.
-
-    Args:
-        values: Tensor of this process, of any shape.
-
-    Returns:
-        The same tensor, which now has the sum.
-    """
+    """Replace a tensor by its sum over all processes of a run, in place."""
     if distributed.world_size() > 1:
         dist.all_reduce(values)
     return values
@@ -88,12 +74,6 @@ def wrap_ddp(model: nn.Module) -> nn.Module:
 
     On GPUs, layers of batch normalization are replaced in `model` by layers that compute their
     statistics over the batch of all processes. On CPUs, each process has its own statistics.
-
-    Args:
-        model: The model.
-
-    Returns:
-        The wrapped model. The model itself if there is only one process.
     """
     if distributed.world_size() == 1:
         return model
@@ -144,12 +124,7 @@ class SignalHandler:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
-        """Restore the handlers, and let a noted signal take effect unless an error is raised.
-
-        Args:
-            error: Type of the error that ends the block. None without an error.
-            *rest: Not used. Python passes the error and its traceback.
-        """
+        """Restore the handlers, and let a noted signal take effect unless an error is raised."""
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)
@@ -188,12 +163,7 @@ class SignalHandler:
         raise Interrupted(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        """Handle the first signal: note its number, so that the next signal ends the process.
-
-        Args:
-            number: Number of the signal.
-            frame: Not used. Python calls handlers of signals with it.
-        """
+        """Handle the first signal: note its number, so that the next signal ends the process."""
         self._number = number
         self._restore()
 

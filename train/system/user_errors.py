@@ -25,23 +25,6 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
     A message of the library begins with the name of a Python argument, such as
     "name". The user of a command knows only the setting from which the command
     took the argument, such as "train.init_from".
-
-    Args:
-        group: Key of a group of settings, such as "scene". It is put before
-            messages about any other argument. If it is empty, these messages
-            stay as they are.
-        **keys: Key for each argument, as in `name="train.init_from"`. The key of
-            the argument "lighting" is also used for "lighting.radius" and
-            "lighting[0]".
-
-    Raises:
-        InputError: If the block raises InputError. The message begins with the
-            key.
-
-    >>> with keyed(name="train.init_from"):
-    ...     raise InputError("name=x is unknown", "name")
-    Traceback (most recent call last):
-    renderer.errors.InputError: train.init_from=x is unknown
     """
     try:
         yield
@@ -61,28 +44,12 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
 
 
 def keys_of(key: str, settings: Settings) -> dict[str, str]:
-    """List the dotted key of each field of a group of settings, as `keyed` takes them.
-
-    Args:
-        key: Key of the group, such as "train".
-        settings: Settings of the group.
-
-    Returns:
-        Key by field, such as "train.epochs" for "epochs".
-    """
+    """List the dotted key of each field of a group of settings, as `keyed` takes them."""
     return {name: f"{key}.{name}" for name in vars(settings)}
 
 
 def user_message(error: BaseException) -> str | None:
-    """Write a message for the user about an error that the user can fix.
-
-    Args:
-        error: Any error.
-
-    Returns:
-        One sentence. None if the error is a fault of the program, or if nothing
-        is known about it.
-    """
+    """Write a message for the user about an error that the user can fix."""
     match error:
         case InputError():
             return str(error)
@@ -120,16 +87,6 @@ def writable_folder(folder: str | Path, key: str) -> Path:
 
     If the folder does not exist, the file is written to the nearest parent
     folder that exists.
-
-    Args:
-        folder: The folder.
-        key: Setting that names the folder, for the error message.
-
-    Returns:
-        The folder as a path.
-
-    Raises:
-        InputError: If the temporary file cannot be written.
     """
     path = Path(folder)
     try:

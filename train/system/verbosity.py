@@ -13,13 +13,8 @@ MAX_LINES = 12
 
 
 def take_flag(words: list[str]) -> list[str]:
-    """Remove --verbose and -v from a command line, and make this process verbose if one is there.
-
-    Args:
-        words: Arguments of the command line.
-
-    Returns:
-        The other arguments.
+    """Remove --verbose and -v from a command line, and make this process verbose if one is
+    there.
     """
     others = [word for word in words if word not in VERBOSE_FLAGS]
     if len(others) < len(words):
@@ -33,16 +28,7 @@ def is_verbose() -> bool:
 
 
 def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
-    """Shorten a list of lines that a command prints, unless the command is verbose.
-
-    Args:
-        lines: Lines of text, the most important ones first.
-        limit: Largest number of lines to return.
-
-    Returns:
-        All lines if the command is verbose or the list is short. Otherwise the
-        first lines, and a line that says how many more there are.
-    """
+    """Shorten a list of lines that a command prints, unless the command is verbose."""
     if is_verbose() or len(lines) <= limit:
         return list(lines)
     kept = limit - 1

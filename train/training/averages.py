@@ -30,9 +30,6 @@ class MovingAverage(AveragedModel):
 
         The method of the base class copies a counter to the GPU in each step,
         which the GPU waits for. This method keeps the counter on the CPU.
-
-        Args:
-            model: The model.
         """
         if self.n_averaged == 0:
             return super().update_parameters(model)
@@ -71,16 +68,7 @@ class Averages:
         soup: bool,
         keeps_latest: bool = False,
     ):
-        """Create the averages, which are empty at first.
-
-        Args:
-            model: Network in training.
-            ema_decay: Decay of the moving average in a step, in [0, 1). 0 for no moving average.
-            soup: Whether to compute the soup.
-            keeps_latest: Whether the network after the last epoch is kept, instead of the network
-                of the epoch with the highest validation accuracy. With a soup, the last one is
-                always kept, because it contains all epochs.
-        """
+        """Create the averages, which are empty at first."""
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:
@@ -97,10 +85,6 @@ class Averages:
         """Restart the training from the initial weights if the run makes a soup.
 
         A soup averages networks that all begin with the same weights.
-
-        Args:
-            initial: Network before the training. None if it had random weights.
-            optimizer: Optimizer of the network, whose momentum is reset.
         """
         if self._soup is None or initial is None:
             return
@@ -120,16 +104,7 @@ class Averages:
             self._soup.update_parameters(self._ema.module if self._ema else self._model)
 
     def is_kept(self, accuracy: float) -> bool:
-        """Return whether to keep the network of this epoch instead of that of an earlier epoch.
-
-        Args:
-            accuracy: Accuracy of the network on the validation images, in
-                [0, 1].
-
-        Returns:
-            True if the accuracy is higher than after all earlier epochs, or if
-            the last network is always kept.
-        """
+        """Return whether to keep the network of this epoch instead of that of an earlier epoch."""
         is_best = accuracy > self._best_accuracy
         self._best_accuracy = max(accuracy, self._best_accuracy)
         return is_best or self._keeps_latest
@@ -140,24 +115,14 @@ class Averages:
         return {name: value.to("cpu", copy=True) for name, value in state.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states of the moving average and of the soup for a checkpoint.
-
-        Returns:
-            Mapping with the keys "ema" and "soup". The value is None if the run
-            does not compute this average.
-        """
+        """Return the states of the moving average and of the soup for a checkpoint."""
         return {
             "ema": self._ema.state_dict() if self._ema else None,
             "soup": self._soup.state_dict() if self._soup else None,
         }
 
     def load_state_dict(self, state: Mapping[str, Any], accuracies: list[float]) -> None:
-        """Restore the averages from a checkpoint.
-
-        Args:
-            state: Mapping that `state_dict` returned.
-            accuracies: Validation accuracy of each finished epoch, in [0, 1].
-        """
+        """Restore the averages from a checkpoint."""
         if self._ema:
             self._ema.load_state_dict(state["ema"])
         if self._soup:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
@@ -29,17 +30,7 @@ class Baseline:
     """Augmentation of training images, chosen by its name."""
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
-        """Create the augmentation.
-
-        Args:
-            name: "none", "pgd" (an adversarial attack on pixels), or a transform of torchvision:
-                "color_jitter" (with half the strength of Chen et al. 2020, as is usual for small
-                images), "trivial_augment", "augmix" or "color_jitter+augmix".
-            model: Network in training, which "pgd" attacks.
-            seed: Seed of the run.
-            absent: Indices of classes for "pgd". An image with a complementary label ("not of class
-                k") shows none of these classes either.
-        """
+        """Create the augmentation."""
         self._name = name
         self._model = model
         self._seed = seed
@@ -48,19 +39,13 @@ class Baseline:
         if name not in ("none", "pgd"):
             self._transform = _transform(name)
 
-    def apply(self, images: Tensor, labels: Tensor, step: int) -> Tensor:
+    def apply(
+        self, images: UInt8[Tensor, "B 3 H W"], labels: Float[Tensor, " B"], step: int
+    ) -> UInt8[Tensor, "B 3 H W"]:
         """Augment the images of a batch.
 
         The random numbers for an image depend on the seed, the step and the index of the image in
         the batch.
-
-        Args:
-            images: Images, uint8, shape (B, 3, H, W).
-            labels: Classes of the images, shape (B,).
-            step: Number of the training step in the run.
-
-        Returns:
-            Augmented images, uint8, shape (B, 3, H, W).
         """
         if self._name == "none":
             return images
@@ -80,11 +65,7 @@ class Baseline:
 
 
 def _transform(name: str) -> Any:
-    """Create a transform of torchvision by its name in the setting `augmentation`.
-
-    Args:
-        name: "color_jitter", "trivial_augment", "augmix" or "color_jitter+augmix".
-    """
+    """Create a transform of torchvision by its name in the setting `augmentation`."""
     # This import takes a second, and most runs need no transform.
     from torchvision.transforms import v2
 
@@ -101,28 +82,14 @@ def _transform(name: str) -> Any:
 @torch.enable_grad()
 def pgd(
     model: nn.Module,
-    images: Tensor,
-    labels: Tensor,
+    images: UInt8[Tensor, "B 3 H W"],
+    labels: Float[Tensor, " B"],
     draws: torch.Generator,
     absent: Sequence[int] = (),
-) -> Tensor:
+) -> UInt8[Tensor, "B 3 H W"]:
     """Attack images by projected gradient descent from a random start (Madry et al. 2018).
 
     All PGD_STEPS steps are taken, also if an image is misclassified earlier.
-
-    Args:
-        model: Classifier of images in [0, 1]. It is in evaluation mode during
-            the attack.
-        images: Images, uint8, shape (B, 3, H, W).
-        labels: Classes of the images, shape (B,). A negative number is a
-            complementary label: it says of which class the image is not.
-        draws: Random generator on the CPU, for the start.
-        absent: Indices of classes that an image with a complementary label does
-            not show either.
-
-    Returns:
-        Images whose pixels differ by at most the radius of `PGD`, rounded to 8
-        bits, uint8, shape (B, 3, H, W).
     """
     clean = to_unit(images)
     clip_to_unit = partial(nearest_in_box, low=0, high=1)

@@ -19,20 +19,7 @@ SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 
 
 def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> DataSet:
-    """Load the data set of a run.
-
-    Args:
-        settings: Settings of the run.
-        initial: Network with whose weights the run begins. If the setting
-            data.size is null, the images get the size that this network takes.
-            None for random weights.
-
-    Returns:
-        Data set with training and test images.
-
-    Raises:
-        InputError: If the data cannot be read.
-    """
+    """Load the data set of a run."""
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
     console.debug("data: %s", name)
@@ -44,15 +31,7 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
 
 
 def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
-    """Load a data set by its name.
-
-    Args:
-        name: Name in `SOURCES`.
-        settings: Settings of the run, with the path and the size of the data.
-        initial: Network with whose weights the run begins. If the settings give
-            no size, the images get the size that this network takes. None for
-            random weights.
-    """
+    """Load a data set by its name."""
     data = settings.data
     if name == "cifar100":
         return load_cifar100(data.path)

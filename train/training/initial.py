@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.classifiers import Classifier, load_source
@@ -109,16 +110,7 @@ class Initial:
         return stored if isinstance(stored, dict) else None
 
     def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
-        """Copy the weights of the initial network to the network of the run.
-
-        Args:
-            network: Network of the run, whose weights are replaced.
-            description: Arguments of `build_network` that build it.
-
-        Raises:
-            InputError: If the two networks differ in classes, image size or
-                architecture.
-        """
+        """Copy the weights of the initial network to the network of the run."""
         own = {"name": WIDERESNET, **self.architecture}
         other = {"name": WIDERESNET, **description}
         for key in SHARED:
@@ -135,18 +127,7 @@ class Initial:
 
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
-    """Load the initial network, with whose weights a run begins.
-
-    Args:
-        settings: Settings of the run. `train.init_from` names the network.
-
-    Returns:
-        The network. None if the run begins with random weights.
-
-    Raises:
-        InputError: If there is no such network, or if the settings give weights
-            or classes to the network of a run, which has its own.
-    """
+    """Load the initial network, with whose weights a run begins."""
     name = settings.train.init_from
     if not name:
         return None
@@ -186,17 +167,6 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 
     The label lists the positive classes. If it is missing, these are the classes
     of the meshes. The names of the classes are known from the initial network.
-
-    Args:
-        settings: Settings of a run.
-
-    Returns:
-        Settings with names in the label. If there was no label, each mesh has
-        its class as a label, too.
-
-    Raises:
-        InputError: If the label is missing and the run begins with random
-            weights, or if the initial network lacks a class.
     """
     names = [] if settings.label is None else label_names(settings.label)
     # A number can be the index of a class.
@@ -231,18 +201,7 @@ def _print_assumed_class(meshes: Sequence[Any], label: str) -> None:
 
 
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
-    """Load a classifier, from another library or from a file, as the initial network.
-
-    Args:
-        settings: Settings of the run, with the weights, the classes and the
-            size of the images. Without a size, the images have the size that
-            the classifier takes.
-        name: Value of `train.init_from`, such as "torchvision:resnet50".
-
-    Raises:
-        InputError: If there is no such classifier, or if it has no weights that
-            can be trained.
-    """
+    """Load a classifier, from another library or from a file, as the initial network."""
     size = settings.data.size
     is_file = is_network_file(name)
     with keyed(name="train.init_from", size="data.size"):
@@ -267,17 +226,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:
-    """Use a classifier in memory as the initial network of a run.
-
-    Args:
-        classifier: The classifier. If it normalizes the light of images, the
-            trained network will do the same.
-        size: Pixels per side of the images of the run. None for the size that
-            the classifier takes.
-
-    Returns:
-        The initial network.
-    """
+    """Use a classifier in memory as the initial network of a run."""
     network = without_normalized_light(classifier.function)
     shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
     if classifier.normalized_light is not None:
@@ -311,15 +260,6 @@ def choose_validation(
     Networks of one data set leave out nested sets of images: a smaller fraction is a subset of a
     larger one. The smallest fraction of a network and of the networks with whose weights it began
     is therefore the fraction from which none of them has learned.
-
-    Args:
-        settings: Settings of the run. `data.validation` is the fraction. If it is None, the
-            fraction that the initial network left out is used, or else VALIDATION.
-        data: Data of the run.
-        initial: Network with whose weights the run begins. None for random weights.
-
-    Returns:
-        Choice of the validation images.
     """
     asked = settings.data.validation
     fraction = _default_fraction(data) if asked is None else asked
@@ -347,21 +287,13 @@ def _default_fraction(data: DataSet) -> float:
 
     It is VALIDATION, or less for data without labels, of which at most HELD_OUT
     images validate.
-
-    Args:
-        data: Data set of the run.
     """
     largest = 1.0 if data.labeled else HELD_OUT / len(data.train)
     return min(VALIDATION, largest)
 
 
 def _learned_from_other_kind(initial: Initial, data: DataSet) -> bool:
-    """Return whether a run trains on rendered images, and its initial network did not.
-
-    Args:
-        initial: Network with whose weights the run begins.
-        data: Data set of the run.
-    """
+    """Return whether a run trains on rendered images, and its initial network did not."""
     record = initial.validation or {}
     is_known = record.get("fraction") is not None
     # Only a network that was trained on rendered images records the entry "data".
@@ -370,17 +302,7 @@ def _learned_from_other_kind(initial: Initial, data: DataSet) -> bool:
 
 
 def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | None:
-    """Return the fraction of the training images from which the initial network did not learn.
-
-    Args:
-        initial: Network with whose weights the run begins.
-        record: Record of the validation images of the run, with a hash of its
-            training images.
-
-    Returns:
-        The fraction. None if the initial network was trained on another data
-        set, or if its data set is unknown.
-    """
+    """Return the fraction of the training images from which the initial network did not learn."""
     initial_record = initial.validation or {}
     fraction = initial_record.get("fraction")
     if not isinstance(fraction, float):
@@ -394,27 +316,14 @@ class CachedModel:
     """Wrapper of a network that stores logits on disk, so that later runs need not compute them."""
 
     def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
-        """Hash what decides the logits of an image.
-
-        Args:
-            model: The network.
-            device: Device that computes.
-            cache: Cache on disk. The key of logits is a hash of the weights and the images.
-        """
+        """Hash what decides the logits of an image."""
         self._model = model
         self._cache = cache
         facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]
         self._key = content_hash(facts)
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Read the logits of images from the cache, or compute and store them.
-
-        Args:
-            images: Images in [0, 1], shape (B, 3, size, size).
-
-        Returns:
-            Logits, shape (B, classes).
-        """
+    def __call__(self, images: Float[Tensor, "B 3 size size"]) -> Float[Tensor, "B classes"]:
+        """Read the logits of images from the cache, or compute and store them."""
         key = content_hash([self._key, images])
         stored = self._cache.read(key)
         if stored is None:

@@ -8,6 +8,7 @@ are compared with those of the network before the training.
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.losses import kl_divergence
@@ -43,20 +44,6 @@ def interpolate(
     divergences from the predictions of the initial network for these images:
     that of the predictions of the interpolated network for the same images, and
     that of its predictions for the images in the light of a projector.
-
-    Args:
-        initial: Network before the training.
-        selected: Network of the same architecture, whose weights are replaced
-            while factors are tried.
-        trained: Weights after the training.
-        validation: Images from which no network has learned.
-        seed: Seed of the light of the projector.
-        weights: Weights of the two divergences, for unchanged and for relit
-            images.
-
-    Returns:
-        Pair of the interpolated weights, on the CPU, and the factor. Among
-        equally good factors, the smallest one is chosen.
     """
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation)
@@ -88,17 +75,7 @@ def interpolate(
 def mix(
     initial: Mapping[str, Tensor], trained: Mapping[str, Tensor], factor: float
 ) -> dict[str, Tensor]:
-    """Interpolate linearly between the weights of two networks.
-
-    Args:
-        initial: Weights by name that the factor 0 gives.
-        trained: Weights by name that the factor 1 gives.
-        factor: Factor, in [0, 1].
-
-    Returns:
-        Interpolated weights by name. Integer tensors, such as counters, are
-        those of `trained`.
-    """
+    """Interpolate linearly between the weights of two networks."""
     mixed = {}
     for name, value in trained.items():
         mixed[name] = value.clone()
@@ -107,45 +84,21 @@ def mix(
     return mixed
 
 
-def agreement(logits: Tensor, targets: Tensor) -> float:
-    """Return the fraction of images for which two networks predict the same class.
-
-    Args:
-        logits: Logits of a network, shape (N, classes).
-        targets: Logits of another network, shape (N, classes).
-
-    Returns:
-        The fraction, in [0, 1].
-    """
+def agreement(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N classes"]) -> float:
+    """Return the fraction of images for which two networks predict the same class."""
     return float((logits.argmax(1) == targets.argmax(1)).double().mean())
 
 
-def divergence(logits: Tensor, targets: Tensor) -> float:
-    """Return the mean Kullback-Leibler divergence of predictions from those of another network.
-
-    Args:
-        logits: Logits of a network, shape (N, classes).
-        targets: Logits of the other network, shape (N, classes).
-
-    Returns:
-        Mean over the N images, at least 0.
-    """
+def divergence(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N classes"]) -> float:
+    """Return the mean Kullback-Leibler divergence of predictions from those of another network."""
     return float(kl_divergence(logits, targets).mean())
 
 
 @torch.no_grad()
-def predict(model: MixedPrecision, split: Split, *light_key: int | str) -> Tensor:
-    """Compute the logits of a network for images, as they are or in the light of a projector.
-
-    Args:
-        model: The network.
-        split: N images.
-        *light_key: Key of the random stream from which the light of the
-            projector is drawn. Without a key, there is no projector.
-
-    Returns:
-        Logits, on the CPU, shape (N, classes).
-    """
+def predict(
+    model: MixedPrecision, split: Split, *light_key: int | str
+) -> Float[Tensor, "N classes"]:
+    """Compute the logits of a network for images, as they are or in the light of a projector."""
     device = next(model.parameters()).device
     batches = torch.arange(len(split)).split(BATCH)
     logits = []

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
@@ -70,17 +71,12 @@ class EpochState:
     """
 
     renders: Renders
-    sums: Tensor
+    sums: Float[Tensor, " 2"]
     diagnostics: list[Mapping[str, float]]
     step: int = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, with sums over all processes.
-
-        Returns:
-            Mapping of tensors and plain values. The renders are rounded to 8
-            bits, as for the training.
-        """
+        """Return the state for a checkpoint, with sums over all processes."""
         return {
             "images": to_bytes(self.renders.images),
             "labels": self.renders.labels,
@@ -103,7 +99,7 @@ class EpochPlan:
     """
 
     split: Split
-    rows: Tensor
+    rows: Int[Tensor, " N"]
     rounds: list[Round]
     steps: list[int]
 
@@ -125,10 +121,6 @@ class Trainer:
         averages: Moving average and model soup of the network.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
-
-    Raises:
-        InputError: If a batch cannot be divided equally among the processes, or
-            if there are no hard negatives for a ranking loss.
     """
 
     def __init__(
@@ -140,17 +132,7 @@ class Trainer:
         folder: Path,
         labeled: bool = True,
     ):
-        """Check the settings, and build the optimizer.
-
-        Args:
-            settings: Settings of the training.
-            model: Network to train.
-            architecture: Description of the network, which is stored in
-                checkpoints.
-            service: Service that renders new training images in each round.
-            folder: Folder of the run.
-            labeled: Whether the labels of the data are known.
-        """
+        """Check the settings, and build the optimizer."""
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(
@@ -194,11 +176,7 @@ class Trainer:
         self._build_step(labeled)
 
     def _build_step(self, labeled: bool) -> None:
-        """Build the optimizer, the gradient scaler, the loss and the augmentation.
-
-        Args:
-            labeled: Whether the labels of the data are known.
-        """
+        """Build the optimizer, the gradient scaler, the loss and the augmentation."""
         settings = self.settings
         positive_classes = self.service.positive_classes
         # `wrap_ddp` may replace layers of the network. The optimizer is built
@@ -248,23 +226,12 @@ class Trainer:
         """Network that is validated after each epoch: an average, or the network in training."""
         return self.averages.selected
 
-    def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
+    def fit(self, split: Split, held_out: Bool[Tensor, " N"], log: RunLog | None) -> None:
         """Train to the last epoch, and write checkpoints.
 
         Afterwards, best.pt contains the network of the epoch with the highest
         validation accuracy. For a model soup, and for data without labels, it
         contains the network after the last epoch.
-
-        Args:
-            split: N images and their labels, on the device of the network.
-            held_out: Whether each image is a validation image, bool, on the CPU,
-                shape (N,). The network learns from the others.
-            log: Log of the run. None in all processes but the first one.
-
-        Raises:
-            InputError: If the loss or a weight becomes NaN or infinite.
-            Interrupted: If a signal ends the training, after a checkpoint was
-                written.
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
@@ -285,13 +252,6 @@ class Trainer:
         """Limit the batch size to the images of a round, and check that a batch fits in memory.
 
         A larger batch would only hold copies of the images.
-
-        Args:
-            split: Images and labels.
-            image_count: Number of training images in `split`.
-
-        Raises:
-            InputError: If the memory is too small for the activations of a batch.
         """
         settings = self.settings
         limits = (settings.images_per_epoch, self.service.settings.regenerate_every)
@@ -315,23 +275,13 @@ class Trainer:
     def _train_epoch(
         self,
         split: Split,
-        rows: Tensor,
+        rows: Int[Tensor, " N"],
         signals: SignalHandler,
         log: RunLog | None,
     ) -> bool:
         """Take the training steps of an epoch that remain.
 
         If the run was resumed within the epoch, some steps were taken before.
-
-        Args:
-            split: Images and labels.
-            rows: Indices of the training images in `split`, shape (N,).
-            signals: Handler of signals that ask the run to stop.
-            log: Log of the run. None in all processes but the first one.
-
-        Returns:
-            True if the epoch is complete. False if a signal stopped it before
-            its last step.
         """
         plan = self._plan(split, rows)
         if self._epoch_state is None:
@@ -351,13 +301,8 @@ class Trainer:
                     self._save()
         return True
 
-    def _plan(self, split: Split, rows: Tensor) -> EpochPlan:
-        """Divide the current epoch into rounds, and count the training steps of each round.
-
-        Args:
-            split: Images and labels.
-            rows: Indices of the training images in `split`, shape (N,).
-        """
+    def _plan(self, split: Split, rows: Int[Tensor, " N"]) -> EpochPlan:
+        """Divide the current epoch into rounds, and count the training steps of each round."""
         settings = self.settings
         rounds = rounds_of_epoch(
             image_count=len(rows),
@@ -371,15 +316,7 @@ class Trainer:
         return EpochPlan(split, rows, rounds, steps)
 
     def _begin_epoch(self, plan: EpochPlan, log: RunLog | None) -> EpochState:
-        """Begin an epoch: render the images of its first round.
-
-        Args:
-            plan: Images and rounds of the epoch.
-            log: Log of the run. None in all processes but the first one.
-
-        Returns:
-            State of the epoch before its first step.
-        """
+        """Begin an epoch: render the images of its first round."""
         self.averages.begin_epoch(self.initial, self.optimizer)
         renders = self._regenerate(plan.rounds[0], log)
         return EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
@@ -387,15 +324,8 @@ class Trainer:
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
     ) -> Generator[Batch, None, None]:
-        """Yield the batches of an epoch that remain, and render new images before each new round.
-
-        Args:
-            plan: Images and rounds of the epoch.
-            state: State of the epoch, which is updated when a round begins.
-            log: Log of the run. None in all processes but the first one.
-
-        Yields:
-            Batches of the rest of the current round, and of all later rounds.
+        """Yield the batches of an epoch that remain, and render new images before each new
+        round.
         """
         # `state.diagnostics` has an item for each round that has begun. The last of them
         # is the current round.
@@ -424,12 +354,7 @@ class Trainer:
                 yield from progress(batches, title, plan.steps[index], first)
 
     def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
-        """Render the training renders of a round anew, and log images of a few attacks on them.
-
-        Args:
-            now: The round.
-            log: Log of the run. None in all processes but the first one.
-        """
+        """Render the training renders of a round anew, and log images of a few attacks on them."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
@@ -443,25 +368,13 @@ class Trainer:
 
     def _step(
         self,
-        images: Tensor,
-        labels: Tensor,
-        rendered: Tensor,
+        images: UInt8[Tensor, "B 3 H W"],
+        labels: Float[Tensor, " B"],
+        rendered: Bool[Tensor, " B"],
         epoch_fraction: float,
         step_in_run: int,
-    ) -> Tensor:
-        """Take a training step: change the weights by the gradient of the loss of a batch.
-
-        Args:
-            images: Images, uint8, shape (B, 3, H, W).
-            labels: Labels of the images, shape (B,).
-            rendered: Whether each image is a render, bool, shape (B,).
-            epoch_fraction: Fraction of the epoch that is done, in [0, 1).
-            step_in_run: Number of the step in the run, from 0.
-
-        Returns:
-            Sum of the losses of the images, and number of correct predictions,
-            shape (2,).
-        """
+    ) -> Float[Tensor, " 2"]:
+        """Take a training step: change the weights by the gradient of the loss of a batch."""
         settings = self.settings
         done = (self.epoch + epoch_fraction) / settings.epochs
         if settings.soup:
@@ -485,19 +398,11 @@ class Trainer:
         self.averages.end_step()
         return sums
 
-    def _add_gradients(self, tensors: Sequence[Tensor]) -> Tensor:
+    def _add_gradients(self, tensors: Sequence[Tensor]) -> Float[Tensor, " 2"]:
         """Compute the gradient of the loss of a batch.
 
         The batch is divided into smaller batches to save memory. Their gradients
         are added.
-
-        Args:
-            tensors: Arguments of the loss. Each has a row for each image of the
-                batch.
-
-        Returns:
-            Sum of the losses of the images, and number of correct predictions,
-            shape (2,).
         """
         count = self.settings.accumulation_steps
         sums = torch.zeros(2, device=self.device)
@@ -510,14 +415,8 @@ class Trainer:
             sums += torch.stack([loss.detach() * image_count, hits])
         return sums
 
-    def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
-        """Finish an epoch: validate the network, keep it if it is the best, and log the metrics.
-
-        Args:
-            split: Images and labels.
-            rows: Indices of the validation images in `split`, shape (N,).
-            log: Log of the run. None in all processes but the first one.
-        """
+    def _end_epoch(self, split: Split, rows: Int[Tensor, " N"], log: RunLog | None) -> None:
+        """Finish an epoch: validate the network, keep it if it is the best, and log the metrics."""
         state = cast(EpochState, self._epoch_state)
         self._epoch_state = None
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
@@ -554,12 +453,7 @@ class Trainer:
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
-        """Raise InputError if the loss or a weight of the network is NaN or infinite.
-
-        Args:
-            loss: Loss, or a sum of losses.
-            epoch: Number of the epoch, from 1, for the error message.
-        """
+        """Raise InputError if the loss or a weight of the network is NaN or infinite."""
         weights = self.model.network.state_dict().values()
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
@@ -614,11 +508,8 @@ class Trainer:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the content of a checkpoint, from which a run continues as if it had not stopped.
-
-        Returns:
-            Mapping of tensors and plain values. "under_way" is the state of the
-            epoch that has begun, or None between two epochs.
+        """Return the content of a checkpoint, from which a run continues as if it had not
+        stopped.
         """
         return {
             **self._description(),
@@ -634,12 +525,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a run from the content of a checkpoint.
-
-        Args:
-            state: Mapping that `state_dict` of the same run returned. Any other
-                value raises errors of many types.
-        """
+        """Restore the state of a run from the content of a checkpoint."""
         self.epoch = state["epoch"]
         self.history = state["history"]
         accuracies = [line["validation/accuracy"] for line in self.history]
@@ -658,11 +544,7 @@ class Trainer:
             self._epoch_state = self._restore_epoch(state["under_way"])
 
     def _restore_epoch(self, state: Mapping[str, Any]) -> EpochState:
-        """Restore the state of an epoch that had begun when a checkpoint was written.
-
-        Args:
-            state: Mapping that `EpochState.state_dict` returned.
-        """
+        """Restore the state of an epoch that had begun when a checkpoint was written."""
         images = to_unit(state["images"]).to(self.device)
         labels = state["labels"].to(self.device)
         renders = Renders(images, labels, state["diagnostics"][-1])
@@ -674,11 +556,7 @@ class Trainer:
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 
     def resume(self) -> None:
-        """Restore the newest undamaged checkpoint in the folder of the run.
-
-        Raises:
-            InputError: If there is no checkpoint, or if it is of another run.
-        """
+        """Restore the newest undamaged checkpoint in the folder of the run."""
         state, problem = checkpoint.load_newest(self.folder)
         try:
             self._require_own_architecture(state)
@@ -729,23 +607,15 @@ class Trainer:
             ) from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
-        """Raise ValueError if a checkpoint has another architecture or other classes than this run.
-
-        Args:
-            state: Content of the checkpoint. Its description of the network may
-                lack entries that are newer than the checkpoint.
+        """Raise ValueError if a checkpoint has another architecture or other classes than this
+        run.
         """
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
 
 
 def activation_bytes(model: nn.Module, size: int) -> int:
-    """Measure the memory that a training step keeps for each image until its backward pass.
-
-    Args:
-        model: Network, from images in [0, 1] of shape (N, 3, size, size) to logits.
-        size: Pixels per side of the images.
-    """
+    """Measure the memory that a training step keeps for each image until its backward pass."""
     totals = []
     device = next(model.parameters()).device
     for count in (1, 2):
@@ -782,21 +652,13 @@ def _require_equal_shares(settings: TrainSettings) -> None:
 
 
 @torch.no_grad()
-def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
+def evaluate(
+    model: nn.Module, split: Split, rows: Int[Tensor, " N"] | None = None
+) -> dict[str, float]:
     """Measure the loss and the accuracy of a network in evaluation mode.
 
     If a run has several processes, each of them scores a part of the images, and
     all of them return the result for all images.
-
-    Args:
-        model: Network, from images in [0, 1] to logits.
-        split: Images and labels.
-        rows: Indices of the images in `split` to score, shape (N,). None for all
-            images.
-
-    Returns:
-        Mapping with two keys: "loss", the mean cross entropy, and "accuracy",
-        the fraction of images that are classified correctly.
     """
     device = split.labels.device
     if rows is None:

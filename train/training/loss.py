@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from augment.losses import is_correct, kl_divergence, label_loss, ranking_loss
@@ -30,17 +31,7 @@ class TrainingLoss:
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
-        """Store the arguments.
-
-        Args:
-            model: Network in training, from images in [0, 1] to logits.
-            settings: Settings of the training.
-            positive_classes: Indices of the positive classes, for the ranking term. Empty if the
-                loss has no such term.
-            teacher: Network before the training. None without distillation and consistency.
-            labeled: Whether the labels of the data are known. If not, only renders count in the
-                cross entropy, and correct predictions for other images are those of the teacher.
-        """
+        """Store the arguments."""
         self._model = model
         self._settings = settings
         self._positive_classes = positive_classes
@@ -49,24 +40,12 @@ class TrainingLoss:
 
     def compute(
         self,
-        images: Tensor,
-        labels: Tensor,
-        rendered: Tensor,
-        augmented: Tensor | None = None,
+        images: UInt8[Tensor, "B 3 H W"],
+        labels: Float[Tensor, " B"],
+        rendered: Bool[Tensor, " B"],
+        augmented: UInt8[Tensor, "B 3 H W"] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Compute the loss of a batch.
-
-        Args:
-            images: Images, uint8, shape (B, 3, H, W).
-            labels: Classes of the images, shape (B,). A negative number is a
-                complementary label: it says of which class the image is not.
-            rendered: Whether each image is a render, bool, shape (B,).
-            augmented: The images after an augmentation, for the consistency
-                term, uint8, shape (B, 3, H, W). None without this term.
-
-        Returns:
-            Pair of scalars: the loss, and the number of correct predictions.
-        """
+        """Compute the loss of a batch."""
         settings = self._settings
         logits = self._model(to_unit(images))
         teacher_logits = None
@@ -97,20 +76,17 @@ class TrainingLoss:
         hits = is_correct(logits.detach().argmax(1), labels, other_positives).sum()
         return loss, hits
 
-    def _divergences(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
+    def _divergences(
+        self,
+        logits: Float[Tensor, "B classes"],
+        targets: Float[Tensor, "B classes"],
+        rendered: Bool[Tensor, " B"],
+    ) -> Float[Tensor, " B"]:
         """Compute the divergence of the predictions from those of the teacher.
 
         For renders, only the classes that are not positive are compared, because
         the training should change the scores of the positive classes. Without
         positive classes, the divergence of renders is 0.
-
-        Args:
-            logits: Logits of the network, shape (B, classes).
-            targets: Logits of the teacher, shape (B, classes).
-            rendered: Whether each image is a render, bool, shape (B,).
-
-        Returns:
-            Kullback-Leibler divergence for each image, shape (B,).
         """
         divergences = kl_divergence(logits, targets) * ~rendered
         if self._positive_classes:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from statistics import fmean
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.classifiers.adapter import nearest
@@ -26,9 +27,6 @@ def _step(done: float) -> float:
     """Return the factor of the learning rate in the schedule "step".
 
     The factor is 0.2 to the power of the number of milestones that are reached.
-
-    Args:
-        done: Fraction of the training that is done, in [0, 1].
     """
     return STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
 
@@ -37,9 +35,6 @@ def _cosine(done: float) -> float:
     """Return the factor of the learning rate in the schedule "cosine".
 
     The factor falls from 1 to 0: (1 + cos(pi * done)) / 2.
-
-    Args:
-        done: Fraction of the training that is done, in [0, 1].
     """
     return (1 + math.cos(math.pi * done)) / 2
 
@@ -49,9 +44,6 @@ def _one_cycle(done: float) -> float:
 
     The factor rises linearly from START_FACTOR to 1, and then falls linearly to
     0. The schedule suits short trainings.
-
-    Args:
-        done: Fraction of the training that is done, in [0, 1].
     """
     if done < WARMUP:
         return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
@@ -68,15 +60,7 @@ SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
 
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
-    """Compute the learning rate at a time of the training.
-
-    Args:
-        settings: Settings with the schedule and the highest learning rate.
-        done: Fraction of the training that is done, in [0, 1].
-
-    Returns:
-        The learning rate.
-    """
+    """Compute the learning rate at a time of the training."""
     return settings.learning_rate * SCHEDULE_FACTORS[settings.schedule](done)
 
 
@@ -86,13 +70,6 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
     "sgd" has Nesterov momentum, and weight decay for all parameters, as in the
     paper. "adamw" (Loshchilov and Hutter 2019) ignores `settings.momentum`, and
     has no weight decay for biases and normalization layers, as is usual.
-
-    Args:
-        model: Network to train.
-        settings: Settings of the training.
-
-    Returns:
-        Optimizer of all parameters of the network.
     """
     if settings.optimizer == "sgd":
         return torch.optim.SGD(
@@ -114,13 +91,8 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
 
 
 def last_layer(network: nn.Module) -> str:
-    """Return the name of the last layer that learns: the module that has the last such parameter.
-
-    Args:
-        network: Network with parameters that are not frozen.
-
-    Returns:
-        Name, such as "head.fc". Empty if the network itself is the layer.
+    """Return the name of the last layer that learns: the module that has the last such
+    parameter.
     """
     names = [name for name, parameter in network.named_parameters() if parameter.requires_grad]
     return _module_of(names[-1])
@@ -132,14 +104,6 @@ def _last_called_layer(network: nn.Module, size: int) -> str:
     The order of the calls may differ from the order of the parameters, which is
     that of the definitions. Normalizations and activations with parameters do not
     count, unless a network has no other layer.
-
-    Args:
-        network: Network with parameters.
-        size: Pixels per side of its images.
-
-    Returns:
-        Name of the layer. A network of TorchScript or torch.export calls no
-        modules, so it is the module that has the last parameter.
     """
     called: list[tuple[bool, str]] = []
     hooks = []
@@ -164,18 +128,7 @@ def _module_of(parameter: str) -> str:
 
 
 def freeze(network: nn.Module, stage: str, size: int) -> None:
-    """Freeze the parameters of a network from its first parameter to the last one of a module.
-
-    Args:
-        network: Network, which is changed.
-        stage: Name of the module, such as "blocks.5". "all_but_last" freezes all
-            parameters but those of the layer that the network calls last.
-        size: Pixels per side of the images of the network.
-
-    Raises:
-        InputError: If there is no module of this name, or if it has no
-            parameters.
-    """
+    """Freeze the parameters of a network from its first parameter to the last one of a module."""
     if next(network.parameters(), None) is None:
         raise InputError("the network has no parameters: give a network that can be trained")
     if stage == ALL_BUT_LAST:
@@ -201,11 +154,6 @@ def set_training_mode(network: nn.Module, settings: TrainSettings) -> None:
 
     Modules of frozen parameters stay in evaluation mode, so that the statistics
     of their batch normalization do not change either.
-
-    Args:
-        network: Network, which is changed.
-        settings: Settings of the training. With `eval_mode`, the whole network
-            is put in evaluation mode.
     """
     network.train(not settings.eval_mode)
     for module in network.modules():
@@ -214,26 +162,15 @@ def set_training_mode(network: nn.Module, settings: TrainSettings) -> None:
             module.eval()
 
 
-def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Tensor) -> float:
+def scale_learning_rate(
+    settings: TrainSettings, network: nn.Module, images: Float[Tensor, "N 3 H W"]
+) -> float:
     """Adapt the learning rate of the last layer to the norm of its features.
 
     A step with a clipped gradient changes the weights of the layer by at most
     the learning rate. It then changes a logit by at most the learning rate
     times the norm of the features. With the adapted rate, this product is the
     same for all networks.
-
-    Args:
-        settings: Settings of the training.
-        network: Network from images in [0, 1] to logits.
-        images: Some images of the training in [0, 1], shape (N, 3, H, W).
-
-    Returns:
-        The learning rate. It is not changed if more than the last layer learns,
-        or if `settings.feature_norm` is None.
-
-    Raises:
-        InputError: If all features are 0, if the network returns NaN, or if its
-            last layer has no features or no gradients.
     """
     if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
@@ -248,7 +185,7 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
     return settings.learning_rate * settings.feature_norm / norm
 
 
-def feature_norm(network: nn.Module, images: Tensor) -> float:
+def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
     """Compute the root mean square norm of the features that the last layer of a network gets.
 
     For a linear layer, the features of an image are the gradient of a logit with
@@ -256,16 +193,6 @@ def feature_norm(network: nn.Module, images: Tensor) -> float:
     a convolution whose outputs are averaged, as in SqueezeNet, it is the mean of
     the features over the positions. The gradient also exists for networks of
     TorchScript and torch.export, in which no hook can read the features.
-
-    Args:
-        network: Network from images in [0, 1] to logits. Its last layer must
-            require gradients.
-        images: Images in [0, 1], shape (N, 3, H, W).
-
-    Example:
-        >>> network = nn.Sequential(nn.Flatten(), nn.Linear(12, 2))
-        >>> round(feature_norm(network, torch.full((5, 3, 2, 2), 0.5)), 3)
-        1.732
     """
     name = last_layer(network)
     layer = network.get_submodule(name)

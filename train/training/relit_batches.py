@@ -3,6 +3,7 @@
 import math
 
 import torch
+from jaxtyping import UInt8
 from torch import Tensor, nn
 
 from augment import distributed
@@ -35,33 +36,17 @@ class RelitBatches:
         teacher: nn.Module | None,
         seed: int,
     ):
-        """Store the arguments.
-
-        Args:
-            settings: Settings of the training.
-            model: Network in training, which the gradient descent attacks.
-            teacher: Network before the training. The attack leads away from the
-                class that it predicts for the image without the projector. None if
-                the factors are random.
-            seed: Seed of the run.
-        """
+        """Store the arguments."""
         self._radius = math.log(settings.relight_gain)
         self._steps = settings.relight_steps
         self._model = model
         self._teacher = teacher
         self._seed = seed
 
-    def apply(self, images: Tensor, labels: Tensor, step: int) -> Tensor:
-        """Show the images of a batch in the light of a projector, each in a light of its own.
-
-        Args:
-            images: Images, uint8, shape (B, 3, size, size).
-            labels: Not used. All augmentations are called with labels.
-            step: Number of the training step in the run.
-
-        Returns:
-            Relit images, uint8, shape (B, 3, size, size).
-        """
+    def apply(
+        self, images: UInt8[Tensor, "B 3 size size"], labels: Tensor, step: int
+    ) -> UInt8[Tensor, "B 3 size size"]:
+        """Show the images of a batch in the light of a projector, each in a light of its own."""
         # The random numbers differ between steps, and between the processes of a run.
         draws = generator(self._seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape

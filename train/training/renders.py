@@ -28,20 +28,7 @@ def build_service(
     data: DataSet,
     device: torch.device,
 ) -> AugmentationService:
-    """Build the service that renders the training images of a run anew in each round.
-
-    Args:
-        settings: Settings of the run.
-        data: Data of the run. The renders are labeled with its classes.
-        device: Device that renders.
-
-    Returns:
-        The service. It has no images if the run trains without renders.
-
-    Raises:
-        InputError: If a mesh, a background, a light or a class does not exist, or if the network
-            has only positive classes although some renders are of no class.
-    """
+    """Build the service that renders the training images of a run anew in each round."""
     scene: Scene | None = None
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64, device=device)
@@ -98,12 +85,6 @@ def _build_scene(
 
     If the run has several processes, the first one builds the scene before the
     others, which then find its files.
-
-    Args:
-        settings: Settings of the run.
-        size: Pixels per side of the renders.
-        device: Device that renders.
-        phases: Clock that measures the time of the phase "operators".
     """
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
@@ -127,16 +108,7 @@ def _build_scene(
 
 
 def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | int, int]:
-    """Return the index of each class that a mesh or a hard negative of a run has.
-
-    Args:
-        settings: Settings of the run, with its meshes and hard negatives.
-        data: Data of the run, with the list of all classes.
-
-    Returns:
-        Index in the list of classes by the name of the class. The class "other",
-        which no network has, is left out.
-    """
+    """Return the index of each class that a mesh or a hard negative of a run has."""
     indices: dict[str | int, int] = {}
     for key, item in settings.objects.items():
         if item.label != OTHER:
@@ -145,20 +117,7 @@ def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | in
 
 
 def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, Tensor]:
-    """Load images that are used as renders from the folder in the setting `augment.folder`.
-
-    Args:
-        settings: Settings of the run.
-        data: Data of the run. The sub-folders have the names of its classes. Sub-folders of other
-            names hold negatives.
-
-    Returns:
-        Pair of the images, uint8, shape (N, 3, size, size), and their labels, shape (N,). A label
-        is the index of a class, or the complementary label of a negative.
-
-    Raises:
-        InputError: If the folder cannot be read, or if it has no image of a positive class.
-    """
+    """Load images that are used as renders from the folder in the setting `augment.folder`."""
     folder = Path(str(settings.augment.folder))
     positive_classes = label_names(settings.label)
     label_of_class = {name: index for index, name in enumerate(data.classes)}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -97,16 +98,7 @@ class Run:
         initial: Initial | None = None,
         command: str = "",
     ):
-        """Store the arguments. The method `load` checks them.
-
-        Args:
-            settings: Settings of the run.
-            data: Data set of the run.
-            folder: Folder to which the run writes its files.
-            initial: Network with whose weights the run begins. None for random
-                weights.
-            command: Command line that started the run, which config.yaml records.
-        """
+        """Store the arguments. The method `load` checks them."""
         self.settings = settings
         self.data = data
         self.folder = folder
@@ -122,12 +114,7 @@ class Run:
         self._initial_predictions: Tensor | None = None
 
     def load(self) -> None:
-        """Check all inputs and build the network. If the run is resumed, restore its checkpoint.
-
-        Raises:
-            InputError: If the settings, the data, the folder or its checkpoint
-                are wrong.
-        """
+        """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
         settings = self.settings
         # Labels of the data become indices into the classes of the network.
         self.data = _relabel(settings, self.data, self.initial)
@@ -196,12 +183,7 @@ class Run:
             self.trainer.fit(split, self.held_out, self.log)
 
     def score(self) -> dict[str, float]:
-        """Score the network that the training selected, on the test images and on photographs.
-
-        Returns:
-            The final scores by name. They are also written to the last line of
-            metrics.jsonl.
-        """
+        """Score the network that the training selected, on the test images and on photographs."""
         trainer = self.trainer
         self._scores |= self._test_scores()
         if self._initial_predictions is not None and CLASSIFIER in trainer.architecture:
@@ -240,16 +222,7 @@ class Run:
             console.info("it needs images with normalized light: normalize_light=%s", given)
 
     def _require_folder(self) -> DictConfig | None:
-        """Check that the run may write to its folder.
-
-        Returns:
-            Settings of the earlier run in the folder if it is resumed. None for
-            a new run.
-
-        Raises:
-            InputError: If the folder has a checkpoint of an earlier run, and the
-                settings neither resume this run nor permit to overwrite it.
-        """
+        """Check that the run may write to its folder."""
         resumes = self.settings.train.resume
         overwrites = self.settings.overwrite and not resumes
         if overwrites or not checkpoint.exists(self.folder):
@@ -267,12 +240,6 @@ class Run:
 
         The number changes the last bits of the results, so a resumed run keeps
         its number of threads.
-
-        Args:
-            earlier: Settings of the run that is resumed. None for a new run.
-
-        Returns:
-            The number. None if neither gives one.
         """
         given = self.settings.train.threads
         if given or earlier is None:
@@ -285,9 +252,6 @@ class Run:
         """Warn if a resumed run has another number of epochs, and so another learning rate.
 
         The schedule of the learning rate extends over all epochs.
-
-        Args:
-            planned: Number of epochs in the settings of the earlier run.
         """
         # The trainer may have adapted the learning rate to the network.
         settings = self.trainer.settings
@@ -326,9 +290,6 @@ class Run:
 
         If the data have no labels, the predictions of the initial network become
         their labels.
-
-        Args:
-            model: The initial network.
         """
         settings = self.settings
         # The logits of a network with code of the user are not cached, because this
@@ -353,16 +314,11 @@ class Run:
             self._score_photographs(cached_model, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
 
-    def _label_with(self, model: Model, test_predictions: Tensor) -> None:
+    def _label_with(self, model: Model, test_predictions: Float[Tensor, " N"]) -> None:
         """Label the validation and test images with the predictions of the initial network.
 
         The training images need no labels, because the loss computes these
         predictions itself.
-
-        Args:
-            model: The initial network.
-            test_predictions: Class that it predicts for each test image, shape
-                (N,).
         """
         labels = self.data.train.labels.clone()
         validation = self.data.train[self.held_out]
@@ -391,16 +347,8 @@ class Run:
                 return
         self.scored_folders = {LABORATORY: folder}
 
-    def _predict_classes(self, model: Model, split: Split) -> Tensor:
-        """Predict the class of each image of a split.
-
-        Args:
-            model: Network, from images in [0, 1] to logits.
-            split: N images.
-
-        Returns:
-            Index of the class with the largest logit, int64, shape (N,).
-        """
+    def _predict_classes(self, model: Model, split: Split) -> Int[Tensor, " N"]:
+        """Predict the class of each image of a split."""
         batches = torch.arange(len(split)).split(BATCH)
         class_count = len(self.trainer.architecture["classes"])
         classes = []
@@ -413,15 +361,6 @@ class Run:
         """Measure the test accuracy of the network in best.pt, and of the one after the last epoch.
 
         Afterwards, `self.trainer.selected` has the weights in best.pt.
-
-        Returns:
-            Mapping with these keys:
-
-            - "test/accuracy": accuracy of the network in best.pt;
-            - "test/epoch": epoch of this network;
-            - "test/accuracy_last": accuracy of the network after the last epoch;
-            - "test/interpolation": factor of the interpolation between the
-              initial and the trained weights, if they were interpolated.
         """
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
@@ -450,16 +389,7 @@ class Run:
         return scores
 
     def _interpolate(self, best: dict[str, Any]) -> dict[str, Any]:
-        """Interpolate between the weights before and after the training, and write best.pt.
-
-        Args:
-            best: Content of best.pt.
-
-        Returns:
-            New content of best.pt, with interpolated weights and their factor.
-            `best` itself if it has interpolated weights already, because an
-            earlier process of the run was stopped after this step.
-        """
+        """Interpolate between the weights before and after the training, and write best.pt."""
         trainer = self.trainer
         if INTERPOLATION in best or trainer.initial is None:
             return best
@@ -478,17 +408,8 @@ class Run:
             checkpoint.save(self.folder / checkpoint.BEST, interpolated)
         return interpolated
 
-    def _agreement(self, initial_predictions: Tensor) -> float:
-        """Measure for which fraction of the test images training did not change the prediction.
-
-        Args:
-            initial_predictions: Class that the network before the training
-                predicts for each test image, shape (N,).
-
-        Returns:
-            Fraction of the test images for which the selected network predicts
-            the same class, in [0, 1].
-        """
+    def _agreement(self, initial_predictions: Float[Tensor, " N"]) -> float:
+        """Measure for which fraction of the test images training did not change the prediction."""
         # The predictions of the initial network serve as labels of data without labels. The
         # test accuracy then is this fraction.
         agreement = self._scores["test/accuracy"]
@@ -509,19 +430,6 @@ class Run:
 
         All predictions are compared with those of the initial network for the
         images without a projector.
-
-        Args:
-            initial: Network before the training.
-
-        Returns:
-            Fractions of the test images for which the same class is predicted:
-
-            - "test/agreement": by the selected network, for the images without a
-              projector;
-            - "test/relit_agreement_before": by the initial network, for the
-              images in the light of a projector;
-            - "test/relit_agreement_after": by the selected network, for the
-              images in the light of a projector.
         """
         test = self.data.test
         targets = predict(initial, test)
@@ -538,17 +446,7 @@ class Run:
         return scores
 
     def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
-        """Score a network on a folder of photographs, and write the scores.
-
-        Args:
-            model: Network, from images in [0, 1] to logits.
-            name: Name of the folder of photographs in `self.scored_folders`.
-            folder: The scores are written to the sub-folder `name` of this
-                folder.
-
-        Returns:
-            The scores.
-        """
+        """Score a network on a folder of photographs, and write the scores."""
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),
             folder=self.scored_folders[name],
@@ -559,20 +457,7 @@ class Run:
 
 
 def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
-    """Load several runs before the first one is trained, so that mistakes are reported at once.
-
-    Args:
-        methods: Settings of each run by its folder. All runs have the same data
-            set and the same initial network.
-        command: Command line that started the runs, which each run records.
-
-    Returns:
-        The runs. `Run.fit` is the next call.
-
-    Raises:
-        InputError: If the data set, the initial network, the settings or a
-            folder cannot be used.
-    """
+    """Load several runs before the first one is trained, so that mistakes are reported at once."""
     data, initial = load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
     for run in runs:
@@ -593,10 +478,6 @@ def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
     """Raise InputError if the setting `label` is the index of a class instead of its name.
 
     The sub-folders of photographs have names of classes, and no indices.
-
-    Args:
-        settings: Settings of the run.
-        data: Data set with the names of the classes.
     """
     for label in label_names(settings.label):
         name = class_name(data.classes, label, "label")
@@ -608,19 +489,6 @@ def _relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | Non
     """Convert the labels of the data to indices into the classes of the network.
 
     A data set and the initial network can have different lists of classes.
-
-    Args:
-        settings: Settings of the run.
-        data: Data set as it was loaded.
-        initial: Network with whose weights the run begins. None for random
-            weights. The network then has the classes of the data.
-
-    Returns:
-        Copy of the data set with the classes of the network.
-
-    Raises:
-        InputError: If the data have no labels and the run has no network to
-            imitate, or if the network lacks a class of the data.
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
@@ -642,22 +510,7 @@ def build_trainer(
     validation: ValidationPart,
     threads: int | None,
 ) -> Trainer:
-    """Build the network, the optimizer and the scene of a run. No file is written.
-
-    Args:
-        settings: Settings of the run.
-        data: Data set, labeled with the classes of the network.
-        folder: Folder of the run.
-        initial: Network with whose weights the run begins. None for random weights.
-        validation: Choice of the validation images. Its record is stored with the network.
-        threads: Number of CPU threads. None to choose it by `choose_threads`.
-
-    Returns:
-        The trainer. `Trainer.fit` is the next call.
-
-    Raises:
-        InputError: If the network, the renders or the initial weights do not fit together.
-    """
+    """Build the network, the optimizer and the scene of a run. No file is written."""
     keys = keys_of("train", settings.train)
     with keyed(**keys):
         device = choose_device(settings.train.device)
@@ -710,18 +563,7 @@ def build_trainer(
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
-    """Return the arguments of `build_network` that choose the architecture of a run.
-
-    Args:
-        settings: Settings of the run. They choose the architecture unless the
-            run begins with a classifier of the user.
-        initial: Network with whose weights the run begins. None for random
-            weights.
-
-    Raises:
-        InputError: If the settings choose another architecture than that of the
-            classifier.
-    """
+    """Return the arguments of `build_network` that choose the architecture of a run."""
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:
         return shape
@@ -736,16 +578,7 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
 
 
 def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """Describe in words what the test accuracy of a run is measured on.
-
-    Args:
-        settings: Settings of the run.
-        data: Data set of the run. It may have fewer classes than the network.
-
-    Returns:
-        Text such as "the test images of cifar100", or "rendered solids of 5 of
-        the network's 1000 classes".
-    """
+    """Describe in words what the test accuracy of a run is measured on."""
     if not data.labeled:
         return f"the predictions of {settings.train.init_from} for held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
@@ -758,17 +591,7 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
 
 
 def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
-    """List the metrics on a folder of photographs under their names in metrics.jsonl.
-
-    Args:
-        name: Name of the folder of photographs, such as "photographs".
-        scores: Scores on these photographs.
-
-    Returns:
-        Values of the known metrics by names such as "photographs/auc". If there
-        are several positive classes, there are also names such as
-        "photographs/orange/auc".
-    """
+    """List the metrics on a folder of photographs under their names in metrics.jsonl."""
     metrics_by_prefix = {name: scores.overall}
     for label, metrics in scores.by_label.items():
         metrics_by_prefix[f"{name}/{label}"] = metrics

@@ -7,6 +7,7 @@ them once saves one of two forward passes.
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.model_passes import eval_mode
@@ -28,12 +29,7 @@ class SharedTeacher(nn.Module):
     """
 
     def __init__(self, pupil: MixedPrecision, teacher: MixedPrecision):
-        """Store what the last layer of the pupil, the network in training, gets as its input.
-
-        Args:
-            pupil: Network in training. A hook on its last layer stores the input.
-            teacher: Copy of the network before the training.
-        """
+        """Store what the last layer of the pupil, the network in training, gets as its input."""
         super().__init__()
         name = last_layer(pupil.network)
         self.layer = teacher.network.get_submodule(name)
@@ -52,23 +48,13 @@ class SharedTeacher(nn.Module):
         self._hook.remove()
 
     def _store_features(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        """Store the input of the last layer of the pupil. torch calls this hook before the layer.
-
-        Args:
-            inputs: Arguments of the layer. The first one has the features.
+        """Store the input of the last layer of the pupil. torch calls this hook before the
+        layer.
         """
         self._features = inputs[0].detach()
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of the teacher for the last images of the network in training.
-
-        Args:
-            images: The images with which the network in training (the pupil) was
-                called last, shape (B, 3, H, W).
-
-        Returns:
-            Logits, shape (B, classes).
-        """
+    def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B classes"]:
+        """Return the logits of the teacher for the last images of the network in training."""
         is_mixed = self._dtype != torch.float32
         with torch.autocast(images.device.type, self._dtype, enabled=is_mixed):
             return self.layer(self._features).float()
@@ -77,19 +63,7 @@ class SharedTeacher(nn.Module):
 def share_layers(
     settings: TrainSettings, pupil: MixedPrecision, teacher: MixedPrecision, size: int
 ) -> nn.Module:
-    """Return a teacher that shares layers with its pupil, if that does not change its logits.
-
-    Args:
-        settings: Settings of the training.
-        pupil: Network in training.
-        teacher: Copy of the network before the training, in evaluation mode.
-        size: Pixels per side of the images.
-
-    Returns:
-        A `SharedTeacher` if only the last layer of the pupil changes in the
-        training, and if the logits of both teachers are equal for two test
-        images. Otherwise `teacher`.
-    """
+    """Return a teacher that shares layers with its pupil, if that does not change its logits."""
     # The features would depend on the statistics of the batch in training mode.
     is_frozen = settings.freeze == ALL_BUT_LAST and settings.eval_mode
     # `SharedTeacher` registers a hook, which modules of TorchScript do not support.

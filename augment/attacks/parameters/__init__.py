@@ -25,17 +25,7 @@ if TYPE_CHECKING:
 
 
 def parameter_class(name: str) -> type[Parameter]:
-    """Return the class of a quantity that an attack changes.
-
-    Args:
-        name: Name of the quantity, such as "pose".
-
-    Returns:
-        The class, such as `Pose`. For a projector or lamps, it is `LocalLight`.
-
-    Raises:
-        InputError: If there is no such quantity.
-    """
+    """Return the class of a quantity that an attack changes."""
     require_choice("name", name, PARAMETER_NAMES)
     if name in LOCAL_LIGHTS:
         return LocalLight
@@ -45,23 +35,7 @@ def parameter_class(name: str) -> type[Parameter]:
 
 
 def make_parameter(name: str, scene: Scene, settings: StepSettings, **options: Any) -> Parameter:
-    """Create an attack parameter by its name.
-
-    Args:
-        name: Name of the parameter, such as "pose".
-        scene: Scene to attack.
-        settings: Norm-ball, steps and units of the attack. Their class is the
-            type of the field of `ParameterSettings` with this name.
-        options: Further arguments of the constructor of the parameter, such as
-            `nonnegative` of `Lighting`.
-
-    Returns:
-        The parameter.
-
-    Raises:
-        InputError: If there is no such parameter, or if the scene lacks what
-            the parameter changes, such as lamps.
-    """
+    """Create an attack parameter by its name."""
     if name in LOCAL_LIGHTS:
         return LocalLight(scene, settings, name)
     constructor: Callable[..., Parameter] = parameter_class(name)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.parameters.mesh_parameter import MeshParameter
@@ -26,17 +27,8 @@ class Albedo(MeshParameter):
     def __init__(self, scene: Scene, settings: StepSettings):
         super().__init__(scene, settings, [item.own_faces for item in scene.objects])
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with a color offset for each face.
-
-        Args:
-            values: Linear RGB offsets of the F faces of the largest mesh in each of A examples,
-                shape (A, 3 F).
-            conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions with the offsets, differentiable with respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A 3*F"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with a color offset for each face."""
         return replace(conditions, albedo=self.offsets(values, examples))

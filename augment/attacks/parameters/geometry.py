@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.parameters.mesh_parameter import MeshParameter
@@ -31,19 +32,10 @@ class Geometry(MeshParameter):
         self._object_of = scene.object_of
         super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with displaced vertices.
-
-        Args:
-            values: Displacements of the N vertices of the largest mesh in each of A examples, in
-                world units, shape (A, 3 N).
-            conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions with the vertices, differentiable with respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A 3*N"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with displaced vertices."""
         # Vertices before the attack, shape (A, N, 3).
         vertices = self._vertices[self._object_of[examples]]
         return replace(conditions, vertices=vertices + self.offsets(values, examples))

@@ -10,19 +10,10 @@ class LocalLight(LightParameter):
     """Attack on the RGB coefficients of a projector (its pixels) or of lamps (their powers).
 
     A coefficient lies between 0 and the power of the light.
-
-    Raises:
-        InputError: If the scene has no such light.
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
-        """Find the light among the local lights of the scene.
-
-        Args:
-            scene: Scene to attack.
-            settings: Norm-ball and steps of the attack.
-            name: Kind of light: "projector" or "lamps".
-        """
+        """Find the light among the local lights of the scene."""
         self.name = name
         for rows, basis in scene.basis.local_lights:
             if basis.name == name:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -50,12 +51,7 @@ class Material(Parameter):
     fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: MaterialSettings):
-        """Read the units, and the materials at which the attack starts.
-
-        Args:
-            scene: Scene to attack.
-            settings: Norm-ball, steps and units of the attack.
-        """
+        """Read the units, and the materials at which the attack starts."""
         self._object_of = scene.object_of
         self._read_materials(scene)
 
@@ -87,11 +83,7 @@ class Material(Parameter):
         )
 
     def _read_materials(self, scene: Scene) -> None:
-        """Keep the materials of the objects of a scene before the attack.
-
-        Args:
-            scene: Scene to attack.
-        """
+        """Keep the materials of the objects of a scene before the attack."""
         self._face_count = max(len(item.mesh.faces) for item in scene.objects)
         materials = [initial_materials(item) for item in scene.objects]
         averages = [material.average() for material in materials]
@@ -107,22 +99,10 @@ class Material(Parameter):
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with the given gloss and hue of the objects.
-
-        Args:
-            values: Attack values of A examples, shape (A, 4). The columns are
-                the average roughness, metallic factor and specular factor, and
-                the rotation of the hue. Each is divided by its unit in the
-                settings.
-            conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions with the gloss and the hue of each face, differentiable
-            with respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A 4"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with the given gloss and hue of the objects."""
         if self.used_mask is not None:
             # Values that are not attacked keep their start.
             values = torch.where(self.used_mask[examples], values, self.start[examples])
@@ -137,17 +117,10 @@ class Material(Parameter):
     def _with_gloss(
         self,
         conditions: Conditions,
-        average_gloss: Tensor,
-        objects: Tensor,
+        average_gloss: Float[Tensor, "A 3"],
+        objects: Int[Tensor, " A"],
     ) -> Conditions:
-        """Return a copy of the conditions with another average gloss of the objects.
-
-        Args:
-            conditions: Light, shape and colors of the A examples.
-            average_gloss: New averages of roughness, metallic and specular
-                factor over the faces of the object of each example, shape (A, 3).
-            objects: Index of the object of each example, shape (A,).
-        """
+        """Return a copy of the conditions with another average gloss of the objects."""
         # Change of the averages of each example, shape (A, 3).
         change = average_gloss - self._average_gloss[objects]
         # The mask is 1 for faces of the object itself and 0 for faces of props and table. One
@@ -155,14 +128,10 @@ class Material(Parameter):
         face_change = change[:, None] * self._object_mask[objects][..., None]
         return replace(conditions, gloss=(self._face_gloss[objects] + face_change).clamp(0, 1))
 
-    def _with_hue(self, conditions: Conditions, angle: Tensor, objects: Tensor) -> Conditions:
-        """Return a copy of the conditions in which the hue of the objects is rotated.
-
-        Args:
-            conditions: Light, shape and colors of the A examples.
-            angle: Rotation angles in degrees, shape (A, 1).
-            objects: Index of the object of each example, shape (A,).
-        """
+    def _with_hue(
+        self, conditions: Conditions, angle: Float[Tensor, "A 1"], objects: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions in which the hue of the objects is rotated."""
         hue = (angle * self._object_mask[objects]).expand(-1, self._face_count)
         albedo_offset = conditions.albedo
         if albedo_offset is None:
@@ -170,27 +139,13 @@ class Material(Parameter):
             albedo_offset = angle.new_zeros(len(angle), self._face_count, 3)
         return replace(conditions, hue=hue, albedo=albedo_offset)
 
-    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest values whose gloss the renderer can show.
-
-        Args:
-            values: Roughness, metallic factor, specular factor and rotation of the
-                hue, each divided by its unit in the settings, shape (A, 4).
-            within: Norm-ball that must contain the result, or None.
-
-        Returns:
-            Feasible values, shape (A, 4).
-        """
+    def project_feasible(
+        self, values: Float[Tensor, "A 4"], within: Ball | None = None
+    ) -> Float[Tensor, "A 4"]:
+        """Find the nearest values whose gloss the renderer can show."""
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
 
 
-def _stack_padded(tensors: list[Tensor]) -> Tensor:
-    """Stack tensors of several objects, and append zeros to those of objects with fewer faces.
-
-    Args:
-        tensors: One tensor for each object, shape (faces of the object, ...).
-
-    Returns:
-        Stacked tensors, shape (objects, faces of the largest object, ...).
-    """
+def _stack_padded(tensors: list[Tensor]) -> Float[Tensor, "objects _ ..."]:
+    """Stack tensors of several objects, and append zeros to those of objects with fewer faces."""
     return pad_sequence(tensors, batch_first=True)

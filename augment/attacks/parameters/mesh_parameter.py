@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -22,15 +23,7 @@ class MeshParameter(Parameter):
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
-        """Find the values that each example uses.
-
-        Args:
-            scene: Scene to attack.
-            settings: Norm-ball and steps of the attack.
-            object_masks: One mask for each object of the scene. It marks the
-                vertices or faces of the mesh that belong to the object itself, not
-                to its props or table, shape (number of vertices or faces,).
-        """
+        """Find the values that each example uses."""
         # One row for each object, one column for each of the N vertices or faces of the largest
         # mesh. Rows of smaller meshes end with False.
         masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)
@@ -40,19 +33,10 @@ class MeshParameter(Parameter):
         start = scene.lights.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
 
-    def offsets(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Reshape the attack values to one vector for each vertex or face.
-
-        Args:
-            values: Attack values of A examples, three for each vertex or face,
-                shape (A, 3 N).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Offset of each of the N vertices or faces, shape (A, N, 3). It is
-            zero if its values are not used.
-        """
+    def offsets(
+        self, values: Float[Tensor, "A 3*N"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A N 3"]:
+        """Reshape the attack values to one vector for each vertex or face."""
         if self.used_mask is not None:
             values = values * self.used_mask[examples]
         return values.unflatten(1, (-1, 3))

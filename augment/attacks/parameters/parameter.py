@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.norm_ball import project, sample, take_step, unconstrained
@@ -51,75 +52,38 @@ class Parameter(ABC):
             self.used_mask = None
 
     @abstractmethod
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
         """Return a copy of the conditions in which this quantity has the given values.
 
         Conditions are the light, shape and colors with which examples are
         rendered.
-
-        Args:
-            values: D values of the quantity in each of A examples, shape (A, D).
-            conditions: Conditions of the A examples. Other parameters may have
-                changed them already.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions of the A examples, differentiable with respect to the
-            values.
         """
 
-    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest feasible values. By default, all values are feasible.
-
-        Args:
-            values: D values in each of A examples, shape (A, D).
-            within: Norm-balls that must contain the result, with feasible
-                centers. None for no norm-balls.
-
-        Returns:
-            Feasible values, shape (A, D), nearest in the Euclidean sense.
-        """
+    def project_feasible(
+        self, values: Float[Tensor, "A D"], within: Ball | None = None
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest feasible values. By default, all values are feasible."""
         return unconstrained(values, within)
 
     def take_step(
         self,
-        values: Tensor,
-        gradient: Tensor,
-        examples: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        """Take a step of projected gradient descent.
-
-        Args:
-            values: D values in each of A examples, shape (A, D).
-            gradient: Gradient of the cost with respect to the values,
-                shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-            length: Factor of the step of each example, shape (A, 1).
-
-        Returns:
-            Values after the step, which are feasible and lie in the norm-balls,
-            shape (A, D).
-        """
+        values: Float[Tensor, "A D"],
+        gradient: Float[Tensor, "A D"],
+        examples: Int[Tensor, " A"],
+        length: Float[Tensor, "A 1"],
+    ) -> Float[Tensor, "A D"]:
+        """Take a step of projected gradient descent."""
         center = self.start[examples]
         return take_step(self.settings, values, gradient, center, self.project_feasible, length)
 
-    def search_scale(self, examples: Tensor) -> Tensor:
+    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Return how much a search without gradients should change each value at first.
 
         With the norm "l2", a random change is about as long as the radius. With
         the norm "linf", it changes each value by about half the radius. Without
         a radius, `STEPS_OF_SEARCH` times the step size takes its place.
-
-        Args:
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Standard deviation of the random changes of each value, shape (A, D).
-            It is 0 for values that have no effect.
         """
         settings = self.settings
         center = self.start[examples]
@@ -140,52 +104,30 @@ class Parameter(ABC):
         used_count = used.sum(1, keepdim=True)
         return length * used / used_count.clamp(min=1).sqrt()
 
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Find the nearest values that are feasible and lie in the norm-balls around the start.
-
-        Args:
-            values: D attacked values of each of A examples, shape (A, D).
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Projected values, shape (A, D).
-        """
+    def project(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest values that are feasible and lie in the norm-balls around the start."""
         return project(self.settings, values, self.start[examples], self.project_feasible)
 
-    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+    def sample(
+        self, generator: torch.Generator, reached: Float[Tensor, "E D"] | None = None
+    ) -> Float[Tensor, "E D"]:
         """Draw random feasible values for all E examples.
 
         With a radius, values are drawn uniformly from the norm-balls and then
         projected onto the feasible values. Without a radius, they are drawn in
         random directions, as far from the start as the values of an attack.
-
-        Args:
-            generator: CPU generator of the random numbers.
-            reached: D values in each example at the end of an attack, shape
-                (E, D). Needed only without a radius.
-
-        Returns:
-            Random values, shape (E, D).
-
-        Raises:
-            InputError: If there is neither a radius nor `reached`.
         """
         if self.settings.radius is None and reached is not None:
             return self._sample_as_far_as(reached, generator)
         drawn = sample(self.settings, self.start, generator, self.used_mask)
         return project(self.settings, drawn, self.start, self.project_feasible)
 
-    def _sample_as_far_as(self, reached: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw feasible values in random directions from the start of each example.
-
-        Args:
-            reached: Values whose distance from the start the drawn values get, shape (E, D).
-            generator: CPU generator of the random numbers.
-
-        Returns:
-            Random values, shape (E, D).
-        """
+    def _sample_as_far_as(
+        self, reached: Float[Tensor, "E D"], generator: torch.Generator
+    ) -> Float[Tensor, "E D"]:
+        """Draw feasible values in random directions from the start of each example."""
         direction = torch.randn(reached.shape, generator=generator).to(reached)
         if self.used_mask is not None:
             direction = direction * self.used_mask

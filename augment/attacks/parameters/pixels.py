@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
@@ -34,16 +35,8 @@ class Pixels(Parameter):
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
         super().__init__(settings, start)
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with an offset for each pixel value.
-
-        Args:
-            values: Offsets of all pixel values of the V images of each of A examples, shape
-                (A, V · 3 · size²).
-            conditions: Light, shape and colors of the A examples.
-            examples: Not used. All parameters have this argument.
-
-        Returns:
-            Conditions with the offsets, differentiable with respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A _"], conditions: Conditions, examples: Tensor
+    ) -> Conditions:
+        """Return a copy of the conditions with an offset for each pixel value."""
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))

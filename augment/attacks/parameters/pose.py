@@ -9,6 +9,7 @@ from itertools import chain
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -55,23 +56,13 @@ class Pose(Parameter):
     Joints rotate before the object does. If another parameter displaces the
     vertices, it does so before. An object with props or a table keeps standing
     on the same ground.
-
-    Raises:
-        InputError: If `ImageSettings.silhouettes` of the scene is False. Also
-            if an object has no skin or lacks a named joint, which
-            `joint_limits` finds.
     """
 
     name = "pose"
     fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: PoseSettings):
-        """Compute units and limits of the attack values.
-
-        Args:
-            scene: Scene to attack, with `ImageSettings.silhouettes`.
-            settings: Norm-ball, steps and units of the attack.
-        """
+        """Compute units and limits of the attack values."""
         if not scene.settings.silhouettes:
             raise InputError(
                 "silhouettes=False: set silhouettes=True, since an attack on the pose needs them",
@@ -94,10 +85,6 @@ class Pose(Parameter):
         Scale and distance are limited, so that the object and a perspective
         camera do not meet. The rotations of joints are at most 1, because their
         units are their limits. The other values have no limit.
-
-        Args:
-            scene: Scene to attack, with its cameras.
-            settings: Settings of the attack, with the largest shift.
         """
         all_cameras = chain.from_iterable(scene.cameras)
         cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
@@ -115,21 +102,10 @@ class Pose(Parameter):
         limit[JOINTS:] = 1.0
         return limit
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with moved objects and cameras.
-
-        Args:
-            values: D attack values of each of A examples: its pose, divided by
-                the units of the settings, shape (A, D).
-            conditions: Conditions of the A examples. If another parameter has
-                displaced the vertices, the displaced vertices are moved.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions with moved vertices and cameras, differentiable with
-            respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with moved objects and cameras."""
         objects = self._object_of[examples]
         changes = values * self._unit[objects]
         vertices = conditions.vertices
@@ -143,33 +119,15 @@ class Pose(Parameter):
             vertices = torch.stack(moved_vertices)
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
-    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest values at which object and camera do not meet and joints can rotate.
-
-        Args:
-            values: D attack values of each of A examples, shape (A, D). They are the pose of the
-                object and the camera, divided by the units of the settings.
-            within: Norm-ball that must contain the result, or None.
-
-        Returns:
-            Feasible values, shape (A, D).
-        """
+    def project_feasible(
+        self, values: Float[Tensor, "A D"], within: Ball | None = None
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest values at which object and camera do not meet and joints can rotate."""
         return nearest_in_box(values, -self._limit, self._limit, within)
 
 
-def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
-    """Return the units of the attack values of a pose.
-
-    Args:
-        settings: Settings of the attack, with the units.
-        item: Attacked object. Its skin has its joints.
-
-    Returns:
-        Units of the rotation vector in degrees (3 values), the shift in world
-        units (2), the logarithm of the scale (1), polar angle and azimuth of
-        the cameras in degrees (2), the logarithm of their distance (1), and a
-        rotation vector in degrees for each attacked joint (3 each), shape (D,).
-    """
+def _pose_units(settings: PoseSettings, item: SceneObject) -> Float[Tensor, " D"]:
+    """Return the units of the attack values of a pose."""
     units = [settings.rotation, settings.rotation, settings.rotation]
     units += [settings.shift, settings.shift]
     units += [math.log1p(settings.scale)]
@@ -181,12 +139,7 @@ def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
 
 
 def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObject]:
-    """Create a movable copy of each object of a scene, in the order of `scene.objects`.
-
-    Args:
-        scene: The attacked scene.
-        settings: Settings of the attack, with the joints to rotate.
-    """
+    """Create a movable copy of each object of a scene, in the order of `scene.objects`."""
     masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
     # One row for each object, one column for each of the N vertices of the largest mesh.
     object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
@@ -220,24 +173,15 @@ class _MovableObject:
             skin, or 0 if joints are not attacked.
     """
 
-    object_mask: Tensor
+    object_mask: Float[Tensor, " N"]
     ground_height: float | None
     skin: Skin | None
     rotated_joint_count: int
 
-    def move(self, vertices: Tensor, change: Tensor) -> Tensor:
-        """Move the object: rotate its joints, then scale, rotate and shift it.
-
-        Args:
-            vertices: Vertices of the object, its props and its table,
-                shape (N, 3).
-            change: Change of the pose in degrees, world units and logarithms,
-                in the order of the attack values of `Pose`, shape (D,).
-
-        Returns:
-            Vertices after the movement, shape (N, 3). Props and table do not
-            move. If the object stands on a ground, its lowest vertex stays on it.
-        """
+    def move(
+        self, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
+    ) -> Float[Tensor, "N 3"]:
+        """Move the object: rotate its joints, then scale, rotate and shift it."""
         bent = self._bend(vertices, change[JOINTS : JOINTS + 3 * self.rotated_joint_count])
         scaled = change[SCALE].exp() * bent
         rotated = scaled @ rotation_matrices(change[ROTATION]).T
@@ -249,15 +193,10 @@ class _MovableObject:
             moved = moved + lift * moved.new_tensor([0, 0, 1])
         return torch.where(self.object_mask[:, None], moved, bent)
 
-    def _bend(self, vertices: Tensor, joint_rotations: Tensor) -> Tensor:
-        """Rotate the J joints, and return all vertices after that, shape (N, 3).
-
-        Args:
-            vertices: Vertices of the object, its props and its table,
-                shape (N, 3).
-            joint_rotations: Rotation vectors of the joints in degrees, one
-                after the other, shape (3 J,).
-        """
+    def _bend(
+        self, vertices: Float[Tensor, "N 3"], joint_rotations: Float[Tensor, " 3*J"]
+    ) -> Tensor:
+        """Rotate the J joints, and return all vertices after that, shape (N, 3)."""
         if self.skin is None or not self.rotated_joint_count:
             return vertices
         # One rotation matrix for each joint, shape (J, 3, 3).
@@ -271,19 +210,7 @@ class _MovableObject:
 
 
 def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
-    """Return the largest rotation of each joint of an object, as an attack permits it.
-
-    Args:
-        settings: Settings of the attack, with the field `joints`.
-        item: Object, whose mesh has a skin with joints.
-
-    Returns:
-        Largest rotation of each joint of the skin about each axis, in degrees. The list is empty
-        if no joint is attacked.
-
-    Raises:
-        InputError: If the object has no skin, or lacks a joint that the settings name.
-    """
+    """Return the largest rotation of each joint of an object, as an attack permits it."""
     if not settings.joints:
         return []
     if item.mesh.skin is None:

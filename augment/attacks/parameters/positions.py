@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
@@ -17,20 +18,12 @@ class Positions(Parameter):
 
     Shadows are cast from the changed positions. The gradient treats shadows as
     fixed.
-
-    Raises:
-        InputError: If the scene has no lamps.
     """
 
     name = "positions"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        """Start at the positions of the lamps of the scene.
-
-        Args:
-            scene: Scene to attack.
-            settings: Norm-ball and steps of the attack.
-        """
+        """Start at the positions of the lamps of the scene."""
         light = scene.basis.movable_light
         if light is None:
             kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
@@ -43,16 +36,8 @@ class Positions(Parameter):
         positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with moved lamps.
-
-        Args:
-            values: x, y and z of the L lamps in each of A examples, in world units, shape
-                (A, 3 L).
-            conditions: Light, shape and colors of the A examples.
-            examples: Not used. All parameters have this argument.
-
-        Returns:
-            Conditions with the positions, differentiable with respect to the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A 3*L"], conditions: Conditions, examples: Tensor
+    ) -> Conditions:
+        """Return a copy of the conditions with moved lamps."""
         return replace(conditions, positions=values.unflatten(1, (-1, 3)))

@@ -4,6 +4,7 @@ import math
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.parameters.light_parameter import environment_light, replace_light
@@ -43,13 +44,7 @@ class Skylight(Parameter):
     name = "skylight"
 
     def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
-        """Compute the initial sky and its brightness.
-
-        Args:
-            scene: Scene to attack.
-            settings: Norm-ball, steps and initial sky of the attack.
-            nonnegative: Whether radiance must not be negative in any direction.
-        """
+        """Compute the initial sky and its brightness."""
         self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
@@ -68,20 +63,10 @@ class Skylight(Parameter):
         start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
         super().__init__(settings, start=start.expand(len(scene), -1))
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """Return a copy of the conditions with the sky in place of the environment lighting.
-
-        Args:
-            values: Zenith angle, azimuth and turbidity of each of A examples,
-                divided by their units, shape (A, 3).
-            conditions: Light, shape and colors of the A examples.
-            examples: Index of each of the A examples, which are objects with their views, in the
-                scene, shape (A,).
-
-        Returns:
-            Conditions with the light of the sky, differentiable with respect to
-            the values.
-        """
+    def apply(
+        self, values: Float[Tensor, "A 3"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with the sky in place of the environment lighting."""
         # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
@@ -95,17 +80,10 @@ class Skylight(Parameter):
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
 
-    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest values for which the sky model is defined.
-
-        Args:
-            values: Zenith angle, azimuth and turbidity of each of A examples, divided by their
-                units, shape (A, 3).
-            within: Norm-ball that must contain the result, or None.
-
-        Returns:
-            Feasible values, shape (A, 3).
-        """
+    def project_feasible(
+        self, values: Float[Tensor, "A 3"], within: Ball | None = None
+    ) -> Float[Tensor, "A 3"]:
+        """Find the nearest values for which the sky model is defined."""
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY

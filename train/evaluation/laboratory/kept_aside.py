@@ -35,17 +35,6 @@ def kept_aside_settings(
 
     If a positive class is the name of a generated solid, new solids are
     generated. Otherwise the meshes of training are rendered in other lighting.
-
-    Args:
-        settings: Settings of the training run. The number of random setups of
-            light and camera, `evaluate.laboratory_setups`, is a multiple of the
-            number of projected patterns, 5.
-        classes: Names of the classes of the network.
-        size: Pixels per side of the renders.
-        out: Folder of the renders.
-
-    Returns:
-        Settings for `write_laboratory`.
     """
     labels = label_names(settings.label)
     meshes: list[Any] = []
@@ -74,11 +63,7 @@ def kept_aside_settings(
 
 
 def can_be_generated(label: str) -> bool:
-    """Return whether a class has generated solids.
-
-    Args:
-        label: Name of the class, such as "orange" or "golf ball".
-    """
+    """Return whether a class has generated solids."""
     name = _solid_name(label)
     return name in SOLIDS or name in HARD_NEGATIVES
 
@@ -89,29 +74,13 @@ def _solid_name(label: str) -> str:
 
 
 def _positives(settings: ExperimentSettings, label: str) -> list[Any]:
-    """Choose the objects of a positive class for the test renders.
-
-    Args:
-        settings: Settings of the training run, with its meshes.
-        label: Positive class.
-
-    Returns:
-        Settings of POSITIVE_COUNT generated solids, if there is a solid with
-        the name of the class. Otherwise settings of the meshes of this class
-        that the training uses.
-    """
+    """Choose the objects of a positive class for the test renders."""
     if can_be_generated(label):
         return _generated(_solid_name(label), label, POSITIVE_COUNT)
     return [asdict(item) for item in settings.objects.values() if item.label == label]
 
 
 def _generated(name: str, label: str, count: int) -> list[Any]:
-    """Return the settings of generated solids of the same kind with different seeds.
-
-    Args:
-        name: Name of the solid, such as "sweet_pepper".
-        label: Class of the objects.
-        count: Number of objects.
-    """
+    """Return the settings of generated solids of the same kind with different seeds."""
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     return [{"mesh": f"solid:{name}:{seed}", "label": label} for seed in seeds]

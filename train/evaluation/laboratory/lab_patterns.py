@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import map_coordinates
 from torch import Tensor
@@ -41,100 +42,40 @@ LINE_LENGTH = 24
 LINE_SPACING = 1.2
 
 
-def _solid(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light the whole image in the first color.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 everywhere.
-    """
+def _solid(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Light the whole image in the first color."""
     return patterns.solid(points)[None]
 
 
-def _gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a linear ramp along x, whose value at the center of the image is 0.5.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): from 0 to 1 along x.
-    """
+def _gradient(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw a linear ramp along x, whose value at the center of the image is 0.5."""
     return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
-def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw stripes along y with a random width and a random position.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the stripes, 0 between them.
-    """
+def _stripes(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw stripes along y with a random width and a random position."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
     bright_fraction = rng.uniform(0.3, 0.7)
     return patterns.stripes(scaled, shift, bright_fraction).double()[None]
 
 
-def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a checkerboard with a random size and a random position.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on every other square, 0 on the others.
-    """
+def _checkers(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw a checkerboard with a random size and a random position."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = torch.from_numpy(rng.uniform(size=2))
     return patterns.checkers(scaled, shift[:, None, None]).double()[None]
 
 
-def _half(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light the pixels on one side of a vertical line that crosses the object.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the lit side, 0 on the other side.
-    """
+def _half(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Light the pixels on one side of a vertical line that crosses the object."""
     line_x = rng.uniform(-0.12, 0.12)
     # `half` lights the points to the right of the line x = shift - 0.5.
     return patterns.half(points, shift=0.5 + line_x).double()[None]
 
 
-def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw discs at random places. All have one size and cover about half of the image.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the discs, 0 elsewhere.
-    """
+def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw discs at random places. All have one size and cover about half of the image."""
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
@@ -144,18 +85,8 @@ def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
     return is_lit.double()[None]
 
 
-def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw concentric rings of the same width around a random center.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the rings, 0 between them.
-    """
+def _rings(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw concentric rings of the same width around a random center."""
     center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
     scaled = radius / rng.uniform(0.12, 0.4)
@@ -164,19 +95,8 @@ def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
     return patterns.stripes(scaled, shift, bright_fraction).double()[None]
 
 
-def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the light that falls through the panes of a window into a dark room.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the panes, 0 on the bars between them and outside of
-        the window.
-    """
+def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw the light that falls through the panes of a window into a dark room."""
     # Each of these three tensors has one value for x and one for y, shape (2, 1, 1).
     pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
     pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
@@ -189,17 +109,9 @@ def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
     return (is_in_window & is_in_pane).all(dim=0).double()[None]
 
 
-def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the shadows of leaves: ellipses at random places, which cover about half of the image.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 0 on the leaves, 1 elsewhere.
+def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw the shadows of leaves: ellipses at random places, which cover about half of the
+    image.
     """
     half_length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
@@ -215,18 +127,8 @@ def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
     return is_lit.double()[None]
 
 
-def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw bright lines of random capital letters on a dark background.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light at each pixel, shape
-        (1, H, W): 1 on the letters, 0 between them.
-    """
+def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+    """Draw bright lines of random capital letters on a dark background."""
     letter_height = int(rng.integers(40, 120))
     image = Image.new("L", (RESOLUTION, RESOLUTION))
     font = ImageFont.load_default(float(letter_height))
@@ -240,17 +142,9 @@ def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
     return _sample(weights, points, order=1)
 
 
-def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw smoothly varying colors: random values on a coarse grid, interpolated by cubic splines.
-
-    Args:
-        points: Positions (x, y) of the pixels in the projected image, which
-            spans [-1, 1], shape (2, H, W).
-        rng: Random number generator.
-
-    Returns:
-        Weight of the first of two colors of light for each color channel and
-        pixel, shape (3, H, W), in [0, 1].
+def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
+    """Draw smoothly varying colors: random values on a coarse grid, interpolated by cubic
+    splines.
     """
     row_count = rng.integers(3, 6)
     column_count = rng.integers(3, 6)
@@ -258,19 +152,10 @@ def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
     return _sample(grid, points, order=3).clamp(0, 1)
 
 
-def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
-    """Interpolate an image at given positions with splines.
-
-    Args:
-        image: Image with C channels, shape (H, W, C). It spans [-1, 1] in x and
-            in y, and is mirrored at its borders.
-        points: Positions (x, y) at which the image is interpolated, shape
-            (2, H', W').
-        order: Order of the splines. 1 interpolates linearly, 3 cubically.
-
-    Returns:
-        Interpolated values, shape (C, H', W').
-    """
+def _sample(
+    image: Float[np.ndarray, "H W C"], points: Float[Tensor, "2 _ _"], order: int
+) -> Float[Tensor, "C _ _"]:
+    """Interpolate an image at given positions with splines."""
     height_and_width = np.array(image.shape[:2])[:, None, None]
     # `flip` swaps (x, y) to (y, x). The interval [-1, 1] becomes [-0.5, size - 0.5],
     # so that whole numbers are centers of pixels.
@@ -305,19 +190,8 @@ def draw_pattern(
     name: str,
     rng: np.random.Generator,
     slides: Sequence[np.ndarray] = (),
-) -> np.ndarray:
-    """Draw an image for a projector: a pattern with random colors, angle, scale and position.
-
-    Args:
-        name: Name of the pattern, a key of PATTERN_FUNCTIONS. "slides" chooses
-            one of the pictures in `slides` instead.
-        rng: Random number generator.
-        slides: Pictures for the pattern "slides", linear RGB, shape (H, W, 3).
-
-    Returns:
-        Projected image, linear RGB in [0, 1], shape
-        (RESOLUTION, RESOLUTION, 3), float32.
-    """
+) -> Float[np.ndarray, "RESOLUTION RESOLUTION 3"]:
+    """Draw an image for a projector: a pattern with random colors, angle, scale and position."""
     first_color = torch.from_numpy(draw_color(rng))[:, None, None]
     second_color = torch.from_numpy(draw_color(rng))[:, None, None]
     # The brightness is drawn even if it is not used, so that all patterns take the same
@@ -340,14 +214,7 @@ def draw_pattern(
     return image.permute(1, 2, 0).contiguous().float().numpy()
 
 
-def draw_color(rng: np.random.Generator) -> np.ndarray:
-    """Draw a color of light with a random hue and a random saturation.
-
-    Args:
-        rng: Random number generator.
-
-    Returns:
-        Linear RGB, shape (3,). The largest channel is 1.
-    """
+def draw_color(rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    """Draw a color of light with a random hue and a random saturation."""
     hue_and_saturation = torch.from_numpy(rng.uniform(size=(1, 2)))
     return patterns.random_colors(hue_and_saturation).flatten().numpy()

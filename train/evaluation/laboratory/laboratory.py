@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
 
 from augment.progress import progress
@@ -74,15 +75,6 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
     """Split a mesh by texture, and convert its colors from sRGB to linear RGB.
 
     The parts have smooth normals, except at sharp edges.
-
-    Args:
-        mesh: Mesh with vertex colors and textures in sRGB.
-        albedo_scale: Factor by which all linear colors are multiplied. The
-            products are limited to [0, 1].
-
-    Returns:
-        Parts with one texture or none. Textures are linear RGB, shape
-        (H, W, 3).
     """
     normals = mesh.written_normals("smooth")
     parts = []
@@ -108,27 +100,12 @@ def path_traced(
     spp: int,
     bounces: int,
     seed: int,
-) -> np.ndarray:
+) -> Float[np.ndarray, "size size 3"]:
     """Render an object with the path tracer of Mitsuba 3.
 
     Each light source is rendered alone, and the images are added. With all
     light sources in one scene, each path would choose one of them at random,
     and this choice would cause most of the noise.
-
-    Args:
-        parts: Parts of the object, each with one texture or none, as
-            `lab_parts` returns them.
-        shot: Lighting, camera, pose and surroundings of the object.
-        size: Pixels per side of the image.
-        spp: Number of paths for each pixel and each light source.
-        bounces: Maximum number of reflections of a path.
-        seed: Seed of the random paths.
-
-    Returns:
-        Radiance in linear RGB, shape (size, size, 3), float32.
-
-    Raises:
-        InputError: If Mitsuba is not installed.
     """
     with mitsuba() as module:
         scene = {
@@ -152,12 +129,7 @@ def _rgb(color: np.ndarray) -> dict[str, Any]:
 
 
 def _light_sources(shot: Shot) -> list[dict[str, Any]]:
-    """Describe the light sources of a shot by dictionaries that Mitsuba takes.
-
-    Returns:
-        The environment map, if the shot has one. Otherwise a projector for each
-        pattern, and uniform ambient light.
-    """
+    """Describe the light sources of a shot by dictionaries that Mitsuba takes."""
     if shot.environment is not None:
         return [environment({"bitmap": shot.environment})]
     lights = []
@@ -173,16 +145,10 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
     return lights
 
 
-def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
+def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> dict[str, Any]:
     """Describe a large diffuse square by a dictionary that Mitsuba takes.
 
     The table and the wall are such squares.
-
-    Args:
-        pose: Matrix from the coordinates of the square to world coordinates,
-            shape (4, 4). In its coordinates, the square lies in the plane
-            z = 0, and its front side faces +z.
-        color: Albedo in linear RGB, shape (3,).
     """
     scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
     surface = {"type": "diffuse", "reflectance": _rgb(color)}
@@ -194,11 +160,6 @@ def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
 
     The object is scaled and rotated, and moved such that its lowest point
     touches the table at z = 0.
-
-    Args:
-        module: The Python module `mitsuba`.
-        parts: Parts of the object, each with one texture or none.
-        shot: Shot with the scale, rotation and roughness of the object.
     """
     positions_by_part = []
     for part in parts:
@@ -235,17 +196,6 @@ def write_laboratory(settings: LabSettings) -> int:
     photos.csv and the settings lab.json. `find_photographs` of
     `train.data.photographs` reads such a folder. The same settings and the same
     versions of the packages give the same bytes.
-
-    Args:
-        settings: Settings of pnb-lab.
-
-    Returns:
-        Number of renders.
-
-    Raises:
-        InputError: If the folder is not empty, if a mesh cannot be read or has
-            no label, if there is no mesh of a label or no hard negative, or if
-            Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
     subjects = []
@@ -293,18 +243,6 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
 
     With several positive classes, the meshes of each are the negatives of the
     others. With a single positive class, meshes of another class are needed.
-
-    Args:
-        subjects: Meshes with their labels.
-        labels: Positive classes.
-
-    Returns:
-        The meshes of each positive class. The last group has the meshes of all
-        other classes, if there are any.
-
-    Raises:
-        InputError: If a positive class has no mesh, or if there is a single
-            positive class and no mesh of another class.
     """
     negatives = [subject for subject in subjects if subject.label not in labels]
     needs_negatives = len(labels) == 1
@@ -323,16 +261,7 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
 
 
 def _require_empty(out: Path, overwrite: bool) -> None:
-    """Check that the folder of the test set is empty, or remove earlier renders.
-
-    Args:
-        out: Folder of the test set.
-        overwrite: Whether earlier renders in the folder are removed. Other
-            files then stay.
-
-    Raises:
-        InputError: If the folder has files, and `overwrite` is False.
-    """
+    """Check that the folder of the test set is empty, or remove earlier renders."""
     if overwrite:
         # lab.json says that the renders are complete.
         for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
@@ -351,19 +280,7 @@ def _write_render(
     shot: Shot,
     number: int,
 ) -> str:
-    """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file.
-
-    Args:
-        out: Folder of the test set.
-        settings: Settings of pnb-lab.
-        subject: Mesh to render.
-        shot: Lighting, camera, pose and surroundings of the mesh.
-        number: Number of the shot, from 0. It is part of the file name and
-            decides the seed of the path tracer.
-
-    Returns:
-        Path of the image in `out`: LABEL/NUMBER_LIGHTING.png.
-    """
+    """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file."""
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
@@ -379,21 +296,8 @@ def _read_slide(path: str) -> np.ndarray:
     return decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy()
 
 
-def _read_environment(path: Path) -> np.ndarray:
-    """Read an environment map from a file, or render a built-in light to such a map.
-
-    Args:
-        path: File of the map, or name of a built-in light. The spherical
-            harmonics of a built-in light may have negative radiance, which is
-            removed.
-
-    Returns:
-        Radiance in linear RGB, shape (H, W, 3). The upper half of the rows is
-        above the horizon.
-
-    Raises:
-        InputError: If no light comes from above the horizon.
-    """
+def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
+    """Read an environment map from a file, or render a built-in light to such a map."""
     if str(path) in PROBES:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
         return to_map(light, BUILT_IN_MAP_HEIGHT).clamp(min=0).numpy()
@@ -413,17 +317,6 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
 
     A generated solid without a label gets its own name as its label. A solid
     that serves as a hard negative gets the label "other_NAME".
-
-    Args:
-        item: File of a mesh, name of a solid, or settings of an object.
-        index: Index of the item in `meshes`, for error messages.
-
-    Returns:
-        The mesh with its label.
-
-    Raises:
-        InputError: If the mesh cannot be read, if a file has no label, or if
-            the label cannot be the name of a folder.
     """
     settings = read_object(item, "", f"meshes[{index}]")
     label = settings.label

@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from augment.random_streams import stream_seed
@@ -81,17 +82,17 @@ class Shot:
     lighting: str
     brightness: float
     patterns: Sequence[np.ndarray]
-    ambient: np.ndarray
-    table: np.ndarray
+    ambient: Float[np.ndarray, " 3"]
+    table: Float[np.ndarray, " 3"]
     projectors: Sequence[np.ndarray]
-    camera: np.ndarray
-    center: np.ndarray
-    aim: np.ndarray
-    rotation: np.ndarray
+    camera: Float[np.ndarray, " 3"]
+    center: Float[np.ndarray, " 3"]
+    aim: Float[np.ndarray, " 3"]
+    rotation: Float[np.ndarray, "3 3"]
     scale: float
     roughness: float
-    wall: np.ndarray | None = None
-    environment: np.ndarray | None = None
+    wall: Float[np.ndarray, " 3"] | None = None
+    environment: Float[np.ndarray, "H W 3"] | None = None
 
 
 def draw_shots(
@@ -104,16 +105,6 @@ def draw_shots(
     The shots of a pattern, or of an environment map, have evenly spread
     logarithms of the brightness. An environment map is rotated about the
     vertical axis by a random angle.
-
-    Args:
-        settings: Settings of pnb-lab. `settings.setups` is the number of shots
-            in total, and `settings.brightness` the range of the brightness.
-        environments: Environment maps by name, linear RGB, shape (H, W, 3).
-        slides: Pictures that the projector projects in the pattern "slides",
-            linear RGB, shape (H, W, 3).
-
-    Yields:
-        The shots of each pattern, and then of each environment map.
     """
     dimmest, brightest = settings.brightness
     lightings = [*settings.patterns, *environments]
@@ -134,21 +125,11 @@ def draw_shots(
 
 
 def _scale_environment(
-    radiance: np.ndarray,
+    radiance: Float[np.ndarray, "H W 3"],
     brightness: float,
     rng: np.random.Generator,
-) -> np.ndarray:
-    """Rotate an environment map about the vertical axis by a random angle, and scale it.
-
-    Args:
-        radiance: Environment map, linear RGB, shape (H, W, 3).
-        brightness: Radiance of a white diffuse surface that faces up, in the
-            scaled lighting.
-        rng: Random number generator.
-
-    Returns:
-        Rotated and scaled map, linear RGB, shape (H, W, 3), float32.
-    """
+) -> Float[np.ndarray, "H W 3"]:
+    """Rotate an environment map about the vertical axis by a random angle, and scale it."""
     directions, solid_angles = equirectangular(*radiance.shape[:2])
     cosines = directions[..., 2].clamp(min=0)
     weights = cosines * solid_angles
@@ -168,20 +149,7 @@ def _draw_shot(
     rng: np.random.Generator,
     extra_rng: np.random.Generator,
 ) -> Shot:
-    """Draw a random shot of an object in the light of projectors.
-
-    Args:
-        pattern_names: Names of the projected patterns, joined by "+". Each
-            pattern has its own projector.
-        brightness: Radiance of a white surface that faces all projectors, if
-            their images are white.
-        settings: Settings of pnb-lab, with the ranges of the random draws.
-        slides: Pictures that the projector projects in the pattern "slides".
-        rng: Random number generator for all that the first version of the
-            library drew.
-        extra_rng: Random number generator for all that was added later, such as
-            the wall. Additions thus do not change the older draws.
-    """
+    """Draw a random shot of an object in the light of projectors."""
     first_pattern, *other_patterns = pattern_names.split("+")
     azimuth = rng.uniform(0, 360)
     half_width = rng.uniform(*HALF_WIDTHS)
@@ -222,34 +190,17 @@ def _draw_shot(
     )
 
 
-def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the position of a projector, relative to the point that it faces.
-
-    Args:
-        settings: Settings of pnb-lab, with the ranges of the elevation and of
-            the azimuth relative to the camera.
-        azimuth: Azimuth of the camera in degrees.
-        rng: Random number generator.
-
-    Returns:
-        Position in world units, shape (3,).
-    """
+def _draw_projector(
+    settings: LabSettings, azimuth: float, rng: np.random.Generator
+) -> Float[np.ndarray, " 3"]:
+    """Draw the position of a projector, relative to the point that it faces."""
     projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
     elevation = _draw_between(settings.elevation, rng)
     return _from_angles(projector_azimuth, elevation, rng.uniform(*PROJECTOR_DISTANCES))
 
 
-def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the position of a vertical wall behind the object, as seen from the camera.
-
-    Args:
-        azimuth: Azimuth of the camera in degrees.
-        rng: Random number generator.
-
-    Returns:
-        Vector from the center of the object to the nearest point of the wall,
-        in world units, shape (3,). It is normal to the wall.
-    """
+def _draw_wall(azimuth: float, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    """Draw the position of a vertical wall behind the object, as seen from the camera."""
     wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
     return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))
 
@@ -259,17 +210,8 @@ def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
     return rng.uniform(limits[0], limits[1])
 
 
-def _from_angles(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """Convert spherical to Cartesian coordinates, with z up.
-
-    Args:
-        azimuth: Angle from +x toward +y in degrees.
-        elevation: Angle above the plane z = 0 in degrees.
-        distance: Distance from the origin.
-
-    Returns:
-        Position (x, y, z), shape (3,).
-    """
+def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, " 3"]:
+    """Convert spherical to Cartesian coordinates, with z up."""
     azimuth_radians = math.radians(azimuth)
     elevation_radians = math.radians(elevation)
     horizontal = math.cos(elevation_radians)

@@ -19,6 +19,7 @@ from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from renderer.short_repr import ShortRepr
 from train.evaluation.scores.predictions import Prediction
@@ -140,16 +141,7 @@ class Metrics:
     class_top5: Estimate | None = None
 
     def find(self, name: str) -> Estimate | None:
-        """Return a metric by its name.
-
-        Args:
-            name: Name of the metric in `METRICS`, such as "auc" or
-                "recall_at/0.05", or "top5".
-
-        Returns:
-            The metric. None if it was not computed, such as a recall at a
-            threshold without a threshold.
-        """
+        """Return a metric by its name."""
         attribute, _, rate = name.partition("/")
         if rate:
             return self.recall_at[rate]
@@ -205,15 +197,7 @@ class Outcome:
 
 
 def within_rank(predictions: Sequence[Prediction], max_rank: int) -> Outcome:
-    """Find the predictions whose true class is among the most probable classes.
-
-    Args:
-        predictions: Predictions for photographs.
-        max_rank: Largest rank of the true class that counts as a hit.
-
-    Returns:
-        All given predictions, and whether each is a hit.
-    """
+    """Find the predictions whose true class is among the most probable classes."""
     # `true_rank` is None if the network lacks the class. No prediction is then a hit, because
     # infinity is above every rank.
     hits = [(prediction.true_rank or np.inf) <= max_rank for prediction in predictions]
@@ -271,14 +255,7 @@ class Pool(ShortRepr):
         return outcomes
 
     def _above_threshold(self, predictions: Sequence[Prediction]) -> Outcome:
-        """Find the predictions whose log-odds exceed the threshold of their label.
-
-        Args:
-            predictions: Predictions. Each of their labels has a threshold.
-
-        Returns:
-            All given predictions, and whether each is a hit: above the threshold.
-        """
+        """Find the predictions whose log-odds exceed the threshold of their label."""
         hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
         return Outcome(predictions, hits)
 
@@ -381,16 +358,7 @@ def _count_objects(predictions: Sequence[Prediction]) -> int:
 
 
 def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
-    """Collect predictions that are scored together, with one ROC curve of all of them.
-
-    Args:
-        predictions: Predictions that are scored together.
-        thresholds: Threshold on the log-odds of each label. None omits the
-            metrics that need a threshold.
-
-    Returns:
-        The predictions, divided into positives and negatives.
-    """
+    """Collect predictions that are scored together, with one ROC curve of all of them."""
     positives = [prediction for prediction in predictions if prediction.positive]
     negatives = [prediction for prediction in predictions if not prediction.positive]
     return Pool(
@@ -453,18 +421,7 @@ class Pooled(ShortRepr):
         return pools
 
     def _hard_negatives(self, positives: Sequence[Prediction], source: str) -> list[Prediction]:
-        """Find the negatives in the sources that positives name as hard negatives.
-
-        Args:
-            positives: Positives of one source. The photograph of each may name
-                other sources in `hard_negatives`.
-            source: Name of the source of the positives. Its own negatives are
-                not returned.
-
-        Returns:
-            Negatives from the named sources. Each has the label of a positive
-            that names its source.
-        """
+        """Find the negatives in the sources that positives name as hard negatives."""
         wanted = set()
         for prediction in positives:
             for other_source in prediction.photograph.hard_negatives:
@@ -493,15 +450,6 @@ class Pooled(ShortRepr):
         The ROC curve of a mesh of a positive class compares the images of this
         mesh with all negatives. The ROC curve of another mesh compares all
         positives with the images of this mesh. The same holds for classes.
-
-        Args:
-            name_of: Function that returns the name of the mesh or class in the
-                image of a prediction. If it returns None, the image is left
-                out.
-
-        Returns:
-            For the name of each mesh or class, its predictions, which are
-            scored together.
         """
         labels = {prediction.label for prediction in self.predictions}
         pools = {}
@@ -531,17 +479,7 @@ class Pooled(ShortRepr):
 def _group(
     predictions: Sequence[Prediction], name_of: Callable[[Prediction], str | None]
 ) -> dict[str, list[Prediction]]:
-    """Group predictions by a name, such as the name of their source.
-
-    Args:
-        predictions: Predictions to group.
-        name_of: Function from a prediction to the name of its group. If it
-            returns None, the prediction is left out.
-
-    Returns:
-        Predictions of each group by its name, in alphabetical order of the
-        names. The predictions of a group keep their order.
-    """
+    """Group predictions by a name, such as the name of their source."""
     groups: dict[str, list[Prediction]] = {}
     for prediction in predictions:
         name = name_of(prediction)
@@ -600,12 +538,6 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     Images of the same object are not independent, so an object is left out with
     all its images. The groups of units depend only on `units`. Metrics of two
     networks on the same images are therefore paired.
-
-    Args:
-        statistic: Function of one array for each group of images: how often
-            each image counts, shape (..., n). It returns an array of shape
-            (M, ...).
-        units: Units of each group of images.
     """
     counts = [np.ones(len(unit_of_image), int) for unit_of_image in units.groups]
     values = statistic(*counts)
@@ -647,11 +579,6 @@ def change(
     The interval combines those of both means and their correlation (Zou and
     Donner 2008), so it is as asymmetric as they are. If both groups have the
     same values without each unit, it is that of 0 changes in Wilson's sense.
-
-    Args:
-        after: Metric of each run of the first group.
-        before: Metric of each run of the second group, on the same images.
-        is_paired: Whether run i of both groups has the same random seed.
     """
     one, other = average(after), average(before)
     value = one.value - other.value
@@ -728,21 +655,14 @@ def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.moveaxis(counts @ values.T / counts.sum(axis=-1, keepdims=True), -1, 0)
 
 
-def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> np.ndarray:
+def class_means(
+    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Float[np.ndarray, "... n"]
+) -> Float[np.ndarray, "K ..."]:
     """Compute the fraction of hits in each class, and average it over the classes.
 
     This is the mean over all images if an image of a class with n images has
     the weight 1 / n. `functools.partial(class_means, hits, names)` is a
     statistic for `leave_out`.
-
-    Args:
-        hits: Whether each image is a hit, by K definitions of a hit such as
-            top-1 and top-5. One row for each definition, shape (K, n).
-        names: Name of the class of each of the n images.
-        counts: How often each image counts, shape (..., n).
-
-    Returns:
-        Mean over classes for each definition of a hit, shape (K, ...).
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
     weights = 1 / class_sizes[class_of_image]
@@ -751,28 +671,17 @@ def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> n
 
 
 def auc_and_recalls(
-    positives: np.ndarray,
-    negatives: np.ndarray,
-    positive_counts: np.ndarray | None = None,
-    negative_counts: np.ndarray | None = None,
-) -> np.ndarray:
+    positives: Float[np.ndarray, " n"],
+    negatives: Float[np.ndarray, " m"],
+    positive_counts: Float[np.ndarray, "... n"] | None = None,
+    negative_counts: Float[np.ndarray, "... m"] | None = None,
+) -> Float[np.ndarray, "4 ..."]:
     """Compute the AUC, and the recall at each false-positive rate in `RATES`.
 
     The AUC is the probability that a random positive has a higher score than a
     random negative. A tie counts half (Mann and Whitney 1947). The recall is the
     fraction of the positives that score above the threshold for a
     false-positive rate. A positive at the threshold counts as missed.
-
-    Args:
-        positives: Scores of the positives, shape (n,).
-        negatives: Scores of the negatives, shape (m,).
-        positive_counts: How often each positive counts, shape (..., n). None
-            counts each once.
-        negative_counts: How often each negative counts, shape (..., m). None
-            counts each once.
-
-    Returns:
-        AUC and three recalls, shape (4, ...).
     """
     if positive_counts is None:
         positive_counts = np.ones(len(positives), int)
@@ -803,8 +712,8 @@ def auc_and_recalls(
 
 
 def thresholds(
-    negatives: np.ndarray,
-    counts: np.ndarray,
+    negatives: Float[np.ndarray, " m"],
+    counts: Float[np.ndarray, "... m"],
     rates: Sequence[str] = RATES,
 ) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
@@ -812,14 +721,6 @@ def thresholds(
     The threshold is the score of a negative. It is the lowest such score that
     at most the given fraction of the negatives exceed. With the rate 0.10 and
     20 negatives, at most 2 negatives exceed the threshold.
-
-    Args:
-        negatives: Scores of the negatives, shape (m,).
-        counts: How often each negative counts, shape (..., m).
-        rates: False-positive rates as decimal strings, which are exact.
-
-    Returns:
-        For each rate, an array of thresholds of shape (...).
     """
     order = negatives.argsort()
     sorted_negatives = negatives[order]
@@ -840,24 +741,14 @@ def thresholds(
 
 
 def roc_curve(
-    positives: np.ndarray,
-    negatives: np.ndarray,
+    positives: Float[np.ndarray, " n"],
+    negatives: Float[np.ndarray, " m"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the points of the ROC curve, from (0, 0) to (1, 1).
 
     An image counts as detected if its score exceeds a threshold. Each distinct
     score is the threshold of one point of the curve. The last point has the
     threshold minus infinity, which all scores exceed.
-
-    Args:
-        positives: Scores of the positives, shape (n,).
-        negatives: Scores of the negatives, shape (m,).
-
-    Returns:
-        Three arrays with an entry for each point of the curve:
-        - the false-positive rate, in ascending order;
-        - the recall, in ascending order;
-        - the threshold, in descending order.
     """
     distinct_scores = np.unique([*positives, *negatives])
     descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
@@ -866,16 +757,10 @@ def roc_curve(
     return false_positive_rate, recall, descending_thresholds
 
 
-def _fraction_above(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Compute the fraction of the scores that exceed each threshold.
-
-    Args:
-        scores: Scores, shape (n,).
-        thresholds: Thresholds, shape (k,).
-
-    Returns:
-        Fraction for each threshold, in [0, 1], shape (k,).
-    """
+def _fraction_above(
+    scores: Float[np.ndarray, " n"], thresholds: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Compute the fraction of the scores that exceed each threshold."""
     count_at_or_below = np.sort(scores).searchsorted(thresholds, "right")
     return (len(scores) - count_at_or_below) / len(scores)
 
@@ -885,13 +770,6 @@ def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
 
     The metric "recall_at/0.05" is summary["recall_at"]["0.05"] in summary.json,
     and summary["recall_at/0.05"] in the file of a published network.
-
-    Args:
-        summary: Content of the file.
-        name: Name of the metric.
-
-    Returns:
-        Entry of the metric. An empty dictionary if the file lacks the metric.
     """
     if name in summary:
         return summary[name] or {}
@@ -902,21 +780,7 @@ def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
-    """Read a metric from the content of summary.json.
-
-    Args:
-        summary: Content of the file, or an entry of its dictionaries
-            "by_label", "by_source" and "by_mesh".
-        name: Name of the metric in `METRICS`, such as "auc" or
-            "recall_at/0.05", or "top5".
-
-    Returns:
-        Metric with its interval, and with the numbers of images if the file has
-        them. None if the file lacks the metric.
-
-    Raises:
-        KeyError, TypeError, ValueError: If the entry of the metric is damaged.
-    """
+    """Read a metric from the content of summary.json."""
     entry = _find_entry(summary, name)
     if not entry:
         return None
@@ -941,15 +805,7 @@ def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
 
 
 def metric_title(name: str) -> str:
-    """Return the title of a metric in tables.
-
-    Args:
-        name: Name of the metric in `METRICS`, such as "auc" or
-            "recall_at/0.10", or "top5".
-
-    Returns:
-        Title such as "AUC" or "recall at 10% FPR".
-    """
+    """Return the title of a metric in tables."""
     if name in TITLES:
         return TITLES[name]
     # All other names have the form "recall_at/RATE".

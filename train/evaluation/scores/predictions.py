@@ -132,10 +132,6 @@ class Predictor:
         classes: Names of the classes of the model.
         size: Pixels per side of the images.
         device: Device of the model.
-
-    Raises:
-        InputError: If the model cannot be called, or the classes or the size
-            are wrong.
     """
 
     model: Model
@@ -156,23 +152,7 @@ class Predictor:
         label: Label,
         skip_unreadable: bool = False,
     ) -> FolderPredictions:
-        """Predict the classes of all photographs of a folder.
-
-        Args:
-            folder: Folder of photographs, as `find_photographs` takes it.
-            label: Positive class, or a list of several.
-            skip_unreadable: Whether photographs that cannot be read are left
-                out. If False, they raise an InputError.
-
-        Returns:
-            Predictions for each photograph and positive class, with the pixels
-            of the photographs.
-
-        Raises:
-            InputError: If the folder or a photograph cannot be used (see
-                `find_photographs` and `load_photographs`), or if the logits are
-                wrong (see `compute_logits`).
-        """
+        """Predict the classes of all photographs of a folder."""
         folder = as_folder("folder", folder)
         labels = label_names(label)
         found = find_photographs(folder, self.classes, label)
@@ -195,14 +175,7 @@ class Predictor:
 
 
 def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
-    """Hash the positive classes and the photographs with SHA-256.
-
-    Args:
-        folder: Folder of the photographs.
-        photographs: Photographs. Their attributes and the bytes of their files
-            are hashed.
-        labels: Names of the positive classes.
-    """
+    """Hash the positive classes and the photographs with SHA-256."""
     digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
         content = (folder / photograph.path).read_bytes()
@@ -219,19 +192,6 @@ def compute_logits(
     """Compute the logits of a model for images.
 
     A module is called in eval mode. Its mode is restored afterwards.
-
-    Args:
-        model: Module or function from images, float32 sRGB in [0, 1], to logits.
-        images: Images, uint8 sRGB, shape (N, 3, H, W).
-        classes: Number of classes of the model.
-        device: Device of the model.
-
-    Returns:
-        Logits, float32 on the CPU, shape (N, classes).
-
-    Raises:
-        InputError: If there are fewer than two classes, or if the logits have
-            another shape, are NaN or are infinite.
     """
     if classes < 2:
         raise InputError(
@@ -265,18 +225,7 @@ def rank_classes(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[Prediction]:
-    """Convert logits to predicted classes with their probabilities, ranks and log-odds.
-
-    Args:
-        photographs: N photographs.
-        logits: Logits of the photographs, shape (N, C).
-        classes: Names of the C classes of the model.
-        labels: Names of the positive classes, which are classes of the model.
-
-    Returns:
-        Predictions of all photographs for the first positive class, then for
-        the next one, and so on.
-    """
+    """Convert logits to predicted classes with their probabilities, ranks and log-odds."""
     logits = logits.double()
     probabilities = logits.softmax(dim=1).tolist()
     # Classes are sorted by logits, because small probabilities may all round to 0.
@@ -313,14 +262,7 @@ def rank_classes(
 
 
 def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
-    """Group predictions by their positive class.
-
-    Args:
-        predictions: Predictions for one or several positive classes.
-
-    Returns:
-        For each positive class, its predictions in the given order.
-    """
+    """Group predictions by their positive class."""
     groups: dict[str, list[Prediction]] = {}
     for prediction in predictions:
         groups.setdefault(prediction.label, []).append(prediction)
@@ -335,11 +277,6 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
     positive class. For each positive class, such as orange, there are the
     columns orange_probability, orange_rank and orange_log_odds. The cell of a
     value that is None is empty.
-
-    Args:
-        path: Path of the table.
-        predictions: Predictions of all photographs for the first positive
-            class, then for the next one, and so on.
     """
     predictions_by_class = by_label(predictions).values()
     rows = [_to_row(predictions) for predictions in zip(*predictions_by_class, strict=True)]
@@ -351,14 +288,7 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
 
 
 def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
-    """Convert the predictions for one photograph to a row of predictions.csv.
-
-    Args:
-        predictions: Predictions for the photograph, one for each positive class.
-
-    Returns:
-        Cell for each name of a column, as `write_predictions` lists them.
-    """
+    """Convert the predictions for one photograph to a row of predictions.csv."""
     photograph = predictions[0].photograph
     row: dict[str, object] = {
         "path": photograph.path,
@@ -380,20 +310,7 @@ def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
 
 
 def read_predictions(path: Path, label: Label) -> list[Prediction]:
-    """Read the table predictions.csv, which `write_predictions` wrote.
-
-    Args:
-        path: Path of the table.
-        label: Positive class, or a list of several.
-
-    Returns:
-        Predictions of all photographs for the first positive class, then for
-        the next one, and so on.
-
-    Raises:
-        InputError: If the file is missing or damaged, or has no columns for a
-            positive class.
-    """
+    """Read the table predictions.csv, which `write_predictions` wrote."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -406,13 +323,7 @@ def read_predictions(path: Path, label: Label) -> list[Prediction]:
 
 
 def _from_row(row: Mapping[str, str], label: str) -> Prediction:
-    """Convert a row of predictions.csv to the prediction for one positive class.
-
-    Args:
-        row: Row of a photograph: a cell for each name of a column. There are
-            the columns LABEL_probability, LABEL_rank and LABEL_log_odds.
-        label: Name of the positive class, LABEL.
-    """
+    """Convert a row of predictions.csv to the prediction for one positive class."""
     photograph = Photograph(
         path=PurePosixPath(row["path"]),
         label=row["label"],

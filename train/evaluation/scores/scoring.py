@@ -140,25 +140,7 @@ class Scores(ShortRepr):
         return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
 
     def to_summary(self) -> dict[str, Any]:
-        """Convert the scores to the content of summary.json.
-
-        Returns:
-            Dictionary with these keys:
-            - label, size, images: positive classes, pixels per side, and
-              hash of the photographs;
-            - n: numbers of photographs, positives, negatives, unreadable files
-              and files that were left out;
-            - each attribute of `Metrics`, for all photographs;
-            - operating_point: the operating point, or with several labels a
-              list of them. Missing if there is none;
-            - by_label: metrics of each label. Missing with a single label;
-            - by_source: metrics of each source;
-            - by_mesh: metrics of each mesh. Missing if `by_mesh` is None;
-            - by_class: attributes of `ClassScores` for each class;
-            - class_metrics: metrics of each class. Missing if `class_metrics`
-              is None;
-            - unreadable, left_out: paths of these files.
-        """
+        """Convert the scores to the content of summary.json."""
         predicted = self.predicted
         has_several_labels = len(predicted.labels) > 1
         summary: dict[str, Any] = {
@@ -191,15 +173,7 @@ class Scores(ShortRepr):
 
 
 def _entries(metrics_by_name: Mapping[str, Metrics]) -> dict[str, dict[str, Any]]:
-    """Convert the metrics of several groups to entries of summary.json.
-
-    Args:
-        metrics_by_name: Metrics by the name of the label, source, mesh or
-            class.
-
-    Returns:
-        For each name, its metrics as a dictionary.
-    """
+    """Convert the metrics of several groups to entries of summary.json."""
     return {name: metrics.to_summary() for name, metrics in metrics_by_name.items()}
 
 
@@ -210,23 +184,7 @@ def evaluate_photographs(
     out: Path,
     skip_unreadable: bool = False,
 ) -> Scores:
-    """Score a model on all photographs of a folder, and write the scores to files.
-
-    Args:
-        predictor: Model to score.
-        folder: Folder of photographs, as `find_photographs` takes it.
-        label: Positive class, or a list of several.
-        out: Folder for the files. It must lie outside `folder`.
-        skip_unreadable: Whether photographs that cannot be read are left out.
-            If False, they raise an InputError.
-
-    Returns:
-        Scores with their intervals.
-
-    Raises:
-        InputError: If `out` lies inside `folder`, or if the photographs cannot
-            be classified (see `Predictor.predict`).
-    """
+    """Score a model on all photographs of a folder, and write the scores to files."""
     folder = as_folder("folder", folder)
     out = as_folder("out", out)
     require_outside(out, folder)
@@ -247,19 +205,6 @@ def score(
     least MIN_OBJECTS of each kind, and otherwise over images, for these objects.
     Intervals of fractions of different objects are Wilson's. All others come
     from a jackknife.
-
-    Args:
-        predicted: Predictions for the photographs of a folder.
-        by: Which groups of photographs are scored in addition to labels and
-            sources: "mesh", "class", or "source" for no other groups.
-        points: Operating point of each label. May be empty.
-
-    Returns:
-        Scores of all photographs, and of each group.
-
-    Raises:
-        InputError: If `by` has another value, or if it is "mesh" and photos.csv
-            names no mesh.
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
@@ -284,24 +229,12 @@ def score(
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of several groups of predictions, and show the progress.
-
-    Args:
-        pools: For the name of each label, source, mesh or class, its
-            predictions.
-
-    Returns:
-        For each name, the metrics of its predictions.
-    """
+    """Compute the metrics of several groups of predictions, and show the progress."""
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
 
 def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
-    """Score the photographs of each class in a folder separately.
-
-    Returns:
-        For each class, in alphabetical order, the scores of its photographs.
-    """
+    """Score the photographs of each class in a folder separately."""
     predictions_by_class: dict[str, list[Prediction]] = {}
     for prediction in predicted.photographs:
         predictions_by_class.setdefault(prediction.photograph.label, []).append(prediction)
@@ -312,12 +245,7 @@ def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
 
 
 def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
-    """Score the photographs of one class.
-
-    Args:
-        predictions: One prediction for each photograph of the class.
-        labels: Names of the positive classes.
-    """
+    """Score the photographs of one class."""
     # `true_rank` is None for all photographs if the model lacks the class.
     known = [item for item in predictions if item.true_rank is not None]
     wrong_classes = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
@@ -339,10 +267,6 @@ def write(scores: Scores, out: Path) -> None:
     - contact_sheet.png: photographs with right and wrong predictions;
     - roc.csv and roc.png: ROC curves of all images and of each label. With a
       single label, of each source instead.
-
-    Args:
-        scores: Scores of a model on photographs.
-        out: Folder for the files. It is created if it does not exist.
     """
     predicted = scores.predicted
     out.mkdir(parents=True, exist_ok=True)
@@ -371,21 +295,6 @@ def choose_operating_points(
     The threshold is the log-odds of a negative. It is the lowest of these
     values at which the false-positive rate is at most `rate`. With rate 0.1 and
     20 negatives, at most 2 negatives score above the threshold.
-
-    Args:
-        predictor: Model for which thresholds are chosen.
-        folder: Folder of photographs, as `find_photographs` takes it.
-        label: Positive class, or a list of several.
-        rate: Largest false-positive rate, in (0, 1).
-        skip_unreadable: Whether photographs that cannot be read are left out.
-            If False, they raise an InputError.
-
-    Returns:
-        Operating point of each label, with its threshold.
-
-    Raises:
-        InputError: If the folder has fewer than 1 / rate negatives, or if its
-            photographs cannot be classified (see `Predictor.predict`).
     """
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
@@ -416,29 +325,13 @@ def choose_operating_points(
 
 
 def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Read the operating points in the content of summary.json.
-
-    Args:
-        summary: Content of summary.json. Its entry "operating_point" is missing,
-            a dictionary, or a list with a dictionary for each label.
-
-    Returns:
-        List of the operating points, which may be empty.
-    """
+    """Read the operating points in the content of summary.json."""
     entry = summary.get("operating_point", [])
     return entry if isinstance(entry, list) else [entry]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:
-    """Describe for which false-positive rate and on which images an operating point was chosen.
-
-    Args:
-        point: Operating point, as in the entry "operating_point" of
-            summary.json.
-
-    Returns:
-        Text such as "5.0% FPR on photographs, 120 negatives".
-    """
+    """Describe for which false-positive rate and on which images an operating point was chosen."""
     images = f"{point['folder']}, {point['negatives']} negatives"
     if point.get("in_sample"):
         images = "these very images, in-sample"
@@ -446,14 +339,7 @@ def describe_point(point: Mapping[str, Any]) -> str:
 
 
 def format_scores(scores: Scores) -> str:
-    """Format scores as Markdown tables, with a row for each label and each source or mesh.
-
-    Args:
-        scores: Scores of a model on photographs.
-
-    Returns:
-        Text of several paragraphs, without a newline at the end.
-    """
+    """Format scores as Markdown tables, with a row for each label and each source or mesh."""
     paragraphs = [
         _count_images(scores),
         str(_fraction_table(scores)),
@@ -465,11 +351,7 @@ def format_scores(scores: Scores) -> str:
 
 
 def _count_images(scores: Scores) -> str:
-    """Say how many positive and negative images were scored.
-
-    Args:
-        scores: Scores of a model on photographs.
-    """
+    """Say how many positive and negative images were scored."""
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
     each = COUNTED_EACH if scores.by_label else ""
@@ -480,13 +362,6 @@ def format_overall(scores: Scores) -> str:
     """Format the metrics of all images as one Markdown table, with 95% intervals.
 
     The table has a row for each metric. The metrics in `DETAILS` are left out.
-
-    Args:
-        scores: Scores of a model on photographs.
-
-    Returns:
-        A line with the numbers of images, the table, and notes about thresholds
-        and about files that were not scored.
     """
     details = {metric_title(name) for name in DETAILS}
     rows = []

@@ -72,15 +72,6 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Im
     Each positive class has three sections: true positives, false negatives and
     false positives. A section has at most MAX_IMAGES images. If there are more,
     it shows images at equal distances in the order of probability.
-
-    Args:
-        predictions: Predictions of all images for the first positive class,
-            then for the next one, and so on.
-        images: Classified images, uint8 sRGB, shape (N, 3, H, W). They are
-            enlarged without smoothing, so that the pixels are visible.
-
-    Returns:
-        Contact sheet.
     """
     grids = [draw_grid([], heading=LEGEND)]
     for label, predictions_of_label in by_label(predictions).items():
@@ -103,14 +94,6 @@ def _sections(
     """Divide images into true positives, false negatives and false positives of a class.
 
     True negatives are left out.
-
-    Args:
-        label: Name of the positive class.
-        predictions: Prediction of each of the N images for this class.
-        images: Classified images, uint8, shape (N, 3, H, W).
-
-    Returns:
-        The three sections. The most confident predictions come first.
     """
     pairs = list(zip(predictions, images, strict=True))
     pairs.sort(key=lambda pair: pair[0].probability, reverse=True)
@@ -127,13 +110,7 @@ def _sections(
 
 
 def _section_grid(label: str, section: _Section) -> Image.Image:
-    """Draw the images of a section of the contact sheet in a grid below a heading.
-
-    Args:
-        label: Name of the positive class, for the heading.
-        section: Images with their predictions. If there are more than
-            MAX_IMAGES, some of them are drawn, at equal distances.
-    """
+    """Draw the images of a section of the contact sheet in a grid below a heading."""
     count = len(section.shown)
     heading = f"{label}: {count} {section.name} of {section.total}"
     if count > MAX_IMAGES:
@@ -146,15 +123,7 @@ def _section_grid(label: str, section: _Section) -> Image.Image:
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Choose items of a list at equal distances, including the first and the last one.
-
-    Args:
-        items: List to choose from.
-        count: Number of items to choose.
-
-    Returns:
-        Chosen items in their order. All items, if there are at most `count`.
-    """
+    """Choose items of a list at equal distances, including the first and the last one."""
     indices = np.linspace(0, len(items) - 1, min(count, len(items)))
     return [items[index] for index in indices.round().astype(int)]
 
@@ -164,11 +133,6 @@ def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
 
     The first caption is the predicted class with its probability. If the
     prediction is wrong, the second caption is the true class.
-
-    Args:
-        prediction: Prediction for the image.
-        image: Classified image, uint8, shape (3, H, W).
-        color: Color of the frame.
     """
     pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
     enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
@@ -193,14 +157,6 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
     There is a curve for all images, and one for each source or label. A curve
     is left out if it lacks positives or negatives.
-
-    Args:
-        folder: Folder for the two files.
-        overall: Log-odds of the positives and of the negatives among all
-            images. The name of this curve is empty in the table.
-        by_name: Log-odds of the positives and of the negatives of each source
-            or label, by its name.
-        label: Positive classes in words, for the title.
     """
     # This import is here because it takes half a second.
     from matplotlib.figure import Figure
@@ -235,17 +191,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
 
 def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
-    """Make a row of roc.csv for each point of a ROC curve.
-
-    Args:
-        name: Name of the source or label of the curve. Empty for all images.
-        pair: Log-odds of the positives, shape (n,), and of the negatives,
-            shape (m,).
-
-    Returns:
-        Rows with the name, the false-positive rate, the recall and the
-        threshold of each point.
-    """
+    """Make a row of roc.csv for each point of a ROC curve."""
     points = zip(*roc_curve(*pair), strict=True)
     return [(name, *map(float, point)) for point in points]
 
@@ -258,13 +204,6 @@ def draw_roc(
     """Draw ROC curves, with the AUC in the legend.
 
     Dotted vertical lines mark the false-positive rates in `RATES`.
-
-    Args:
-        axes: Axes of matplotlib to draw on.
-        scores: For each name in the legend, the log-odds of the positives and
-            of the negatives. Several training runs with different seeds have a
-            curve each, in the same style. The legend has the mean of their AUC.
-        styles: For some names, keyword arguments of `axes.plot`.
     """
     # The ROC curve of a random classifier is the diagonal.
     axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
