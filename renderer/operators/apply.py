@@ -266,7 +266,11 @@ class TransferOperator:
     def _images(
         self, lights: Float[Tensor, "... coefficients 3"], background: _PreparedBackground
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render images without autograd, and return what the gradient needs."""
+        """Render images without autograd, and return what the gradient needs.
+
+        It returns the images, 1 for values of the distinct pixels that clamping left alone
+        and 0 for others, and the clamped linear values of the distinct pixels.
+        """
         unclamped = self._radiance(lights).add_(background.term)
         clamped_values = unclamped.clamp(0, 1)
         # 1 for values in [0, 1], including the limits. Only these have a gradient.
@@ -296,7 +300,10 @@ class TransferOperator:
         is_unclamped: Bool[Tensor, "... 3 D"],
         clamped_values: Float[Tensor, "... 3 D"],
     ) -> Float[Tensor, "... coefficients 3"]:
-        """Convert the gradient of a loss from the images of `_images` to the lights."""
+        """Convert the gradient of a loss from the images of `_images` to the lights.
+
+        The last two arguments are the last two results of `_images`.
+        """
         flat_gradient = image_gradient.flatten(-2)
         if self._distinct_in_image is not None:
             pixel_gradient = self._distinct_in_image.add_up(flat_gradient)
@@ -342,7 +349,8 @@ class TransferOperator:
         """Compute the light that D pixels send to the camera, without autograd or checks.
 
         Pixels that are equal in every light are computed once, which leaves the D
-        distinct pixels.
+        distinct pixels. The radiance is multiplied by the fraction of the pixel that the
+        mesh covers.
         """
         dtype = self.distinct_transfer.dtype
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
@@ -558,7 +566,7 @@ class _Radiance(torch.autograd.Function):
     def forward(
         ctx: Any, lights: Float[Tensor, "... coefficients 3"], operator: TransferOperator
     ) -> Float[Tensor, "... 3 P"]:
-        """Compute the radiance of the P covered pixels."""
+        """Compute the radiance of the P covered pixels, times the fraction that the mesh covers."""
         ctx.operator = operator
         radiance = operator._radiance(lights)
         if operator.distinct is None:
@@ -639,7 +647,9 @@ def apply_transfer(
     """Compute the radiance of P pixels under B lights, with one or more transfer matrices.
 
     The lights are the left factor of the matrix product, which is several times
-    faster on a CPU.
+    faster on a CPU. With three channels, each color has its own, and `albedo` is not used.
+    A single channel is shared by all colors, and multiplied by `albedo`. A second channel
+    is specular reflection, which is added.
     """
     if transfer.shape[-3] == COLORS:
         # Multiply a matrix (B, K) and a matrix (K, P) for each color.
@@ -665,7 +675,8 @@ def build_operators(
 ) -> list[TransferOperator]:
     """Compute the transfer operators of a mesh for several cameras.
 
-    Surfaces are shaded on the side that the camera sees.
+    Surfaces are shaded on the side that the camera sees. A `gloss` of None is that of the
+    mesh.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(
@@ -857,7 +868,8 @@ class _OperatorBuilder:
     ) -> _DenseRows:
         """Compute the rows of the transfer matrix for environment light.
 
-        The rows contain shadows and bounces.
+        The rows contain shadows and bounces. With `distinct`, they are rows for the
+        distinct pixels only.
         """
         harmonics_basis = environment.basis
         all_coefficients = torch.arange(harmonics_basis.size)
@@ -884,27 +896,41 @@ class _OperatorBuilder:
     def _local_entries(
         self, local_light: LocalPart, surface: Surface, channels: _Channels
     ) -> SparseTransfer:
-        """Compute the nonzero entries of the transfer matrix for a lamp or a projector."""
+        """Compute the nonzero entries of the transfer matrix for a lamp or a projector.
+
+        Its basis functions (lamps, or pixels of a projector) are counted from the first one
+        of this light.
+        """
         return local_transfer(self.rays, surface, channels.sample_albedo, local_light.basis)
 
     def _local_rows(
         self, local_light: LocalPart, entries: SparseTransfer, surface: Surface
     ) -> _DenseRows:
-        """Write the transfer matrix of a lamp or projector (a local light) as dense rows."""
+        """Write the transfer matrix of a lamp or projector (a local light) as dense rows.
+
+        Only basis functions that reach a pixel have rows.
+        """
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
         return _DenseRows(transfer.to(self.dtype), local_light.rows.start + coefficients)
 
     def _sparse_rows(
         self, local_light: LocalPart, entries: SparseTransfer, channels: _Channels
     ) -> SparseTransfer:
-        """Convert the nonzero entries of a local light to three channels with the albedo."""
+        """Convert the nonzero entries of a local light to three channels with the albedo.
+
+        The result counts basis functions among all coefficients, and `entries` from the
+        first function of the light.
+        """
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
         return SparseTransfer(local_light.rows.start + entries.function, entries.pixel, weight)
 
     def _concatenate(
         self, parts: list[_DenseRows], channel_count: int, pixel_count: int
     ) -> _DenseRows:
-        """Concatenate the rows of several lights in the order of their coefficients."""
+        """Concatenate the rows of several lights in the order of their coefficients.
+
+        The two numbers are needed if there are no rows.
+        """
         if len(parts) == 1:
             # The rows of a single light are returned as they are, because `cat` copies them.
             return parts[0]
@@ -923,7 +949,11 @@ def _first_coefficient(rows: _DenseRows) -> int:
 def _pixel_albedo(
     fragments: Fragments, albedo: Float[Tensor, "S 3"], dtype: torch.dtype
 ) -> Float[Tensor, "P 3"] | None:
-    """Return the albedo of each pixel if all samples of each pixel have the same albedo."""
+    """Return the albedo of each pixel if all samples of each pixel have the same albedo.
+
+    Differences below the rounding errors of `dtype` are ignored. None means that two
+    samples of a pixel differ.
+    """
     sample_albedo = albedo.T
     zeros = sample_albedo.new_zeros(COLORS, len(fragments.pixels))
     # Each pixel gets the albedo of one of its samples. The comparison below shows whether
@@ -948,7 +978,9 @@ def _box_filter(
     An entry for a pixel and an SH coefficient is the mean of albedo · A_l Y_lm(n)
     over the samples of the pixel (box filter). A_l is the factor of the coefficient
     in the irradiance (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the
-    normal of a sample. Sums are computed in float64.
+    normal of a sample. Sums are computed in float64. An `albedo` of None is 1 in a single
+    channel. With `distinct`, only one pixel of each group is computed, which needs flat
+    normals and an albedo of 1.
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
@@ -1000,7 +1032,8 @@ def _copy_from_faces(
     """Compute `_box_filter` for flat normals and an albedo of 1, by copying values of faces.
 
     A pixel that a single face fills has the values of this face. Only the other
-    pixels need sums over several faces.
+    pixels need sums over several faces. The face values are the irradiance A_l Y_lm(n) from
+    each harmonic.
     """
     # A group is all samples of one face in a pixel.
     group_to_pixel, group_to_face, sample_count = fragments.groups
@@ -1034,7 +1067,7 @@ def _copy_from_faces(
     return transfer[None]
 
 
-def _row_starts(counts: Float[Tensor, " N"]) -> Float[Tensor, " N+1"]:
+def _row_starts(counts: Int[Tensor, " N"]) -> Int[Tensor, " N+1"]:
     """Compute where each row begins in a list of the entries of all rows.
 
     For example, rows with 2 and 3 entries give 0, 2, 5.
@@ -1047,13 +1080,14 @@ def _row_starts(counts: Float[Tensor, " N"]) -> Float[Tensor, " N+1"]:
 def _weighted_row_sums(
     weights: Float[Tensor, " E"],
     entry_to_value: Int[Tensor, " E"],
-    entry_starts: Float[Tensor, " N+1"],
+    entry_starts: Int[Tensor, " N+1"],
     values: Float[Tensor, "M K"],
 ) -> Float[Tensor, "N K"]:
     """Compute N weighted sums of rows of a matrix.
 
     Each sum has several entries, and an entry is a weight and a row of the matrix.
-    Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1.
+    Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1. The first
+    entry in `weights` has the number `entry_starts[0]`.
     """
     # The weights become a sparse matrix with one row for each sum and one column for each
     # row of `values`, in the compressed format of SciPy.
@@ -1069,7 +1103,9 @@ def _group_weights(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute how much each face that a pixel shows contributes to the mean of the pixel.
 
-    A group is all samples of one face in a pixel.
+    A group is all samples of one face in a pixel. The results are, for each group, the
+    index into `fragments.pixels`, the index into `fragments.faces`, and the sum of the
+    albedo divided by the number of samples of a pixel.
     """
     if albedo is not None:
         return fragments.merge(albedo)
@@ -1081,7 +1117,7 @@ def _group_weights(
 def _sample_weights(
     fragments: Fragments, albedo: Float[Tensor, "S C"] | None
 ) -> Float[Tensor, "S C"]:
-    """Compute how much each sample contributes to the mean of its pixel."""
+    """Divide the albedo of each sample (1 if None) by the number of samples of a pixel."""
     if albedo is None:
         albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.sample_to_pixel), 1)
     return albedo / fragments.samples**2
@@ -1090,7 +1126,11 @@ def _sample_weights(
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
 ) -> Float[Tensor, "3 K P"]:
-    """Compute the transfer matrix of a glossy surface under an open sky, without shadows."""
+    """Compute the transfer matrix of a glossy surface under an open sky, without shadows.
+
+    An albedo of shape (S, 1) means that all colors share a channel. The result then has two
+    channels, of which the second is the specular reflection with the color of the light.
+    """
     fragments = surface.fragments
     color_count = albedo.shape[1]
     channel_count = 2 if color_count == 1 else color_count
@@ -1156,9 +1196,12 @@ class _Block(NamedTuple):
 
 
 def _blocks(
-    sample_to_pixel: Float[Tensor, " S"], transfer: Float[Tensor, "C K P"], size: int
+    sample_to_pixel: Int[Tensor, " S"], transfer: Float[Tensor, "C K P"], size: int
 ) -> Iterator[_Block]:
-    """Split the P pixels of a view into blocks of successive pixels."""
+    """Split the P pixels of a view into blocks of successive pixels.
+
+    `sample_to_pixel` is ascending, and writing to `_Block.transfer` fills `transfer`.
+    """
     first_sample = 0
     for first_pixel in range(0, transfer.shape[-1], size):
         end_sample = int(torch.searchsorted(sample_to_pixel, first_pixel + size))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderer.visibility.fragments import Fragments
@@ -49,7 +49,10 @@ class DistinctPixels:
         return replace(self, distinct=distinct, copies=copies)
 
     def write(self, values: Float[Tensor, "... D"], canvas: Float[Tensor, "... pixels"]) -> Tensor:
-        """Write one value for each group of equal pixels to all pixels of the group."""
+        """Write one value for each group of equal pixels to all pixels of the group.
+
+        `canvas` is changed in place and returned.
+        """
         batch_shape = values.shape[:-1]
         distinct = self.distinct.expand(*batch_shape, -1)
         copies = self.copies.expand(*batch_shape, -1)
@@ -74,7 +77,8 @@ def find_distinct_pixels(
 ) -> DistinctPixels | None:
     """Find the covered pixels that are equal because the same face fills them.
 
-    All samples of a face must reflect the same light, up to their albedo.
+    All samples of a face must reflect the same light, up to their albedo. The result is
+    None if there are too few copies to save time, or if a copy has another albedo.
     """
     pixel_count = len(fragments.pixels)
     if pixel_count < FEWEST_COPIES:
@@ -107,7 +111,7 @@ def find_distinct_pixels(
     )
 
 
-def indices_of_true(mask: Float[Tensor, " N"]) -> Tensor:
+def indices_of_true(mask: Bool[Tensor, " N"]) -> Int[Tensor, " _"]:
     """Return the indices of the entries of a mask that are true.
 
     This takes a quarter of the time of `torch.nonzero`.

@@ -49,7 +49,11 @@ class SparseTransfer(NamedTuple):
     weight: Float[Tensor, "N C"]
 
     def dense(self, pixel_count: int) -> tuple[Tensor, Tensor]:
-        """Write the entries into a dense matrix, without rows that would only have zeros."""
+        """Write the entries into a dense matrix, without rows that would only have zeros.
+
+        The matrix has one row for each basis function with an entry, in C color channels.
+        The second result has the ascending indices of these functions.
+        """
         functions, row_of_entry = self.function.unique(return_inverse=True)
         # One row for each channel, which has all rows of the matrix after each other.
         zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
@@ -80,7 +84,8 @@ class SparseTransfer(NamedTuple):
         """Compute the radiance of B images, each with its own light.
 
         The entries must have three channels. They may belong to several views.
-        The result is differentiable with respect to the lights.
+        The result is differentiable with respect to the lights. `image` is the index of the
+        image to which each entry belongs.
         """
         # Row of the coefficient of each entry, if the coefficients of all images are
         # written below each other.
@@ -141,7 +146,9 @@ def local_radiance(
     """Compute the radiance of a view under local light.
 
     The result is differentiable with respect to the light, the albedo, the
-    irradiance of the paths and the gloss.
+    irradiance of the paths and the gloss. The radiance is multiplied by the fraction of
+    each pixel that the mesh covers. `fragments` may assign the same samples to other
+    pixels.
     """
     fragments = fragments or surface.fragments
     # Irradiance at the end of each path: one row for each path, one column for each color.
@@ -155,7 +162,10 @@ def local_radiance(
 def _reflectance(
     surface: Surface, albedo: Float[Tensor, "S C"], paths: LightPaths
 ) -> Float[Tensor, "E C"]:
-    """Compute the reflected radiance, per irradiance, at the ends of E paths of light."""
+    """Compute the reflected radiance, per irradiance, at the ends of E paths of light.
+
+    A matte sample reflects its albedo.
+    """
     sample = paths.point
     path_albedo = albedo[sample]
     gloss = surface.gloss
@@ -185,7 +195,8 @@ def unoccluded(
 ) -> LightPaths:
     """Find the paths from local lights to surface points that no face of the mesh blocks.
 
-    A path must also arrive above the plane of the face on which the point lies.
+    A path must also arrive above the plane of the face on which the point lies. `positions`
+    are the places to which lamps have moved. None leaves them where the basis has them.
     """
     paths = basis.connect(points, normals, positions)
     # Whether a path is blocked has no gradient, so no operations are recorded.
@@ -255,7 +266,7 @@ class LocalLightView:
         """Compute the radiance of the view under local light.
 
         The result is differentiable with respect to all tensors and to the
-        vertices of the view.
+        vertices of the view. The arguments are those of `local_radiance` and `unoccluded`.
         """
         fragments = None if fragments is None else fragments.to("cpu")
         if basis.is_movable and positions is not None:

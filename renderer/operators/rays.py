@@ -191,7 +191,8 @@ class Rays:
 
         Each ray starts at one sample of its pixel. The face of this sample
         blocks all light from below its plane, as if the mesh were the surface of a
-        solid.
+        solid. The directions divide the sphere equally (see `sphere`), and each result is
+        for the next block of pixels.
         """
         fragments = surface.fragments
         pixels = self._pixels_to_cast(surface)
@@ -268,7 +269,9 @@ class Rays:
         First, a vertex of the mesh lies above the plane of the face on which the
         sample lies. Second, the shading normal differs from the normal of the face
         by an angle a, so that the plane of the face blocks the fraction
-        (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
+        (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`. All pixels
+        are returned if the test would need more than `MAX_COMPARISONS` comparisons and
+        would take longer than the rays.
         """
         fragments = surface.fragments
         plane_normals = surface.face_planes
@@ -295,7 +298,10 @@ class Rays:
         directions: Float[Tensor, "N 3"],
         lengths: Float[Tensor, " N"] | None = None,
     ) -> Int[Tensor, " N"]:
-        """Find the first face that each of N rays hits."""
+        """Find the first face that each of N rays hits, or `NO_FACE`, in world axes and units.
+
+        Rays are infinite if `lengths` is None.
+        """
         rays = [origins, directions] if lengths is None else [origins, directions, lengths]
         faces = self._scene.run(
             *(np.ascontiguousarray(array.numpy(), np.float32) for array in rays)

@@ -138,7 +138,8 @@ class Patches:
         """Average values over each of the N patches.
 
         A patch is a group of sides (fronts or backs) of pieces, the small faces of
-        the mesh.
+        the mesh. The means are weighted with the areas of the pieces. The values are in the
+        order of the samples of `view`.
         """
         patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
         return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
@@ -148,7 +149,8 @@ class Patches:
     ) -> csr_matrix:
         """Add up the weights of the rays from a pixel that hit the same patch.
 
-        A patch is a group of pieces, the small faces of the mesh `pieces`.
+        A patch is a group of pieces, the small faces of the mesh `pieces`. The result has
+        one row for each pixel, and one column for each patch.
         """
         is_hit = hits.face_of_ray != rays.NO_FACE
         # Pixel and direction of each ray that hits a face and has a nonzero weight.
@@ -178,7 +180,8 @@ def _group_sides(
     The faces of the mesh are small. They are called pieces. Two sides belong to
     the same patch if the centers of their pieces lie in the same cell of a cubic
     grid, if the normals are equal after each component is rounded to -1, 0 or 1,
-    and if both sides are fronts or both are backs.
+    and if both sides are fronts or both are backs. The width of a cell is in world units.
+    The result is the index of the patch of each side.
     """
     centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
     normals = pieces.face_normals()[piece_of_side]
@@ -230,7 +233,11 @@ class Transport:
     def change(
         self, surface: Surface, albedo: Float[Tensor, "S C"]
     ) -> Float[Tensor, "C K P"] | None:
-        """Compute how shadows and bounces change the transfer matrix of a view."""
+        """Compute how shadows and bounces change the transfer matrix of a view.
+
+        The albedo has 3 channels if `has_colored_light` is true, and otherwise 1 or 3. None
+        means that no surface blocks light.
+        """
         change = None
         fragments = surface.fragments
         gloss = surface.gloss
@@ -278,7 +285,8 @@ class Transport:
     ) -> Float[Tensor, "K B"]:
         """Compute the light that B pixels receive from patches and reflect, in one color channel.
 
-        A patch is a group of small faces (pieces) of the mesh.
+        A patch is a group of small faces (pieces) of the mesh. `blocked` is the reflected
+        radiance per unit radiance from each direction, and 0 in directions of the sky.
         """
         # Radiance that the patches send: one row for each patch, one column for each SH
         # coefficient.
@@ -286,21 +294,21 @@ class Transport:
         received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
         return torch.from_numpy(received).T
 
-    def _cosines(
-        self, surface: Surface, sample_of_ray: Float[Tensor, "B D"]
-    ) -> Float[Tensor, "B D"]:
+    def _cosines(self, surface: Surface, sample_of_ray: Int[Tensor, "B D"]) -> Float[Tensor, "B D"]:
         """Compute the cosine between each ray and the shading normal at its start."""
         normals = surface.normals[sample_of_ray]
         return torch.einsum("bdi,di->bd", normals, self._directions)
 
     def _reflect_rays(
-        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Float[Tensor, "B D"]
+        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Int[Tensor, "B D"]
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular reflectance of B pixels for light along their rays.
 
         The specular reflection may be narrower than the angle between two of the
         D ray directions. The reflectances of a pixel are therefore scaled so that
-        their sum over the directions is exact for uniform light.
+        their sum over the directions is exact for uniform light. The first result is
+        multiplied by the albedo, because metals color reflections. The second has the color
+        of the light.
         """
         to_camera = at_samples(surface.toward, sample_of_ray)
         normals = surface.normals[sample_of_ray]
@@ -322,7 +330,8 @@ class Transport:
         """Compute how shadows and bounces change the radiance of a view under one light.
 
         The result is differentiable with respect to the light, but not with
-        respect to the albedo.
+        respect to the albedo. The change is multiplied by the fraction of each pixel that
+        the mesh covers.
         """
         with torch.no_grad():
             change = self.change(surface, albedo.detach().cpu().double())
@@ -338,7 +347,8 @@ def build_transport(
     """Prepare the computation of shadows and bounces of environment light.
 
     The shadows of lamps and projectors are not included. They are computed in
-    `renderer.operators.lamp_paths`.
+    `renderer.operators.lamp_paths`. The result is None without shadows and bounces, or
+    without environment light. Bounces with local lights raise `InputError`.
     """
     if basis.local_lights and settings.bounces:
         raise InputError(
@@ -359,7 +369,8 @@ def _radiosity(
     After one bounce, patch i with albedo ρ_i sends the radiance
     B_i = ρ_i / π S_i, where S_i is its irradiance from the sky. After each further
     bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij is the irradiance of patch i
-    per unit radiance of patch j.
+    per unit radiance of patch j. The last axis of the result has size 1 if all patches are
+    gray.
     """
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
     # Mean albedo: one row for each patch, one column for each color.

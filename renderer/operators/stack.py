@@ -224,7 +224,10 @@ class TransferOperators(Sequence[TransferOperator]):
     def _image_by_image(
         self, lights: Float[Tensor, "V ... coefficients 3"], background: Tensor
     ) -> Float[Tensor, "V ... 3 size size"]:
-        """Render all V views in a loop over the operators."""
+        """Render all V views in a loop over the operators.
+
+        A background has the shape (3, size, size), or that of the result.
+        """
         size = self._operators[0].settings.size
         if background.ndim == 3:
             background = background.expand(len(self), COLORS, size, size)
@@ -299,7 +302,11 @@ class ScatterLayers(torch.autograd.Function):
         targets: Sequence[tuple[Rows, Tensor]],
         *layers: Tensor,
     ) -> Tensor:
-        """Write the values of all layers into the images."""
+        """Write the values of all layers, shape (B, 3, P) each, into the images in place.
+
+        A target selects B images by a slice or by indices, and P pixels by row-major
+        indices.
+        """
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, layers, strict=True):
             # `scatter_` takes half the time of `index_copy_` on a CPU.
@@ -348,7 +355,10 @@ class OperatorStack:
         shown: Int[Tensor, " N"],
         device: torch.device | str = "cpu",
     ):
-        """Copy operators into common tensors."""
+        """Copy operators into common tensors.
+
+        `shown` is the index of the operator of each image.
+        """
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
         # If the number of coefficients is odd, append coefficient 0 once more. Its additional
@@ -399,7 +409,8 @@ class OperatorStack:
         A batched product needs the same number of lights for each operator. The
         lights are therefore written to a table with one row for each operator that
         the images show, and one column (slot) for each of its images. Slots stay
-        empty if an operator has fewer images than another operator.
+        empty if an operator has fewer images than another operator. `images` are indices on
+        the CPU.
         """
         operator_of_image = self.shown[images]
         operators, image_to_row, images_per_row = torch.unique(
@@ -434,7 +445,11 @@ class OperatorStack:
     def _select_entries(
         self, sparse: SparseTransfer, operator_of_image: Int[Tensor, " A"]
     ) -> tuple[SparseTransfer, Tensor]:
-        """Select the nonzero matrix entries of the operators that A images show."""
+        """Select the nonzero matrix entries of the operators that A images show.
+
+        The entries of the first image come first. The second result is the index of the
+        image of each entry, from 0 to A - 1.
+        """
         first_in_stack = self._first_entry[operator_of_image]
         entry_count = self._first_entry[operator_of_image + 1] - first_in_stack
         image_of_entry = torch.arange(len(operator_of_image)).repeat_interleave(entry_count)
