@@ -166,7 +166,10 @@ class Fragments:
         return weights.T
 
     def positions(self) -> Float[Tensor, "S 2"]:
-        """Compute the positions of the S covered samples in the image."""
+        """Compute the positions of the S covered samples in the image.
+
+        x points to the right and y up, and the image is [-1, 1] in both.
+        """
         # Dividing floating-point numbers takes a tenth of the time of dividing integers.
         pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
         pixel_row, pixel_column = _divide(pixel_index, self.size)
@@ -180,7 +183,10 @@ class Fragments:
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
     def by_sample(self) -> "Fragments":
-        """Return a copy for a finer image, in which each sample is a pixel."""
+        """Return a copy for a finer image, in which each sample is a pixel.
+
+        The samples keep their order, and the finer image has one sample per pixel.
+        """
         resolution = self.size * self.samples
         # Row-major index of each pixel of the finer image.
         finer_indices = torch.arange(resolution**2, device=self.sample_numbers.device)
@@ -226,7 +232,10 @@ class Fragments:
         return copied
 
     def image_of_samples(self, values: Float[Tensor, " S"], empty: float) -> Float[Tensor, "_ _"]:
-        """Arrange values at samples as an image with one pixel per sample."""
+        """Arrange values at samples as an image with one pixel per sample.
+
+        Samples that show no mesh get the value `empty`. Row 0 is at the top.
+        """
         image = values.new_full((self.size**2 * self.samples**2,), empty)
         image.index_copy_(0, self.sample_numbers, values)
         # Axes: row of a pixel, column of a pixel, row in the pixel, column in the pixel.
@@ -271,7 +280,9 @@ class Fragments:
         """Add up the albedo of the samples of a pixel that show the same face.
 
         With flat normals, the samples of such a group have the same normal, so they
-        can be shaded together.
+        can be shaded together. The results are, for each of R groups, the index into
+        `pixels`, the index into `faces`, and the sum of the albedo divided by the number of
+        samples of a pixel, which is differentiable.
         """
         if self.samples == 1 or len(self.sample_to_pixel) == 0:
             # Each sample is a group of its own if a pixel has one sample.
@@ -331,7 +342,11 @@ class _Interpolation(torch.autograd.Function):
         sample_to_seen_face: Int[Tensor, " S"],
         weights: Float[Tensor, "3 S"],
     ) -> Float[Tensor, "D S"]:
-        """Interpolate D values from the three corners of a face to each of S samples."""
+        """Interpolate D values from the three corners of a face to each of S samples.
+
+        The rows of `corner_rows` are D values at the first corners, then D at the second
+        and D at the third ones.
+        """
         ctx.save_for_backward(sample_to_seen_face, weights)
         ctx.corner_rows_shape = corner_rows.shape
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
@@ -361,7 +376,9 @@ def _distribute(
 ) -> Float[Tensor, "_ G"]:
     """Add up values at S samples for each corner of the faces that the samples show.
 
-    Each value is multiplied by the barycentric weight of the corner at the sample.
+    Each value is multiplied by the barycentric weight of the corner at the sample. The rows
+    of the result are D sums for the first corners, then D for the second and D for the
+    third ones.
     """
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
@@ -377,7 +394,7 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def _divide(numbers: Float[Tensor, " S"], divisor: int) -> tuple[Tensor, Tensor]:
-    """Divide whole numbers that are stored as floating-point numbers."""
+    """Divide whole numbers that are stored as floats into whole quotients and remainders."""
     quotient = (numbers / divisor).floor()
     return quotient, numbers - quotient * divisor
 
@@ -390,7 +407,12 @@ def build_fragments(
     rasterizer: Rasterizer,
     closed: bool = False,
 ) -> list[Fragments]:
-    """Rasterize a mesh once for each camera to find the samples that show the mesh."""
+    """Rasterize a mesh once for each camera to find the samples that show the mesh.
+
+    Vertices are in world axes. With `closed` (see `Mesh.closed`), faces that are seen from
+    behind are not drawn, except if the near plane cuts the mesh open. A mesh that reaches a
+    perspective camera raises `InputError`.
+    """
     require_finite(vertices=torch.from_numpy(vertices))
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
@@ -422,7 +444,7 @@ class _CoveredSamples(NamedTuple):
     """
 
     pixels: Int[np.ndarray, " P"]
-    sample_count: Float[np.ndarray, " P"]
+    sample_count: Int[np.ndarray, " P"]
     sample_to_pixel: Int[np.ndarray, " S"]
 
 
@@ -434,7 +456,10 @@ def _fragments_of_view(
     faces: Int[np.ndarray, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
-    """Create the `Fragments` of one view from the face at each sample of its image."""
+    """Create the `Fragments` of one view from the face at each sample of its image.
+
+    `depths` is None without perspective, and a sample without a face has the index -1.
+    """
     size = settings.size
     samples = settings.samples
     # Neighboring samples in a row of the same pixel become one item, which is faster to
@@ -472,9 +497,13 @@ def _fragments_of_view(
 
 
 def _group_by_pixel(
-    covered_samples: Float[np.ndarray, " S"], size: int, samples: int
+    covered_samples: Int[np.ndarray, " S"], size: int, samples: int
 ) -> _CoveredSamples:
-    """Find the pixels to which the S covered samples of an image belong."""
+    """Find the pixels to which the S covered samples of an image belong.
+
+    The samples are ascending numbers, and all samples of the image are numbered pixel by
+    pixel.
+    """
     if samples == 1:
         # Sample numbers and pixel indices are the same if a pixel has one sample.
         return _CoveredSamples(
@@ -493,11 +522,12 @@ def _group_by_pixel(
     )
 
 
-def _compact(values: Float[np.ndarray, " S"], limit: int) -> tuple[np.ndarray, np.ndarray]:
+def _compact(values: Int[np.ndarray, " S"], limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the distinct values of an array, and the index of each entry among them.
 
     The result equals that of np.unique with return_inverse=True. This function
-    is faster, because it does not sort.
+    is faster, because it does not sort. All values are whole numbers in [0, limit), and the
+    distinct values are ascending.
     """
     # Convert the indices once here. Otherwise, each of the two lookups would convert them.
     values = values.astype(np.intp)

@@ -40,7 +40,7 @@ def rasterize(
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
-    coordinates and the rounding.
+    coordinates and the rounding. Samples without a face get -1.
     """
     # Unsigned indices are faster: compiled code checks signed indices for negative values.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
@@ -79,7 +79,7 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_njit
 def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
-    """Compute twice the signed area of the triangle with the vertices a, b and c."""
+    """Compute twice the signed area of a triangle, negative if counter-clockwise in the image."""
     return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
 
 
@@ -87,7 +87,11 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 def _covered_range(
     coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int
 ) -> tuple[int, int]:
-    """Find the range of rows, or of columns, in which a triangle can cover samples."""
+    """Find the range of rows, or of columns, in which a triangle can cover samples.
+
+    `coordinates` are y of all vertices for rows and x for columns, with `bits` fractional
+    bits. The results are the first row, and the first row after the range.
+    """
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
     # The operator >> divides by 2^bits and rounds down. The two minus signs make it round
@@ -97,7 +101,7 @@ def _covered_range(
 
 @_njit
 def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort three corners by y, from the top to the bottom."""
+    """Sort three corners by y, which points down: x and y of the top, middle and bottom corner."""
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     if by > cy:

@@ -55,7 +55,7 @@ def rasterize(
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
-    coordinates and the rounding.
+    coordinates and the rounding. Samples without a face get -1.
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
@@ -77,8 +77,8 @@ class _TriangleRows(NamedTuple):
     """
 
     triangle_index: Int[np.ndarray, " T"]
-    first_row: Float[np.ndarray, " T"]
-    row_count: Float[np.ndarray, " T"]
+    first_row: Int[np.ndarray, " T"]
+    row_count: Int[np.ndarray, " T"]
 
 
 def _keys(
@@ -106,8 +106,8 @@ def _keys(
 
 
 def _draw(
-    keys: Float[np.ndarray, " R²"],
-    triangles: Float[np.ndarray, "2 3 T"],
+    keys: Int[np.ndarray, " R²"],
+    triangles: Int[np.ndarray, "2 3 T"],
     depths: Float[np.ndarray, "3 T"],
     rows: _TriangleRows,
     face_ids: Int[np.ndarray, " T"],
@@ -151,7 +151,9 @@ def to_fixed_point(
 
     The unit of the positions is a subsample, 1/256 of the distance of two samples.
     As on GPUs, positions in samples are computed with one multiplication and one
-    addition, rounded to float32, and then rounded to subsamples.
+    addition, rounded to float32, and then rounded to subsamples. Positions are x to the
+    right and y down from the center of the first sample. Points have the image in [-1, 1]
+    and the near plane at the depth -1.
     """
     half = resolution / 2
     # Positions from the top left corner of the image, in samples. The product with a
@@ -169,7 +171,7 @@ def to_fixed_point(
     return positions, depths
 
 
-def _cull(triangles: Float[np.ndarray, "2 3 F"], resolution: int, closed: bool) -> _TriangleRows:
+def _cull(triangles: Int[np.ndarray, "2 3 F"], resolution: int, closed: bool) -> _TriangleRows:
     """Find the triangles that can cover samples, and their rows.
 
     By the top-left rule, a sample on an edge belongs to the triangle to the
@@ -193,8 +195,8 @@ def _cull(triangles: Float[np.ndarray, "2 3 F"], resolution: int, closed: bool) 
     )
 
 
-def _doubled_areas(triangles: Float[np.ndarray, "2 3 F"]) -> Float[np.ndarray, " F"]:
-    """Compute twice the signed areas of F triangles."""
+def _doubled_areas(triangles: Int[np.ndarray, "2 3 F"]) -> Int[np.ndarray, " F"]:
+    """Compute twice the signed areas of F triangles, negative if counter-clockwise in the image."""
     (ax, bx, cx), (ay, by, cy) = triangles
     return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
 
@@ -204,7 +206,7 @@ def _next_sample(positions: np.ndarray) -> np.ndarray:
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
-def _sort(corners: Int[np.ndarray, "3 T"]) -> Float[np.ndarray, "3 T"]:
+def _sort(corners: Int[np.ndarray, "3 T"]) -> Int[np.ndarray, "3 T"]:
     """Sort the three values of each column of an array, several times faster than np.sort."""
     least = corners.min(axis=0)
     greatest = corners.max(axis=0)
@@ -228,10 +230,10 @@ class _EdgeLines(NamedTuple):
     """
 
     coefficients: np.ndarray
-    middle_row: Float[np.ndarray, " T"]
+    middle_row: Int[np.ndarray, " T"]
 
 
-def _edges(triangles: Float[np.ndarray, "2 3 T"]) -> _EdgeLines:
+def _edges(triangles: Int[np.ndarray, "2 3 T"]) -> _EdgeLines:
     """Compute the lines through the edges of T triangles."""
     x, y = triangles
     # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
@@ -255,10 +257,13 @@ def _edges(triangles: Float[np.ndarray, "2 3 T"]) -> _EdgeLines:
 def _crossings(
     edges: _EdgeLines,
     triangle: Int[np.ndarray, " N"],
-    row: Float[np.ndarray, " N"],
+    row: Int[np.ndarray, " N"],
     resolution: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row."""
+    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row.
+
+    The results are the first covered column, and the first column after the covered ones.
+    """
     is_below_middle = row >= edges.middle_row.take(triangle)
     triangle_count = len(edges.middle_row)
     # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
@@ -274,9 +279,13 @@ def _crossings(
 
 
 def _planes(
-    triangles: Float[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
+    triangles: Int[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
 ) -> Float[np.ndarray, "5 T"]:
-    """Compute the depth of T triangles as a linear function of column and row."""
+    """Compute the depth of T triangles as a linear function of column and row.
+
+    The rows are the column, the row and the depth of the first corner, and the slopes of
+    the depth per column and per row.
+    """
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
     to_b = depth_b - depth_a
@@ -287,7 +296,7 @@ def _planes(
     return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
 
 
-def _expand(counts: Float[np.ndarray, " N"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _expand(counts: Int[np.ndarray, " N"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Repeat the index of each item as often as its count, and number the repetitions.
 
     For example, the counts 2 and 3 give the indices 0, 0, 1, 1, 1 and the numbers

@@ -62,7 +62,7 @@ def rasterize(
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility.rasterizer` defines the
-    coordinates and the rounding.
+    coordinates and the rounding. Samples without a face get -1.
     """
     # Sort the corners, so that two faces with the same corners in another order get exactly
     # the same depth. If the orientation of faces matters, the corners are only rotated, so
@@ -84,7 +84,11 @@ def device() -> str:
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
-    """Create an OpenGL context for a `with` block, and check that it draws correctly."""
+    """Create an OpenGL context for a `with` block, and check that it draws correctly.
+
+    Without an EGL device, or if the driver fails or renders wrong indices, it raises
+    `InputError`.
+    """
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.
     with suppress(ImportError):

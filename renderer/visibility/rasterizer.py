@@ -66,7 +66,11 @@ class Rasterizer:
         resolution: int,
         closed: bool = False,
     ) -> Int[np.ndarray, "N R R"]:
-        """Find the nearest face at each sample of N images."""
+        """Find the nearest face at each sample of N images, or -1.
+
+        x and y of the points are in [-1, 1] in the image, and the third coordinate is the
+        depth. `closed` leaves out faces that are seen from behind.
+        """
         lowest = points.min(initial=0)
         highest = points.max(initial=0)
         if not (np.isfinite(lowest) and np.isfinite(highest)):
@@ -80,7 +84,11 @@ class Rasterizer:
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
-    """Choose a rasterizer that works on this machine."""
+    """Choose a rasterizer that works on this machine.
+
+    "auto" chooses numba if it is installed, and numpy otherwise, so that images are the
+    same on every machine.
+    """
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
         return Rasterizer("opengl", f"opengl ({opengl.device()})")

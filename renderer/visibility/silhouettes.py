@@ -101,7 +101,9 @@ def moving_outlines(
     Rasterized images lack this gradient. Adding the zeros to an image adds the
     gradient and does not change the values. Not only the P covered pixels have
     such a gradient, but also E uncovered pixels beside silhouettes. The gradient
-    reaches the vertices, and the fields of the camera that are tensors.
+    reaches the vertices, and the fields of the camera that are tensors. The results are the
+    row-major indices of the E uncovered pixels, and the zeros for the P covered and then
+    these pixels. The background is that of all pixels, and it is linear.
     """
     positions, nearness = camera.homogeneous(vertices.double())
     sample_indices = torch.arange(
@@ -148,7 +150,10 @@ class _ZerosWithGradient(torch.autograd.Function):
     def forward(
         ctx: Any, positions: Float[Tensor, "V 3"], view: _MovingView
     ) -> Float[Tensor, "3 _"]:
-        """Create the zeros, and store the view and the positions for `backward`."""
+        """Create the zeros, and store the view and the positions for `backward`.
+
+        The positions are homogeneous, (x w, y w, w).
+        """
         ctx.save_for_backward(positions)
         ctx.view = view
         pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
@@ -194,7 +199,11 @@ class _MovingView:
     def gradient_of_surfaces(
         self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]
     ) -> Float[Tensor, "V 3"]:
-        """Compute the gradient with respect to movements of surfaces, without silhouettes."""
+        """Compute the gradient with respect to movements of surfaces, without silhouettes.
+
+        The positions are homogeneous, and `upstream` is for the P covered and then the E
+        uncovered pixels.
+        """
         fragments = self.fragments
         upstream_at_samples = upstream.index_select(1, fragments.sample_to_pixel)
         # Radiance times upstream gradient, summed over the color channels.
@@ -231,7 +240,11 @@ class _MovingView:
         weighted_image: Float[Tensor, "_ _"],
         upstream_at_samples: Float[Tensor, "3 S"],
     ) -> Float[Tensor, " S"]:
-        """Compute the gradient with respect to movements of surfaces along one image axis."""
+        """Compute the gradient with respect to movements of surfaces along one image axis.
+
+        `axis` is X for movements to the right, or Y for movements down. The image is
+        radiance times upstream gradient, summed over the colors, and NaN where no mesh is.
+        """
         # Rows are dimension 0 of the image, so the axis X (0) is dimension 1.
         dim = 1 - axis
         steps = len(self.sample_grid) - 1
@@ -262,7 +275,8 @@ class _MovingView:
 
         The two pixels have different upstream gradients. The correct difference is
         the difference of the two radiances times the mean of the two upstream
-        gradients.
+        gradients. `difference` is the product of radiance and upstream gradient of a sample
+        minus that of the next one along `dim`.
         """
         samples = self.fragments.samples
         # Slices of the image for the last samples of all pixels but the last one (before),
@@ -292,7 +306,9 @@ class _MovingView:
         A crossing is a place where a silhouette edge passes between two samples.
         An edge with the unit normal n that moves by v moves along a row by
         n · v / n_x. Its crossing with the row has the weight n_x², so that the
-        product is n_x (n · v).
+        product is n_x (n · v). The results are the vertices at the first and then at the
+        second ends of the K edges, and the gradients with respect to their homogeneous
+        positions.
         """
         crossings = self.crossings
         # Component of the edge normal in the direction from the first to the second sample,
@@ -339,7 +355,10 @@ class _MovingView:
     def _seen_radiance(
         self, samples: Int[Tensor, " K"], pixels: Int[Tensor, " K"]
     ) -> Float[Tensor, "3 K"]:
-        """Look up the radiance at K samples, or the background if a sample shows no mesh."""
+        """Look up the radiance at K samples, or the background if a sample shows no mesh.
+
+        `samples` are indices of covered samples or NOT_COVERED, and `pixels` are row-major.
+        """
         return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
@@ -357,7 +376,7 @@ def _to_homogeneous(
 
 
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
-    """Find the pixels to which samples of an image belong."""
+    """Find the row-major pixels to which samples, row-major in the whole image, belong."""
     samples = fragments.samples
     resolution = fragments.size * samples
     row = cells // resolution // samples
@@ -372,7 +391,11 @@ def _find_crossings(
     faces: Int[np.ndarray, "F 3"],
     sample_grid: Int[np.ndarray, "_ _"],
 ) -> Crossings:
-    """Find where visible silhouette edges pass between neighboring samples."""
+    """Find where visible silhouette edges pass between neighboring samples.
+
+    `nearness` is larger for nearer points, and linear in the image position on each face.
+    Crossings with rows of samples come first, then those with columns.
+    """
     x, y, w = positions.T
     points = np.stack([x / w, y / w, nearness]).T
     # Positions (x, y) of the vertices, with y down, in units of samples. They are rounded
@@ -415,11 +438,15 @@ class _Silhouettes:
     places: Float[np.ndarray, "2 V"]
     nearness: Float[np.ndarray, " V"]
     sample_grid: Int[np.ndarray, "_ _"]
-    ends: Float[np.ndarray, "2 N"]
+    ends: Int[np.ndarray, "2 N"]
     normal: Float[np.ndarray, "2 N"]
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
-        """Find where visible silhouettes pass between samples that are neighbors along an axis."""
+        """Find where visible silhouettes pass between samples that are neighbors along an axis.
+
+        `axis` is X for neighbors in a row, and the arrays are those of `Crossings`, in
+        order.
+        """
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
@@ -472,7 +499,9 @@ class _Silhouettes:
 
         A cut is the place where an edge crosses a row or a column of samples. The
         edge is hidden there if the surfaces at both samples beside it are nearer to
-        the camera. It counts as hidden, too, if no sample beside it shows a surface.
+        the camera. It counts as hidden, too, if no sample beside it shows a surface. The
+        two rows are for the samples before and after each cut. The nearness is larger for
+        nearer points.
         """
         tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
         start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
@@ -490,7 +519,8 @@ class _Silhouettes:
         """Compute how near the faces beside K cuts are, if they are extended to the cuts.
 
         A cut is the place where a silhouette edge crosses a row or a column of
-        samples. The faces are those that the samples before and after it show.
+        samples. The faces are those that the samples before and after it show. The result
+        is minus infinity for NOT_COVERED. Places are in units of samples.
         """
         sample_to_seen_face = self.fragments.sample_to_seen_face.numpy()
         # Axes: before or after the cut, cut, corner. The index -1 (NOT_COVERED) selects an
@@ -513,9 +543,9 @@ class _Silhouettes:
 
 
 def _smallest_in_groups(
-    values: Float[np.ndarray, " N"], groups: Float[np.ndarray, " N"]
+    values: Float[np.ndarray, " N"], groups: Int[np.ndarray, " N"]
 ) -> np.ndarray:
-    """Find the smallest value of each group of values."""
+    """Find the index of the smallest value of each group, in ascending order of the groups."""
     # Sort by the group, and then by the value.
     order = np.lexsort([values, groups])
     is_first_of_group = np.diff(groups[order], prepend=-1) != 0
@@ -583,8 +613,11 @@ def _cut_edges(
 
 def _silhouette_edges(
     places: Float[np.ndarray, "2 V"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "2 N"]:
-    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image."""
+) -> Int[np.ndarray, "2 N"]:
+    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image.
+
+    The result has the vertices at both ends of each edge.
+    """
     edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
@@ -619,15 +652,16 @@ class _Edges(NamedTuple):
     corners: Int[np.ndarray, "3 F"]
     ends: Int[np.ndarray, "2 N"]
     edge_of_face_side: Int[np.ndarray, " 3*F"]
-    direction: Int[np.ndarray, "3 F"]
-    face_count: Float[np.ndarray, " N"]
+    direction: Float[np.ndarray, "3 F"]
+    face_count: Int[np.ndarray, " N"]
 
 
 @lru_cache(maxsize=4)
 def _edges(face_bytes: bytes) -> _Edges:
     """Find the edges of a mesh.
 
-    Each face has three sides. Sides with the same two vertices are one edge.
+    Each face has three sides. Sides with the same two vertices are one edge. The argument
+    holds int64 vertex indices as bytes, because the cache needs a key that can be hashed.
     """
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
     corners = np.ascontiguousarray(faces.T)
