@@ -50,7 +50,7 @@ class Texture:
         """Create a texture from a tensor of linear values.
 
         The values that `look_up` returns are differentiable with respect to the
-        tensor.
+        tensor. NaN or infinite values raise `InputError`.
         """
         require_bounded(texture=values)
         height = values.shape[0]
@@ -68,7 +68,8 @@ def surface_albedo(
 
     The albedo is the interpolated color of the face corners times the interpolated
     texture. Colors and texels are decoded to linear values before they are
-    interpolated.
+    interpolated. `textures` are linear, replace those of the mesh, and get a gradient. The
+    result is linear, too.
     """
     colors = _interpolated_colors(mesh, fragments, encoding)
     textures_to_sample: list[Texture] = []
@@ -84,7 +85,11 @@ def surface_albedo(
 def sample_textures(
     textures: Sequence[Texture], mesh: Mesh, fragments: Fragments
 ) -> Float[Tensor, "C S"]:
-    """Look up the textures of a mesh at the samples of a view, with interpolation."""
+    """Look up the textures of a mesh at the samples of a view, with interpolation.
+
+    Samples of faces without a texture have the value 1. `mesh.texture_ids` are
+    indices into `textures`.
+    """
     sample_uvs = _interpolated_uvs(mesh, fragments)
     texture_of_face = _texture_of_seen_face(mesh, fragments)
     # All faces of most meshes have the same texture. Then it is looked up at all samples.
@@ -130,7 +135,11 @@ def interpolate_texture(texture: Texture, uvs: Float[Tensor, "2 N"]) -> Float[Te
 
 
 def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
-    """Find the four texels around each of N points, and their weights for interpolation."""
+    """Find the four texels around each of N points, and their weights for interpolation.
+
+    The pairs of weight and index (row · width + column) are for the upper left, upper
+    right, lower left and lower right texel.
+    """
     u, v = uvs
     # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)
@@ -146,7 +155,9 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
 def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor, Tensor]]:
     """Find the two columns of texels, or the two rows, between which each of N points lies.
 
-    Columns and rows are both called lines.
+    Columns and rows are both called lines. The pairs of index and weight are for the line
+    before and the line after a point. Indices are whole floating-point numbers in [0,
+    count).
     """
     # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5
@@ -164,7 +175,10 @@ def _modulo(index: Float[Tensor, " N"], count: int) -> Float[Tensor, " N"]:
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
-    """Convert the 8-bit textures of a mesh to `Texture` objects, which return linear values."""
+    """Convert the 8-bit textures of a mesh to `Texture` objects, which return linear values.
+
+    The values get the device and dtype of `like`.
+    """
     # A channel has only 256 possible values. A table with the linear value of each saves
     # decoding every texel.
     eight_bit_values = torch.arange(256, dtype=torch.float64) / 255
@@ -183,7 +197,10 @@ def _look_up_packed(
     linear_values: Float[Tensor, " 256"],
     texels: Int[Tensor, " N"],
 ) -> Float[Tensor, "3 N"]:
-    """Look up the linear values of N texels of a texture with one integer per texel."""
+    """Look up the linear values of N texels of a texture with one integer per texel.
+
+    Bits 0 to 7 of a texel are red, 8 to 15 green and 16 to 23 blue.
+    """
     first_bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=packed_texels.device)
     # Values from 0 to 255: one row for each color, one column for each texel.
     eight_bit_values = (packed_texels.index_select(0, texels) >> first_bits) & 255
@@ -213,7 +230,8 @@ def paint_faces(
     The albedo is scaled. Then the hue is rotated and a color is added at corners
     and texels (`changed_albedo`), before they are interpolated. The changed albedo
     can therefore be stored in image files (see `renderer.surface.texture_bake`).
-    The result is differentiable with respect to `added` and `hue`.
+    The result is differentiable with respect to `added` and `hue`. `added` is linear, and
+    `hue` is in degrees, or None for unchanged hues.
     """
     sample_to_seen_face = fragments.sample_to_seen_face
     added_at_samples = face_albedo(added, fragments)
@@ -285,7 +303,7 @@ def changed_albedo(
 
     The hue is rotated about the gray axis of RGB space, which preserves the mean
     of the three channels (Haeberli 1993). A channel is clamped to [0, 1], or to
-    [0, albedo] if its albedo is above 1.
+    [0, albedo] if its albedo is above 1. Hues are in degrees, and colors are linear.
     """
     rotated = albedo
     if hue is not None:
@@ -299,7 +317,11 @@ def changed_albedo(
 
 
 def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, " 3"] | None:
-    """Return the albedo of the faces that a view shows if all of them have the same albedo."""
+    """Return the albedo of the faces that a view shows if all of them have the same albedo.
+
+    The result is linear. It is None if a texture or two colors prevent it, or if the view
+    shows no face.
+    """
     if mesh.packed_textures:
         return None
     # One row for each corner of the seen faces, one column for each channel.
@@ -343,7 +365,7 @@ def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Float[Tensor, "2 S"]:
 
 
 def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Int[Tensor, " G"]:
-    """Return the index of the texture of each of the G faces that a view shows."""
+    """Return the index of the texture of each of the G faces that a view shows, or `NO_TEXTURE`."""
     seen_faces = fragments.faces.cpu().numpy()
     texture_ids = torch.from_numpy(mesh.texture_ids.take(seen_faces))
     return texture_ids.to(fragments.sample_to_seen_face.device)

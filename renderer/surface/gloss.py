@@ -183,7 +183,8 @@ class SampleGloss(NamedTuple):
 
         A lobe is the specular reflectance as a function of the direction to the
         light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, the values
-        of `renderer.surface.lobes.lobe_functions`.
+        of `renderer.surface.lobes.lobe_functions`. The first lobe is multiplied by the
+        albedo, and None if no sample is metallic. The second has the color of the light.
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
         dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
@@ -198,7 +199,11 @@ class SampleGloss(NamedTuple):
     def reflect_uniform_light(
         self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"]
     ) -> tuple[Tensor | None, Tensor]:
-        """Compute the specular radiance of S samples under uniform light of irradiance 1."""
+        """Compute the specular radiance of S samples under uniform light of irradiance 1.
+
+        The first result is multiplied by the albedo, and None if no sample is metallic. The
+        second has the color of the light.
+        """
         cosine = (normals * toward).sum(1).clamp(0, 1)
         colored, white = self.lobes(cosine, degree=0)
         white_radiance = white[0] * _UNIFORM_COEFFICIENT
@@ -212,7 +217,7 @@ class SampleGloss(NamedTuple):
         The coat is a transparent layer on a diffuse layer. The fraction is
         1 - s E(μ). E(μ) is the fraction that a coat with the specular factor s = 1
         reflects (`coat_albedo`). The result is differentiable with respect to the
-        cosine and to the gloss.
+        cosine and to the gloss. Negative cosines count as 0.
         """
         return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
@@ -223,7 +228,8 @@ class SampleGloss(NamedTuple):
         U_lm of the light, the harmonics Y_lm, the normal n and the specular
         factor s. A_l is the factor without a coat (`lambertian_factors`), and
         B_l the factor of the light that the coat reflects (`coat_irradiance_factors`). The
-        result is differentiable with respect to the gloss.
+        result is differentiable with respect to the gloss. The last axis has size 1 if all
+        samples have the same gloss.
         """
         # Factors B_l of the light that the coat reflects: one row for each degree l, one column
         # for each sample.
@@ -257,7 +263,9 @@ class SampleGloss(NamedTuple):
 
         The environment light has K = (degree + 1)² SH coefficients in axes that
         face the camera. The result is differentiable with respect to the vectors
-        and the gloss.
+        and the gloss. The results are the radiance of metals, which must be multiplied by
+        the albedo (None without metals), all other specular radiance, and the axes that
+        face the camera.
         """
         frame = ViewFrame.from_directions(normals, toward)
         colored_lobe, white_lobe = self.lobes(frame.cosine, degree)
@@ -272,7 +280,8 @@ class SampleGloss(NamedTuple):
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular radiance per irradiance for light from single directions.
 
-        The result is differentiable with respect to the vectors and the gloss.
+        The result is differentiable with respect to the vectors and the gloss. The first
+        result is multiplied by the albedo, and the second has the color of the light.
         """
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
         white = self.metallic * edge + (1 - self.metallic) * self.specular_factor * dielectric
@@ -280,7 +289,7 @@ class SampleGloss(NamedTuple):
 
 
 def smallest_roughness(mesh: Mesh) -> float:
-    """Return the smallest roughness of all faces of a mesh that reflect specularly.
+    """Return the smallest roughness of all faces of a mesh that reflect specularly, 1 if matte.
 
     In each texture of the roughness, the 1% of the texels with the smallest
     roughness do not count.
@@ -300,8 +309,11 @@ def smallest_roughness(mesh: Mesh) -> float:
     return float(roughness_of_face.min(initial=1, where=has_gloss))
 
 
-def at_samples(values: Tensor, samples: Tensor | slice) -> Float[Tensor, "1 ..."]:
-    """Select the values of some samples. A single value counts for all samples."""
+def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
+    """Select the values of some samples. A single value counts for all samples.
+
+    It is returned as it is, with size 1 along the first axis.
+    """
     return values if len(values) == 1 else values[samples]
 
 
@@ -311,7 +323,8 @@ def sample_gloss(
     """Look up the specular material (gloss) at the samples of a view that show the mesh.
 
     The result is differentiable with respect to `gloss`. A warning is issued if
-    a roughness is raised to its minimum 0.2.
+    a roughness is raised to its minimum 0.2. A `gloss` of None is that of the mesh, and the
+    result is None for a matte surface.
     """
     # A given gloss uses the textures of the mesh only if its field `textured` is True.
     gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
@@ -350,7 +363,10 @@ def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
 
 
 def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up the value of the face that each sample shows."""
+    """Look up the value of the face that each sample shows.
+
+    A single value, which all faces share, is returned as it is.
+    """
     if len(face_values) == 1:
         return face_values
     seen_face_values = face_values.index_select(0, fragments.faces)
@@ -360,7 +376,8 @@ def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
 def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
     """Compute unit vectors from the S samples of a view to the camera.
 
-    The vectors are differentiable with respect to the vertices.
+    The vectors are differentiable with respect to the vertices. They are in world axes.
+    Without perspective, all samples share one vector, and the shape is (1, 3).
     """
     eye = fragments.eye.to(vertices)
     # `eye` is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with

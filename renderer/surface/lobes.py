@@ -392,7 +392,9 @@ def lobe_functions(
 ) -> Float[Tensor, "T M S"]:
     """Evaluate the lobe functions π c_lm (see the module) at the S samples.
 
-    The result is differentiable with respect to both tensors.
+    The result is differentiable with respect to both tensors. The roughness is in
+    [MIN_ROUGHNESS, 1]. The M functions with 0 ≤ m ≤ l are in ascending order of l and then
+    of m.
     """
     function_count = (degree + 1) * (degree + 2) // 2
     table = _table_like(max(degree, COMMON_DEGREE), cosine.dtype, cosine.device)
@@ -550,7 +552,7 @@ def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     roughness (see `_roughness_to_argument`), and x for the cosine (see
     `_cosine_to_argument`). When a mirror turns by θ, the reflected light turns by
     2 θ. A harmonic of degree l of this light therefore needs polynomials up to
-    degree 2 l in cos θ.
+    degree 2 l in cos θ. The axes are the Fresnel term, the pair (l, m), k and p.
     """
     cosine_count = 2 * degree + EXTRA_POLYNOMIALS
     roughnesses = _argument_to_roughness(_chebyshev_nodes(ROUGHNESS_POLYNOMIALS))
@@ -581,7 +583,7 @@ def lobe_integrals(
     a sum over β of these functions times an integral over φ of the rest of the
     lobe times cos mφ. The azimuths end where the light is on the horizon. The
     substitution tan φ/2 = AZIMUTH_SCALE tan ψ draws their nodes to φ = 0, where
-    the lobe is high.
+    the lobe is high. The integrals are π c_lm s_m (see the module).
     """
     polar_nodes, polar_weights = _gauss_legendre(POLAR_NODE_COUNT)
     azimuth_nodes, azimuth_weights = _gauss_legendre(AZIMUTH_NODE_COUNT)

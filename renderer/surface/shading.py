@@ -62,7 +62,8 @@ def radiance(
     """Compute the linear radiance of the P covered pixels of a matte surface.
 
     The result is differentiable with respect to the vertices, the light and the
-    albedo.
+    albedo. The radiance is multiplied by the covered fraction of each pixel. `normals`
+    come from `normals_in_sight`, or are None for flat shading.
     """
     # Only the albedo is checked here. `area_vectors` checks the vertices, and `irradiance`
     # checks the light.
@@ -246,7 +247,9 @@ def irradiance(
 
     The result is differentiable with respect to the normals and the light. The
     irradiance is the function R in appendix B.2 of Liu et al. 2019. Appendix D has
-    its derivative. Both are evaluated as polynomials of the normal.
+    its derivative. Both are evaluated as polynomials of the normal. The normals have any
+    length. Coefficients of odd degrees from 3 on change nothing, and their gradient is
+    exactly 0.
     """
     require_bounded(light=light)
     # `degree_of` raises InputError if K is not (degree + 1)².
@@ -352,7 +355,9 @@ class _IrradiancePolynomial:
         """Compute the irradiance and its gradient at N unit normals n.
 
         The irradiance is c + a · n + p(n), with the constant c, the vector a and the
-        polynomial p of this object.
+        polynomial p of this object. The irradiance has the shape (3 colors, N), and the
+        gradient (3 components, 3 colors, N). Only its tangential component is the
+        derivative.
         """
         # A tensor of monomials with a name would stay in memory until the function
         # returns.
@@ -377,7 +382,8 @@ def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) ->
     The irradiance is a polynomial c + a · n + p(n) of the normal n. The constant c
     comes from the harmonic of degree 0, the vector a from those of degree 1, and
     the homogeneous polynomial p from those of even degree from 2 on. The gradient
-    is therefore a + ∇p(n).
+    is therefore a + ∇p(n). The shape is (3 components, monomials + 1, coefficients). The
+    last row gives a, and the others ∇p.
     """
     even_degree = _even_degree(degree)
     coefficient_count = (even_degree + 1) ** 2
@@ -406,7 +412,8 @@ def _gradients(degree: int) -> Tensor:
     The harmonic Y_k of degree l, with l of the same parity as `degree`, equals the
     homogeneous polynomial |n|^degree Y_k(n / |n|) on the unit sphere (see
     `harmonics.homogeneous_gradients`). Its gradient is a sum of monomials of
-    degree `degree` - 1.
+    degree `degree` - 1. The shape is (3 components, monomials, (degree + 1)²). Columns are
+    zero for l = 0 and the other parity.
     """
     band = harmonics.bands(degree)
     # Each gradient as a sum of harmonics below `degree`. Axes: component of the gradient,
@@ -419,7 +426,11 @@ def _gradients(degree: int) -> Tensor:
 
 
 def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
-    """Compute the irradiance of N diffuse surfaces from each spherical harmonic."""
+    """Compute the irradiance of N diffuse surfaces from each spherical harmonic.
+
+    The results are the ascending indices of the M harmonics that change the irradiance, and
+    the irradiance for a coefficient of 1, shape (M, N).
+    """
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
     factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
     return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
@@ -459,6 +470,6 @@ def smooth_normals(
     """Interpolate the normals at corners to the samples of a view.
 
     The normals of faces that are seen from behind are reversed, so that they
-    point to the side of the camera.
+    point to the side of the camera. The interpolated normals are not of unit length.
     """
     return fragments.interpolate(corner_normals * fragments.facing[:, :, None].to(corner_normals))

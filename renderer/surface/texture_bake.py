@@ -57,7 +57,9 @@ def with_added_albedo(
 
     An attack rotates the hue of each face and adds a color to it. New textures
     have 8 bits per channel. They hold the product of the old texture and the
-    corner colors, so faces with a texture get white corners.
+    corner colors, so faces with a texture get white corners. `added` is linear, and `hue`
+    in degrees. The second result is the albedo scale for rendering the new mesh: 1, or the
+    largest albedo above 1, because files store values up to 1.
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     eight_bit_values = torch.arange(CHANNEL_VALUES, dtype=torch.float32) / (CHANNEL_VALUES - 1)
@@ -102,7 +104,10 @@ def with_added_albedo(
 def _largest_albedo(
     mesh: Mesh, corner_albedo: Float[Tensor, "F 3 3"], linear_values: Float[Tensor, " 256"]
 ) -> float:
-    """Compute an upper bound of the linear albedo of a mesh."""
+    """Compute an upper bound of the linear albedo of a mesh.
+
+    It is the largest corner color, times the largest texel if all faces have a texture.
+    """
     largest_corner = float(corner_albedo.max())
     if not (mesh.texture_ids >= 0).all():
         return largest_corner
@@ -179,7 +184,10 @@ class _TextureSheet:
         corner_albedo: Float[Tensor, "N 3 3"],
         linear_values: Float[Tensor, " 256"],
     ) -> None:
-        """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss."""
+        """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss.
+
+        `linear_values` has the linear value of each 8-bit value.
+        """
         block_count = 1 + self.charts.texel_count // BLOCK
         for charts in np.array_split(np.arange(len(self._faces)), block_count):
             texels = self.charts.texels(charts)
@@ -204,9 +212,7 @@ class _TextureSheet:
     def _multiply_by_colors(
         self, albedo: Float[Tensor, "T 3"], texels: "_Texels", corner_albedo: Float[Tensor, "N 3 3"]
     ) -> None:
-        """Multiply the albedo of texels by the interpolated corner colors of their faces, in
-        place.
-        """
+        """Multiply albedo of texels in place by the interpolated corner colors of their faces."""
         if not self._mesh.one_color_per_face:
             weights = torch.from_numpy(self.charts.weights(texels)).float()
             # Weighted sum over the three corners k, for each texel n and channel c.
@@ -232,7 +238,7 @@ class _Texels(NamedTuple):
     """
 
     chart: Int[np.ndarray, " T"]
-    sheet_position: Float[np.ndarray, "T 2"]
+    sheet_position: Int[np.ndarray, "T 2"]
     position: Float[np.ndarray, "T 2"]
 
 
@@ -248,7 +254,10 @@ class _Charts:
     """
 
     def __init__(self, uvs: Float[np.ndarray, "N 3 2"], old_size: tuple[int, int]) -> None:
-        """Compute the size of the rectangle of each face, and place it on the new texture."""
+        """Compute the size of the rectangle of each face, and place it on the new texture.
+
+        `old_size` are the columns and rows of the old texture.
+        """
         # Positions of the corners as pairs of column and row, counted from the top. The
         # texture coordinate v points up.
         old_positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * old_size
@@ -272,7 +281,7 @@ class _Charts:
         self.uvs = sheet_positions / self.sheet_size * [1, -1] + [0, 1]
 
     def texels(self, charts: Int[np.ndarray, " M"]) -> _Texels:
-        """List all texels of some charts."""
+        """List all texels of some charts, chart by chart in row-major order."""
         texels_per_chart = self._size[charts].prod(axis=1)
         chart_of_texel = np.repeat(charts, texels_per_chart)
         texels_before_chart = texels_per_chart.cumsum() - texels_per_chart
@@ -308,11 +317,12 @@ class _Charts:
         return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _pack(sizes: Float[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
+def _pack(sizes: Int[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
     """Pack N rectangles on a sheet that is about square.
 
     The rectangles are placed from left to right in rows, the highest rectangle
-    first.
+    first. Sizes are columns and rows. The results are the column and row of the top left
+    corner of each rectangle, and the columns and rows of the sheet.
     """
     area = sizes.prod(axis=1).sum()
     widest = int(sizes[:, 0].max(initial=1))
