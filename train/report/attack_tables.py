@@ -50,7 +50,7 @@ def format_attack(
     checks: Mapping[str, Any] | None,
     lines: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
-    """Describe the attack on one mesh in lines of text for the console."""
+    """Describe the attack on one mesh in lines of text for the console. The first is a summary."""
     has_noise = bool(result.settings.sensor_noise)
     text = [_heading(name, result)]
     if checks is not None:
@@ -108,7 +108,11 @@ def _success(result: AttackResult) -> str:
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
-    """Describe the results of the checks of an attack in lines of text."""
+    """Describe the results of the checks of an attack in lines of text.
+
+    With noise, only an attack that succeeds in spite of it counts; without gradients, the budget is
+    a number of queries.
+    """
     unit = "step" if uses_gradients else "query"
     units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
@@ -133,7 +137,7 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
 
 
 def _format_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a success rate and, if success is measured with noise, the rate without noise."""
+    """Write a rate in [0, 1] as "62%", or "62% (70% without noise)" if success needs noise."""
     if not has_noise:
         return f"{rate:.0%}"
     return f"{rate:.0%} ({without_noise:.0%} without noise)"
@@ -161,7 +165,10 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
 
 
 def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
-    """Write the success of transferred adversaries to a file, and return it as a table."""
+    """Write the success of transferred adversaries to a file, and return it as a table.
+
+    The first key of each result, such as "classifier", says what kind of thing it is for.
+    """
     lines = []
     rows = []
     for result in transfers:
@@ -242,7 +249,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
 
 
 def _pool_meshes(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
-    """Concatenate the examples of all meshes at each radius."""
+    """Concatenate the examples of all meshes, which have the same radii, at each radius."""
     pooled = []
     for rows in zip(*sweeps.values(), strict=True):
         success = {method: torch.cat([row[method] for row in rows]) for method in methods}

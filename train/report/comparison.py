@@ -116,7 +116,11 @@ def pools_of(pooled: Pooled, *properties: str) -> dict[Subset, Pool]:
 
 
 def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "source") -> Evaluations:
-    """Read the predictions of runs that were scored on the same images."""
+    """Read the predictions of runs that were scored on the same images.
+
+    A published network has no file of predictions, and is left out. Sources in `exclude` do not
+    count among all images.
+    """
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
@@ -153,7 +157,11 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
 
 
 def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> Estimate | None:
-    """Average a metric over the seeds of a method."""
+    """Average a metric over the seeds of a method.
+
+    The interval is that of the only seed, or goes from the lowest to the highest of several. None
+    if no seed has the metric.
+    """
     known: list[Estimate] = []
     values: list[float] = []
     for evaluation in evaluations:
@@ -171,7 +179,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
 
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
-    """Make a table of the metrics of each method on each subset of the images."""
+    """Make a table of the metrics, means over seeds, of each method on each subset of images."""
     # A dictionary has each subset once, in order.
     subsets: dict[Subset, None] = {}
     for evaluations in methods.values():
@@ -190,8 +198,8 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
 def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
     """Choose which methods are compared.
 
-    Each method is compared with its initial network, the network with whose
-    weights its runs began. It is also compared with the first method.
+    Each method is compared with its initial network, the network with whose weights its runs began.
+    It is also compared with the first method. A pair is a method and its reference.
     """
     first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
     pairs = []
@@ -210,7 +218,8 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
 def class_table(group: Scored) -> Table:
     """Make a table of the top-1 and top-5 accuracy for the images of each class.
 
-    The accuracies are among all classes of the network.
+    The accuracies are among all classes of the network. The table has no rows if the networks have
+    one such class, or more than MAX_CLASSES.
     """
     methods = read_evaluations(group, by="class")
     header = ["class", "images", "network", "top-1", "top-5"]
@@ -250,9 +259,9 @@ def difference(
 ) -> Difference | None:
     """Compare a metric of a method with that of a reference: mean minus mean over the seeds.
 
-    The 95% interval is paired: both methods are measured without the same
-    objects. With several seeds, it is also over seeds. With one seed, it says
-    nothing about other seeds.
+    The 95% interval is paired: both methods are measured without the same objects. With several
+    seeds, it is also over seeds. With one seed, it says nothing about other seeds. The value is
+    `evaluations` minus `reference`. None if the metric of a run is unknown.
     """
     pools = [evaluation.pools[subset] for evaluation in evaluations]
     reference_pools = [evaluation.pools[subset] for evaluation in reference]
@@ -362,7 +371,11 @@ def format_short_comparison(
     photographs: str = PHOTOGRAPHS,
     by: str = "source",
 ) -> str:
-    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose."""
+    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
+
+    Without the usual sub-folder "photographs", the first photographs of the runs are compared. The
+    gain in AUC is over the first method.
+    """
     methods = group_by_method(runs)
     groups = group_by_images(methods)
     group = _find_group(list(groups.values()), photographs)
@@ -397,7 +410,7 @@ def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:
 
 
 def _title_of_all(exclude: Sequence[str]) -> str:
-    """Return the title of the row of all images."""
+    """Return the title of the row of all images: "all", or "all but A, B" without these sources."""
     return f"all but {', '.join(exclude)}" if exclude else "all"
 
 
@@ -417,7 +430,10 @@ def _format_value(metric: Estimate | None) -> str:
 
 
 def _format_gain(methods: Evaluations, method: str) -> str:
-    """Write the gain in AUC: the AUC of a method minus the AUC of the first method."""
+    """Write the gain in AUC: the AUC of a method minus the AUC of the first method.
+
+    It is "-" for the first method itself, and for a method without evaluations.
+    """
     first = next(iter(methods), method)
     if method == first or method not in methods:
         return "-"
@@ -426,7 +442,11 @@ def _format_gain(methods: Evaluations, method: str) -> str:
 
 
 def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
-    """Find the runs whose scores lie in a sub-folder of a given name."""
+    """Find the runs whose scores lie in a sub-folder of a given name.
+
+    None if no run has the usual sub-folder "photographs"; any other name that no run has is an
+    error.
+    """
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
         first = _first_folder(found[0])

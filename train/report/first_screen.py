@@ -169,7 +169,7 @@ class Compared(NamedTuple):
         return len({prediction.label for prediction in pool.positives}) > 1
 
     def metric(self, title: str, note: str, name: str) -> ShownMetric | None:
-        """Average a metric of both networks over their seeds."""
+        """Average a metric of both networks over their seeds; None if one of them lacks it."""
         before = compare.mean_metric(self.before, compare.ALL, name)
         after = compare.mean_metric(self.after, compare.ALL, name)
         if before is None or after is None:
@@ -201,7 +201,10 @@ def is_laboratory(folder: Path) -> bool:
 def compare_networks(
     compared: Compared, rows: dict[str, list[ComparedImage]]
 ) -> FirstScreen | None:
-    """Make the first screen, which says whether hardening helped, and at what price."""
+    """Make the first screen, which says whether hardening helped, and at what price.
+
+    None if recall, false-positive rate or AUC is unknown.
+    """
     label = compared.label
     false_positive_title = f"Other objects called {label}"
     if compared.has_several_classes:
@@ -275,7 +278,8 @@ def _describe_images(compared: Compared) -> str:
 def _direction(change: compare.Difference) -> int:
     """Return the sign of a difference, or 0 if its sign is not proven.
 
-    The sign is proven if the 95% interval does not contain 0.
+    The sign is proven if the 95% interval does not contain 0. 1 is a proven increase, -1 a proven
+    decrease, 0 neither.
     """
     assert change.low is not None and change.high is not None
     return int(change.low > 0) - int(change.high < 0)
@@ -289,8 +293,8 @@ def _answer(
 ) -> str:
     """Write a short sentence that says whether a change of a network helped.
 
-    A proven change of the AUC decides. Recall and false positives decide what
-    the sentence says in addition.
+    A proven change of the AUC decides. Recall and false positives decide what the sentence says in
+    addition. Differences are after minus before.
     """
     assert auc.value is not None and auc.low is not None and auc.high is not None
     subject = change[0].upper() + change[1:]
@@ -376,15 +380,15 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
 
 
 def _points(value: float) -> str:
-    """Write a difference of fractions in percentage points."""
+    """Write a difference of fractions in percentage points, such as "+3", "−0.4" or "0"."""
     return _rounded(100 * value, 0, "+")
 
 
 def _rounded(value: float, decimals: int, sign: str = "") -> str:
     """Write a number with a fixed number of decimals.
 
-    A number that would be rounded to 0 keeps one significant digit, so that its
-    sign is visible.
+    A number that would be rounded to 0 keeps one significant digit, so that its sign is visible.
+    "+" as `sign` writes positive numbers with a plus sign.
     """
     text = f"{value:{sign}.{decimals}f}"
     if float(text) == 0:
@@ -404,9 +408,10 @@ def choose_disagreements(
 ) -> dict[str, list[ComparedImage]]:
     """Choose images that only one of two networks classifies correctly.
 
-    An image of a positive class is classified correctly if this class is
-    predicted. Any other image is classified correctly if no positive class is
-    predicted.
+    An image of a positive class is classified correctly if this class is predicted. Any other image
+    is classified correctly if no positive class is predicted. The first row has the images that
+    only the hardened network gets right, the second those that only the original does, at most
+    PICTURES each.
     """
     predictions_before = _read_predictions(before, labels)
     predictions_after = _read_predictions(after, labels)
@@ -436,7 +441,8 @@ Pair = tuple[Prediction, Prediction]
 def _read_predictions(folder: Path, labels: Sequence[str]) -> list[Prediction]:
     """Read one prediction for each image from predictions.csv.
 
-    This file has a line for each image and each positive class.
+    This file has a line for each image and each positive class. An image of another class keeps the
+    line of the first positive class.
     """
     predictions = []
     for prediction in read_predictions(folder / PREDICTIONS, labels):

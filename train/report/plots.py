@@ -85,7 +85,7 @@ class Picture:
 
 
 def style(index: int) -> dict[str, Any]:
-    """Return the color and the style of the lines of a method, as matplotlib takes them."""
+    """Return the color and line style of the method with this index, as matplotlib takes them."""
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
@@ -94,7 +94,10 @@ def curves(
     title: str,
     x_title: str = "epoch",
 ) -> Picture | None:
-    """Plot a metric over epochs or rounds, with a line for each seed of each method."""
+    """Plot a metric over epochs or rounds, with a line for each seed of each method.
+
+    None if the metric is constant in each line.
+    """
     lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
     for method, seeds in methods.items():
         lines_of_method[method] = []
@@ -135,7 +138,11 @@ def _draw_curves(
 
 
 def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
-    """Plot ROC curves, with a curve for each seed of each method."""
+    """Plot ROC curves, with a curve for each seed of each method.
+
+    A pair has the scores of the positive and of the negative images of a seed. None if no seed has
+    both.
+    """
     # Seeds of each method that have both positive and negative images.
     known = {}
     for method, pairs in methods.items():
@@ -164,7 +171,11 @@ def by_radius(
     title: str,
     x_title: str,
 ) -> Picture:
-    """Plot which fraction of views is still recognized under attacks of a given radius."""
+    """Plot which fraction of views is still recognized under attacks of a given radius.
+
+    Each network has two lines in turn: attacks, and random changes. The radii, ascending, stand at
+    equal distances.
+    """
     ends = [f"{name} {_percent(values[-1])}" for name, values in lines.items()]
     alt = f"{title}: still recognized at the largest radius: {', '.join(ends)}"
 
@@ -195,7 +206,10 @@ def _draw_fractions(
     color: str,
     is_random: bool,
 ) -> None:
-    """Draw a line with the fraction of views that is still recognized at each radius."""
+    """Draw a line with the fraction of views that is still recognized at each radius.
+
+    Random changes are a dotted line. Attacks are a line with error bars, the 95% interval.
+    """
     heights = np.array([estimate.value for estimate in values], float)
     if is_random:
         axes.plot(positions, heights, color=color, linestyle=":", label=name)
@@ -242,7 +256,11 @@ def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
 
 
 def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
-    """Read an image from a file, and encode it for a page."""
+    """Read an image from a file, and encode it for a page.
+
+    A wider image is reduced to `widest` pixels. The list is empty if the file is missing or
+    damaged.
+    """
     try:
         with open_image(path) as image:
             pixels = image.convert("RGB")

@@ -76,7 +76,10 @@ CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validat
 
 @progress_message("report")
 def write_report(folders: Sequence[Path], out: Path) -> Path:
-    """Write the page of the runs and attacks in folders and below them."""
+    """Write the page of the runs and attacks in folders and below them.
+
+    A run or attack that cannot be read is listed on the page.
+    """
     found = summary.find(folders)
     methods = summary.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
@@ -166,7 +169,11 @@ def _collect_epochs(methods: Methods, unfinished: Sequence[summary.Unfinished]) 
 
 
 def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
-    """Render a template to HTML, and write it to report.html."""
+    """Render a template to HTML, and write it to report.html.
+
+    `content` needs `title` and `about`, the line below the title. The browser runs no other script
+    than `script`.
+    """
     # This import takes time, and a training run needs it only at its end.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -202,8 +209,9 @@ def _sha256(script: str) -> str:
 def report_of(folders: Sequence[Path], out: Path) -> str:
     """Write the page of finished runs, and describe it for the console.
 
-    The text says why if the page cannot be written. No error is raised: the runs
-    are finished and saved, so their command must not fail.
+    The text says why if the page cannot be written. No error is raised: the runs are finished and
+    saved, so their command must not fail. A paragraph before the path says what hardening changed,
+    if that was measured.
     """
     try:
         lines = [f"report: {write_report(folders, out)}"]
@@ -217,7 +225,7 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
 
 
 def _shell_command(config: Mapping[str, Any]) -> str:
-    """Return the shell commands that repeat a run or an attack."""
+    """Return the lines `cd FOLDER` and COMMAND that repeat a run, or "" if none is recorded."""
     folder = config.get("working_folder")
     command = config.get("command") or ""
     if folder and command:
@@ -247,9 +255,10 @@ def _plot_metrics(methods: Epochs) -> list[Picture]:
 def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
     """Read the success rate of the attacks on training renders in each round of a run.
 
-    A round is a part of the training with the same renders. The metrics of the
-    third round of an epoch have names such as "round_3/attack_success". If an
-    epoch has only one round, the names begin with "augment/".
+    A round is a part of the training with the same renders. The metrics of the third round of an
+    epoch have names such as "round_3/attack_success". If an epoch has only one round, the names
+    begin with "augment/". A success is a render that is correct before the attack and not after it,
+    as a fraction of those correct before. None if no render is.
     """
     rates = []
     for epoch in epochs:
@@ -353,7 +362,11 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
 
 
 def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
-    """Choose which two networks the first screen compares."""
+    """Choose which two networks the first screen compares.
+
+    It is the last pair of a method and the trained network that it began with, or else the last
+    pair.
+    """
     hardened = []
     for method, reference in pairs:
         first_run = group[reference][0].run
@@ -411,7 +424,10 @@ def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> lis
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:
-    """Find the folder of the images on which a run was scored."""
+    """Find the folder of the images on which a run was scored.
+
+    None if the configuration does not name it, or if it has been moved.
+    """
     photos = OmegaConf.select(run.config, "evaluate.photos")
     folders = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
     folder = folders.get(name)
@@ -427,7 +443,10 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
-    """Collect the content of a section of the page about the scores on the same images."""
+    """Collect the content of a section of the page about the scores on the same images.
+
+    The keys are those that the macro `scores` of page.html.jinja reads.
+    """
     sheets = {}
     for method, scored_runs in group.items():
         path = scored_runs[0].folder / CONTACT_SHEET
@@ -454,7 +473,10 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
 
 def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None]:
-    """Plot the ROC curves of all methods."""
+    """Plot the ROC curves of all methods.
+
+    With several positive classes, a plot for each of them follows the plot of all images.
+    """
     first_evaluation = next(iter(methods.values()))[0]
     name = images.partition(":")[0]
     pictures = []

@@ -48,7 +48,11 @@ RESULTS = (
 
 
 def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[str] = ()) -> None:
-    """Check that a command would not replace results of an earlier command."""
+    """Check that a command would not replace results of an earlier command.
+
+    `own` has patterns in RESULTS of files that may be there, because the command continues with
+    them.
+    """
     if overwrite or not path.exists():
         return
     if not path.is_dir():
@@ -96,9 +100,9 @@ def _is_of_training(folder: Path) -> bool:
 def remove_run(folder: Path, *, with_others: bool = True) -> None:
     """Remove the results of a training run, and those of its first training and baselines.
 
-    The metrics go first, without which no run counts as finished, and config.yaml goes last. If
-    the removal is stopped, what is left belongs to the run that config.yaml describes. The log
-    stays.
+    The metrics go first, without which no run counts as finished, and config.yaml goes last. If the
+    removal is stopped, what is left belongs to the run that config.yaml describes. The log stays.
+    `with_others=False` keeps the first training and the baselines, which may be resumed.
     """
     files = [folder / name for name in (*OF_RUN, FAILURE, PAGE)]
     files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]

@@ -70,7 +70,10 @@ class PhotographScores:
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> "PhotographScores":
-        """Read scores from a mapping, also if an earlier version wrote it with fewer entries."""
+        """Read scores from a mapping, also if an earlier version wrote it with fewer entries.
+
+        A damaged mapping raises an error of any type.
+        """
         labels = label_names(summary.get("label", ""))
         points = operating_points(summary)
         by_label = {}
@@ -110,7 +113,10 @@ def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
 
 
 def _as_dictionaries(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to dictionaries, which the file of a published network can hold."""
+    """Convert metrics to dictionaries, which the file of a published network can hold.
+
+    The dictionary of an unknown metric is empty.
+    """
     dictionaries: dict[str, dict[str, Any]] = {}
     for name, estimate in metrics.items():
         dictionaries[name] = {} if estimate is None else asdict(estimate)
@@ -182,7 +188,10 @@ Scored = Mapping[str, Sequence[ScoredRun]]
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether a folder holds a finished run, which has its final scores."""
+    """Return whether a folder holds a finished run, which has its final scores.
+
+    The last line of metrics.jsonl then has scores. All lines before it have the number of an epoch.
+    """
     lines = read_metrics(folder)
     return bool(lines) and "epoch" not in lines[-1]
 
@@ -244,7 +253,10 @@ def _read(folder: Path) -> RunSummary | None:
 
 
 def _read_run(folder: Path) -> RunSummary:
-    """Read a finished run, and the scores of the network with whose weights it began."""
+    """Read a finished run, and the scores of the network with whose weights it began.
+
+    The field `before` is None if the run began with random weights.
+    """
     # Each line of metrics.jsonl is an epoch. The last line has the final scores.
     *epochs, scores = read_metrics(folder)
     config = read_config(folder / CONFIG)
@@ -288,7 +300,10 @@ def read_summaries(folder: Path) -> dict[str, PhotographScores]:
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
-    """Find the settings in which runs differ."""
+    """Find the settings in which runs differ.
+
+    The kind of renders and the seed are left out, because tables always show them.
+    """
     keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
     varied = {}
     for key in sorted(keys):
@@ -301,7 +316,11 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
 
 
 def group_by_method(runs: Sequence[RunSummary]) -> Methods:
-    """Group runs that differ only in the seed, and name each group."""
+    """Group runs that differ only in the seed, and name each group.
+
+    The networks with whose weights runs began come first, each once. Many varied settings in a name
+    become a number.
+    """
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*_initial_networks(runs), *runs):
@@ -456,7 +475,7 @@ def label_title(label: str) -> str:
 
 
 def seconds_table(methods: Methods) -> Table:
-    """Make a table of the time that an epoch of each method takes."""
+    """Make a table of the seconds that an epoch of the first run of each method takes, by phase."""
     titles = {phase: phase.replace("_", " and ") for phase in PHASES}
     titles["attack_classifier"] = "attack: in the classifier"
     titles["operators"] = "operators, once"
@@ -471,7 +490,10 @@ def seconds_table(methods: Methods) -> Table:
 
 
 def _mean_seconds(run: RunSummary, phase: str) -> float | None:
-    """Average the seconds that a phase of an epoch takes over the epochs of a run."""
+    """Average the seconds that a phase of an epoch takes over the epochs of a run.
+
+    None if no epoch records the phase.
+    """
     name = f"seconds/{phase}"
     seconds = [line[name] for line in run.epochs if name in line]
     return fmean(seconds) if seconds else None
@@ -482,7 +504,11 @@ Line = tuple[int | None, Sequence[Estimate | None]]
 
 
 def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
-    """Make a table with a row for each run."""
+    """Make a table with a row for each run.
+
+    A line is a seed and the metrics in the order of `header`. Several seeds get a row of their mean
+    ± standard deviation.
+    """
     rows = []
     for method, runs in lines.items():
         for seed, metrics in runs:
@@ -496,7 +522,7 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
 
 
 def _format_spread(metrics: Sequence[Estimate | None]) -> str:
-    """Write the mean and the standard deviation of a metric over runs."""
+    """Write the mean and standard deviation over runs: "0.912 ± 0.004", or "-" if unknown."""
     values = [metric.value for metric in metrics if metric is not None and metric.value is not None]
     if len(values) < len(metrics):
         return "-"
@@ -575,7 +601,10 @@ def read_attack(folder: Path) -> AttackSummary:
 
 
 def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
-    """Return whether the attack on an example succeeds in images without noise."""
+    """Return whether the attack on an example succeeds in images without noise.
+
+    Files of earlier versions have only "success", which was measured without noise.
+    """
     return bool(line.get("success_without_noise", line["success"]))
 
 
