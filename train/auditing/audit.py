@@ -153,7 +153,10 @@ def run_audit(
 def _audit_photographs(
     settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
 ) -> page.Audited:
-    """Audit networks without meshes, on photographs in the light of a projector."""
+    """Audit networks without meshes, on photographs in the light of a projector.
+
+    Only if the settings name the networks may an audit that was stopped continue.
+    """
     device = choose_device(settings.device)
     find_unlabeled(published(Path(str(settings.photographs))))
     out = writable_folder(settings.out, "out")
@@ -276,7 +279,11 @@ class _Plan:
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
-    """Fill in the class and the hard negatives if the settings leave them out."""
+    """Fill in the class and the hard negatives if the settings leave them out.
+
+    The class is that of the meshes. Hard negatives are only filled in if test images must be
+    rendered.
+    """
     if settings.label is None:
         label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
     else:
@@ -296,7 +303,10 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
 
 
 def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
-    """Load the network to audit and, if the settings name one, the hardened network."""
+    """Load the network to audit and, if the settings name one, the hardened network.
+
+    The keys CLASSIFIER and HARDENED also name the subfolders of their results.
+    """
     with keyed(name="classifier"):
         classifier = load_chosen(settings)
     networks = {CLASSIFIER: classifier}
@@ -363,7 +373,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
 
 
 def _may_change(key: str, old: Any, new: Any) -> bool:
-    """Return whether a setting may change when a stopped audit continues."""
+    """Return whether a stopped audit may continue with a change of a setting: only from None."""
     return old is None and key in SETTABLE_LATER
 
 
@@ -391,8 +401,9 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
 def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
     """Read the settings of the meshes and of the hard negatives, with their labels.
 
-    A hard negative without a label gets a label that starts with "other_",
-    which need not be a class of the networks.
+    A hard negative without a label gets a label that starts with "other_", which need not be a
+    class of the networks. The first list has the meshes of the class, the second the hard
+    negatives.
     """
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
     hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]

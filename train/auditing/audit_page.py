@@ -110,7 +110,10 @@ def write_audit_page(
     out: Path,
     caveats: Sequence[str],
 ) -> Audited:
-    """Write report.html from the results in the folder of an audit."""
+    """Write report.html from the results in the folder of an audit.
+
+    Keys of `names` and values of `remedies` are subfolders of `out` with results.
+    """
     results = {name: out / key for key, name in names.items()}
     scored = {}
     for name, folder in results.items():
@@ -172,7 +175,10 @@ def write_audit_page(
 def _recommendation(
     remedies: Mapping[str, str], folders: Mapping[str, Path], out: Path
 ) -> Recommendation | None:
-    """Recommend a remedy by the scores on the first folder of test images."""
+    """Recommend a remedy by the scores on the first folder of test images.
+
+    `remedies` begins with the original network. None without test images, or without a remedy.
+    """
     images = next(iter(folders), None)
     if images is None or len(remedies) == 1:
         return None
@@ -184,8 +190,8 @@ def _with_remedies(
 ) -> dict[str, Path]:
     """Add the networks with the remedy "normalized light" to the networks of an audit.
 
-    This remedy normalizes the colors of an image before the network classifies
-    it.
+    This remedy normalizes the colors of an image before the network classifies it. New names are
+    such as "resnet50, normalized light".
     """
     name_of_folder = {folder.name: name for name, folder in results.items()}
     added = {}
@@ -197,7 +203,10 @@ def _with_remedies(
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Choose the attack that the slider of the report shows, the first that succeeds."""
+    """Choose the attack that the slider of the report shows, the first that succeeds.
+
+    "network" and "light" of the result are titles. None if no attack succeeds.
+    """
     for name, counts_of_network in counts.items():
         for kind, attack_counts in counts_of_network.items():
             if "slider" in attack_counts:
@@ -294,9 +303,7 @@ def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
 
 
 def _agreement(scored: Predictions) -> Proportion:
-    """Compute the fraction of the test photographs for which all networks predict the same
-    class.
-    """
+    """Compute the fraction of photographs for which all networks predict the same class."""
     by_network = [by_images.get(PHOTOGRAPHS, ()) for by_images in scored.values()]
     is_same = []
     for predictions in zip(*by_network, strict=True):
@@ -343,7 +350,11 @@ def write_answer(label: str, name: str, folder: Path, images: Collection[str]) -
 def _find_rates(
     label: str, folder: Path, images: Collection[str]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Find what fraction of the renders and test images a network classifies correctly."""
+    """Find what fraction of the renders and test images a network classifies correctly.
+
+    The first list is about renders in environments and random light, the second about recall and
+    false positives on test images.
+    """
     rates = _rates(read_json(folder / RECOGNIZED))
     of_renders = [_recognized(subject, rate) for subject, rate in rates.items()]
     findings = []
@@ -371,7 +382,10 @@ def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
 
 
 def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
-    """Describe what fraction of the images of other objects a network mistakes for a class."""
+    """Describe what fraction of the images of other objects a network mistakes for a class.
+
+    `error_rate` is the fraction that is mistaken, the finding has the fraction that is not.
+    """
     if error_rate is None or error_rate.value is None or error_rate.high is None:
         return None
     text = f"it takes {error_rate.value:.0%} of {subject}"
@@ -379,7 +393,11 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Describe the attacks after which a network misclassifies half of the views."""
+    """Describe the attacks after which a network misclassifies half of the views.
+
+    Each clause has the smallest radius at which that is so, among the views that were correct
+    before.
+    """
     faults = []
     for kind, light in KINDS.items():
         counts = read_json(folder / f"{kind}.json")
@@ -394,7 +412,7 @@ def _attack_faults(folder: Path) -> list[str]:
 def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     """Compute what fraction of renders in environment lights and random lights is recognized.
 
-    The intervals are over views.
+    The intervals are over views. Names of random lights start with "random ".
     """
     random_names = {name for name in correct if name.startswith(RANDOM)}
     names_of_title = {
@@ -435,9 +453,9 @@ def _worst(
 ) -> dict[str, list[Picture]]:
     """Make two galleries of the worst predictions of each network.
 
-    The first gallery has the images of the tested class with the lowest
-    log-odds of this class. The second gallery has the images of other objects
-    with the highest log-odds.
+    The first gallery has the images of the tested class with the lowest log-odds of this class. The
+    second gallery has the images of other objects with the highest log-odds. Each gallery has at
+    most WORST pictures, by its title.
     """
     galleries: dict[str, list[Picture]] = {}
     for name, by_images in scored.items():

@@ -48,7 +48,10 @@ def plain_sentence(label: str, name: str, plain: PlainViews) -> str:
 
 
 def strongest_kind(counts: Counts) -> str | None:
-    """Return the kind of lighting by which the most views become misclassified."""
+    """Return the kind of lighting by which the most views become misclassified.
+
+    None if no view is recognized before the attacks.
+    """
     attacked = [kind for kind in KINDS if counts[kind]["correct"]]
     if not attacked:
         return None
@@ -122,7 +125,10 @@ def _score_sentence(label: str, pool: Pool) -> list[str]:
 
 
 def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
-    """Read a picture for each kind of lighting: one view before and after the attack."""
+    """Read a picture for each kind of lighting: one view before and after the attack.
+
+    A kind of lighting by which no attack succeeds has no picture.
+    """
     compared = []
     for kind, light in KINDS.items():
         answers = _answers(counts[kind])
@@ -138,7 +144,10 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
 
 
 def withstood_sentence(name: str, counts: Counts) -> str:
-    """Name the kinds of lighting by which no attack on a network succeeds."""
+    """Name the kinds of lighting by which no attack on a network succeeds.
+
+    Empty if attacks with each kind succeed, or if no view is recognized before them.
+    """
     withstood = [
         light.title
         for kind, light in KINDS.items()
@@ -150,7 +159,7 @@ def withstood_sentence(name: str, counts: Counts) -> str:
 
 
 def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
-    """Describe the predictions for one view before and after an attack."""
+    """Describe the right prediction before an attack and the wrong one after it, if it succeeds."""
     texts = [in_words(name) for name in attack_counts.get("predicted", ())]
     # Earlier versions of the library did not write the key "confidence".
     for index, probability in enumerate(attack_counts.get("confidence", ())):
@@ -162,7 +171,11 @@ def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
 
 
 def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
-    """Plot the fraction of recognized views against the radius of attacks."""
+    """Plot the fraction of recognized views against the radius of attacks.
+
+    Each network has a line for the attack and one for random draws, unless it recognizes no view
+    before.
+    """
     pictures = []
     for kind, light in KINDS.items():
         lines = {}
@@ -177,7 +190,11 @@ def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
 
 
 def _remaining(attack_counts: Mapping[str, Any], method: str) -> list[Estimate]:
-    """Compute the fraction of views that stay correctly classified, for each radius."""
+    """Compute the fraction of views that stay correctly classified, for each radius.
+
+    The first is 1, at the radius 0. `method` is "adversarial" or "random"; views that are correct
+    before count.
+    """
     correct = attack_counts["correct"]
     misclassified_by_radius = (0, *attack_counts[method])
     return [fraction(correct - count, correct) for count in misclassified_by_radius]

@@ -28,8 +28,10 @@ BATCH = 16
 def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     """Render an example in lights between the start and the end of an attack.
 
-    Frame i of n has the light start + i / (n - 1) · (end - start). If the
-    attack may use two lights, it may use all lights between them, too.
+    Frame i of n has the light start + i / (n - 1) · (end - start). If the attack may use two
+    lights, it may use all lights between them, too. "classes" are the right class and the
+    CLASS_COUNT - 1 most probable others. Each of "frames" has "image", "ball" (a white ball in the
+    same light), both JPEG in base64, and "probabilities" of these classes.
     """
     start = result.problem.start[example]
     end = result.descent.values[example]
@@ -63,7 +65,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
 
 
 def _jpeg(image: Float[Tensor, "3 H W"], side: int) -> str:
-    """Resize an image, and encode it as a JPEG file in base64."""
+    """Resize an image in [0, 1] to a square, and encode it as a JPEG file in base64."""
     pixels = to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy()
     file = io.BytesIO()
     Image.fromarray(pixels).resize((side, side)).save(file, "JPEG", quality=85)

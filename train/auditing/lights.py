@@ -195,7 +195,7 @@ def recognize_in_environments(
 def is_correct(
     classifier: Classifier, scene: Scene, images: Float[Tensor, "E 1 3 H W"]
 ) -> Bool[Tensor, " E"]:
-    """Test whether a classifier predicts the right class for the images of a scene."""
+    """Test whether a classifier predicts the class of a scene, the same in all E examples."""
     logits = logits_of(classifier, images, BATCH)[:, 0]
     return logits.argmax(1) == classifier.label(scene.labels[0])
 
@@ -208,9 +208,10 @@ def adversaries(
 ) -> AttackResult:
     """Attack a classifier by one kind of lighting, within the largest radius of this kind.
 
-    Each step changes all values of the lighting by a quarter of the radius, in
-    the direction of the sign of the gradient. A classifier without gradients is
-    attacked by a random search with QUERIES forward passes.
+    Each step changes all values of the lighting by a quarter of the radius, in the direction of the
+    sign of the gradient. A classifier without gradients is attacked by a random search with QUERIES
+    forward passes. `additional` always takes ADDITIONAL_STEPS steps. Otherwise the attack stops
+    when the prediction is wrong even with the noise of a camera.
     """
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
@@ -243,9 +244,11 @@ def success_by_light(
 ) -> dict[str, Any]:
     """Attack one kind of lighting, and count the misclassified views for each radius.
 
-    The attacked lighting of the largest radius is written to out/KIND.npz, which
-    `transfer_success` reads. If an attack succeeds, a picture of the first
-    success, before and after the attack, is written to out/KIND.png.
+    The attacked lighting of the largest radius is written to out/KIND.npz, which `transfer_success`
+    reads. If an attack succeeds, a picture of the first success, before and after the attack, is
+    written to out/KIND.png. "adversarial" and "random" of the result count, for each radius, the
+    "correct" of "n" views that become wrong even with the noise of a camera. "predicted",
+    "confidence" and "slider" are missing if no attack succeeds.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
@@ -278,7 +281,11 @@ def success_by_light(
 
 
 def _draw_pair(result: AttackResult, example: int) -> Image.Image:
-    """Draw the image of an example before and after the attack, side by side."""
+    """Draw the image of an example before and after the attack, side by side.
+
+    Renders smaller than SIDE pixels are enlarged without smoothing, so that their pixels are
+    visible.
+    """
     before = result.images_before[example]
     after = result.images[example]
     pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
@@ -295,10 +302,11 @@ def transfer_success(
 ) -> dict[str, dict[str, list[int]]]:
     """Test whether lighting that fools one classifier also fools another classifier.
 
-    There are two sets of attacked lighting. "first" is the lighting that
-    `success_by_light` wrote, whose attack ended at its first success. "further"
-    comes from attacks that continue after their success. The views are rendered
-    again at the image size of the other classifier.
+    There are two sets of attacked lighting. "first" is the lighting that `success_by_light` wrote,
+    whose attack ended at its first success. "further" comes from attacks that continue after their
+    success. The views are rendered again at the image size of the other classifier. The three
+    numbers, for each kind of lighting and for "further" and "first", are those of
+    `_TransferTest.count`.
     """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
@@ -336,8 +344,10 @@ class _TransferTest:
     def count(self, is_wrong: Bool[Tensor, " E"], values: Float[Tensor, "E D"]) -> list[int]:
         """Count the views whose attacked lighting also fools the second classifier.
 
-        A view is tested if its attacked lighting fools the first classifier, and
-        if the second classifier recognizes it before the attack.
+        A view is tested if its attacked lighting fools the first classifier, and if the second
+        classifier recognizes it before the attack. The three numbers are tested views that are
+        misclassified even with the noise of a camera, tested views, and tested views that are
+        misclassified without noise.
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))

@@ -53,8 +53,8 @@ class PlainViews:
 def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
     """Find the plain light, exposure and size at which a classifier recognizes most views.
 
-    All combinations are tried, until one is found at which the classifier
-    recognizes a fraction of ENOUGH.
+    All combinations are tried, until one is found at which the classifier recognizes a fraction of
+    ENOUGH. If no view is ever recognized, the first combination is returned.
     """
     best: PlainViews | None = None
     candidates = list(_candidates(views))

@@ -66,8 +66,8 @@ class Recommendation:
 def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
     """Add the remedy "normalized light" to the networks of an audit.
 
-    This remedy normalizes the colors of an image before the network classifies
-    it.
+    This remedy normalizes the colors of an image before the network classifies it. Keys become such
+    as "hardened_normalized_light". Networks that normalize light already are left out.
     """
     return {
         key + NORMALIZED: network.normalizing_light()
@@ -77,7 +77,11 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
 
 
 def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Name the remedies that an audit compares, and find their results."""
+    """Name the remedies that an audit compares, and find their results.
+
+    The values are subfolders. The original network comes first, then the remedies from the cheapest
+    to the most expensive.
+    """
     subfolders = {ORIGINAL: CLASSIFIER}
     for key, network in {**normalizing(networks), **networks}.items():
         if key == CLASSIFIER:
@@ -94,10 +98,11 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
 def recommend(evaluations: Evaluations) -> Recommendation | None:
     """Recommend the cheapest remedy that helps, unless a more expensive one helps more.
 
-    A remedy helps if the 95% interval of its gain over the original network is
-    above 0. It helps more than a cheaper one if the interval of its gain over
-    the cheaper one is above 0, too. The metric is the recall at 10% false
-    positives. With several positive classes, it is top-1 accuracy.
+    A remedy helps if the 95% interval of its gain over the original network is above 0. It helps
+    more than a cheaper one if the interval of its gain over the cheaper one is above 0, too. The
+    metric is the recall at 10% false positives. With several positive classes, it is top-1
+    accuracy. The first evaluation is of the original network, and remedies follow by price. None if
+    a metric is unknown.
     """
     original, *remedies = evaluations
     metric = _metric_for(evaluations[original])
@@ -134,12 +139,12 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
 
 
 def _metric_for(evaluations: Sequence[Evaluation]) -> str:
-    """Choose the metric by which remedies are compared."""
+    """Choose top-1 accuracy for several positive classes, or else recall at 10% false positives."""
     labels = {prediction.label for prediction in evaluations[0].pools[ALL].positives}
     return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 
 def _is_gain(evaluations: Evaluations, name: str, reference: str, metric: str) -> bool:
-    """Return whether the 95% interval of the gain of one network over another is above 0."""
+    """Return whether the 95% interval of the gain of `name` over `reference` is above 0."""
     gain = difference(evaluations[name], evaluations[reference], ALL, metric)
     return gain is not None and gain.low is not None and gain.low > 0
