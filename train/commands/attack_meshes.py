@@ -212,7 +212,10 @@ def _write_attacks(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> tuple[list[Outcome], dict[str, Sweep]]:
-    """Run the attacks on several meshes, and write each result to its own folder."""
+    """Run the attacks on several meshes, and write each result to its own folder.
+
+    The sweeps are by the name of the folder, and empty if `attack.radius_scales` is.
+    """
     sweeps: dict[str, Sweep] = {}
     outcomes = []
     for index, mesh_attack in enumerate(mesh_attacks):
@@ -270,7 +273,10 @@ def _write_attack(
 
 
 def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
-    """Format the summary that pnb-attack prints about the attacks on all meshes."""
+    """Format the summary that pnb-attack prints about the attacks on all meshes.
+
+    Several meshes get a number of successes and a table. Details follow in any case.
+    """
     (first, *others) = outcomes
     lines = [first.heading]
     if others:
@@ -297,8 +303,9 @@ def attacks(
 ) -> Iterator[MeshAttack]:
     """Attack each mesh of the settings, or the scene of a saved adversary.
 
-    If a mesh is misclassified in its scene, a search looks for another scene in
-    which it is recognized. This scene is then attacked.
+    If a mesh is misclassified in its scene, a search looks for another scene in which it is
+    recognized. This scene is then attacked. The values of an adversary are the start of its attack
+    and the centers of the norm-balls.
     """
     if adversary is not None:
         yield _attack_adversary(settings, classifier, device, adversary)
@@ -319,7 +326,10 @@ def _attack_adversary(
     device: torch.device,
     adversary: Adversary,
 ) -> MeshAttack:
-    """Attack the scene of a saved adversary, starting at its attacked values."""
+    """Attack the scene of a saved adversary, starting at its attacked values.
+
+    An adversary with changed pixels instead of a changed scene raises InputError.
+    """
     if adversary.pixels is not None:
         raise InputError(
             f"reload={settings.reload} is an adversary with changed pixels, from which an attack "
@@ -431,7 +441,10 @@ def load_targets(
 
 
 def _load_classifier(item: Any, trust: bool) -> Classifier:
-    """Load one classifier that the setting `transfer.classifiers` names."""
+    """Load one classifier that the setting `transfer.classifiers` names.
+
+    `item` is a name, or has the keys "classifier" and "weights".
+    """
     values = item if isinstance(item, dict) else {"classifier": item}
     for key in values:
         if key not in ("classifier", "weights"):
@@ -445,7 +458,7 @@ def _load_classifier(item: Any, trust: bool) -> Classifier:
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
-    """Write the settings that the search for a scene changed, as a command line takes them."""
+    """Write the settings that the search for a scene changed, such as "scene.polar=80.0"."""
     words = []
     for name in SEARCHED_SETTINGS:
         value = getattr(scene, name)
@@ -461,7 +474,11 @@ def format_reloaded(
     settings: AttackSettings,
     seed: int,
 ) -> list[str]:
-    """Classify the images of a reloaded adversary, and describe the predictions."""
+    """Classify the images of a reloaded adversary, and describe the predictions.
+
+    The images are rendered again, in [0, 1]. Each line has the prediction, whether noise changes
+    it, and the largest difference from the saved image.
+    """
     model = preprocessed_model(settings, classifier)
     # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
     logits = logits_of(model, images[None], len(images))

@@ -90,7 +90,8 @@ def _train_on_photographs(
 ) -> ExperimentSettings:
     """Train on photographs first, as the setting `photographs_first` asks.
 
-    If this first training is already finished, it is not repeated.
+    If this first training is already finished, it is not repeated. The returned settings are those
+    of the main training, which starts from the network of the first.
     """
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
@@ -129,7 +130,9 @@ def _train_in(
 ) -> None:
     """Check that the folders can be written to, and train a network and its baselines.
 
-    If the training is interrupted, the command that resumes it is printed.
+    If the training is interrupted, the command that resumes it is printed. `resuming` has the words
+    of that command without run= and train.resume=, and `resumed_folder` its folder, or None for
+    `folder`.
     """
     settings_of_runs = _settings_of_runs(settings, folder)
     for path, run_settings in settings_of_runs.items():
@@ -153,7 +156,10 @@ def _train_in(
 
 
 def _settings_of_runs(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """List the training runs of a command: the baselines, and then the main run."""
+    """List the training runs of a command: the baselines, and then the main run.
+
+    The keys are folders: a baseline has a subfolder with the name of its kind of renders.
+    """
     settings_of_runs = {}
     for mode in settings.compare:
         with keyed("compare"):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from augment.scene.objects import load_object
@@ -81,7 +81,8 @@ def fit(settings: FitSettings) -> None:
 def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
     """Compare the photograph with a render in the camera and lighting that were found.
 
-    Both images are written to comparison.png, side by side.
+    Both images are written to comparison.png, side by side. The error is of the pixels in
+    out/mask.png, with images in `encoding`, "srgb" or "linear".
     """
     photograph, rendered = render_attacked(attacked)
     write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
@@ -92,7 +93,10 @@ def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> fl
 
 
 def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackExperimentSettings:
-    """Choose settings with which pnb-attack attacks the lighting of the photograph."""
+    """Choose settings with which pnb-attack attacks the lighting of the photograph.
+
+    The camera looks at the center of the mesh. Numbers are rounded as in the printed command.
+    """
     fov = None
     if isinstance(camera, PerspectiveCamera):
         fov = round(camera.angle, 3)
@@ -143,8 +147,10 @@ def attack_command(settings: AttackExperimentSettings) -> list[str]:
     return words
 
 
-def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render the scene that pnb-attack would attack, as it is before the attack."""
+def render_attacked(
+    settings: AttackExperimentSettings,
+) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
+    """Return the encoded background, and the render as it is before an attack by pnb-attack."""
     mesh = read_object(settings.scene.meshes[0], settings.label or "", "scene.meshes[0]")
     device = torch.device("cpu")
     scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
@@ -154,15 +160,20 @@ def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, t
     return scene.backgrounds[0], images[0, 0]
 
 
-def relative_error(rendered: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
-    """Compute the relative root mean square error of rendered pixels, in linear RGB."""
+def relative_error(
+    rendered: Float[torch.Tensor, "3 N"], photograph: Float[torch.Tensor, "3 N"], encoding: str
+) -> float:
+    """Compute the relative root mean square error of rendered pixels, in linear RGB.
+
+    It is RMS(rendered - photograph) / RMS(photograph) after decoding ("srgb" or "linear").
+    """
     expected = decode(photograph.double(), encoding)
     difference = decode(rendered.double(), encoding) - expected
     return float(difference.norm() / expected.norm())
 
 
 def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image file at its full size."""
+    """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
     require_file(path, "give an image file")
     try:
         return np.asarray(read_rgb(Path(path), 10**6))
@@ -172,7 +183,10 @@ def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndarray, "H W"]:
-    """Segment the object inside a box with OpenCV's GrabCut (Rother et al. 2004)."""
+    """Segment the object inside a box with OpenCV's GrabCut (Rother et al. 2004).
+
+    The box is left, top, right and bottom in pixels. The mask is 255 on the object, otherwise 0.
+    """
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
@@ -208,14 +222,14 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
 
 
 def _is_box_within(box: list[int], height: int, width: int) -> bool:
-    """Return whether a box is not empty and lies within an image."""
+    """Return whether a box (left, top, right, bottom) is not empty and lies within an image."""
     if len(box) != 4:
         return False
     left, top, right, bottom = box
     return 0 <= left < right <= width and 0 <= top < bottom <= height
 
 
-def write_values(path: Path, image: torch.Tensor) -> None:
-    """Write an image to a file with 8 bits per channel."""
+def write_values(path: Path, image: Float[torch.Tensor, "3 H W"]) -> None:
+    """Write an image with values in [0, 1] to a file with 8 bits per channel."""
     pixels = to_bytes(image.permute(1, 2, 0)).numpy()
     write_image(path, Image.fromarray(pixels))

@@ -54,7 +54,7 @@ def publish_network(settings: PublishSettings) -> None:
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
-    """Collect the settings and scores of a training run for the file of the published network."""
+    """Collect "settings", "versions" of packages and "scores" of a run for the published file."""
     run = summarize(folder)
     photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
     return {
@@ -65,7 +65,10 @@ def _describe_run(folder: Path) -> dict[str, Any]:
 
 
 def _without_folder(text: str) -> str:
-    """Remove the folders from an absolute path, because other machines do not have them."""
+    """Remove the folders from an absolute path, because other machines do not have them.
+
+    Other values than absolute paths are returned as they are.
+    """
     return Path(text).name if text.startswith("/") else text
 
 
@@ -75,7 +78,11 @@ def _calibrate(
     label: Any,
     false_positive_rate: float,
 ) -> list[dict[str, Any]]:
-    """Choose a detection threshold for each positive class on photographs, and print it."""
+    """Choose a detection threshold for each positive class on photographs, and print it.
+
+    The thresholds have at most `false_positive_rate`. The weights of `network` are rounded to 16
+    bits.
+    """
     # Published weights have 16 bits, so the thresholds are chosen with rounded weights.
     network.half().float()
     with keyed(folder="calibrate"):

@@ -45,7 +45,11 @@ MAX_UNFINISHED = 3
 
 
 def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
-    """Train all runs of a sweep, print a table of their results, and write a report."""
+    """Train all runs of a sweep, print a table of their results, and write a report.
+
+    Wrong settings, and folders of other runs, are found before any training. The exit status is 1
+    if a run is not finished.
+    """
     runs = _expand([word for word in words if not word.startswith("-")])
     first_config = compose("train", runs[0])
     if first_config.photographs_first:
@@ -106,7 +110,10 @@ def _is_text(override: str) -> bool:
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
-    """List the settings of each run of a sweep, in the order in which Hydra starts them."""
+    """List the settings of each run of a sweep, in the order in which Hydra starts them.
+
+    "seed=0,1" and "train.epochs=3" become a tuple of overrides for each combination.
+    """
     choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
@@ -174,7 +181,10 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
 
 
 def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
-    """Train, score and export one run. If it has a checkpoint, the training is resumed."""
+    """Train, score and export one run. If it has a checkpoint, the training is resumed.
+
+    `overrides` are escaped as Hydra escapes them.
+    """
     settings = with_label(read_settings(ExperimentSettings, config))
     settings.train.resume = checkpoint.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
@@ -197,7 +207,10 @@ def _unescaped(override: str) -> str:
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
-    """Format the results of the training runs of a sweep."""
+    """Format the results of the training runs of a sweep.
+
+    Without --verbose, the table and the list of unfinished runs are cut off after a few lines.
+    """
     finished = [folder for folder in folders if is_finished(folder)]
     lines = [f"{len(finished)} of {len(folders)} runs are finished", ""]
     unfinished = [folder for folder in folders if folder not in finished]
