@@ -52,7 +52,10 @@ class TrainCommand(Command):
 
 
 def name_model(words: list[str]) -> list[str]:
-    """Replace model=NAME, a short form of model.name=NAME, in the command line."""
+    """Replace model=NAME, a short form of model.name=NAME, in the command line.
+
+    A mapping as in model={...} stays, because it sets several fields.
+    """
     renamed = []
     for word in words:
         has_name = word.startswith("model=") and not word.startswith("model={")

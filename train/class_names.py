@@ -19,7 +19,11 @@ def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
 
 
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
-    """Return the settings of a mesh, in which its class is given by name instead of by index."""
+    """Return the settings of a mesh, in which its class is given by name instead of by index.
+
+    An item without a label, or with one that no network has, such as "other_lemon", stays as it is.
+    Only a mapping can have a label.
+    """
     label = item.get("label") if isinstance(item, dict) else None
     if label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX):
         return item
@@ -29,7 +33,8 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
 def class_of_name(name: str, classes: Sequence[str]) -> str | None:
     """Find the class of a network that a name means, such as "sweet pepper" for "Sweet_Pepper".
 
-    Upper and lower case, "_", "-" and spaces make no difference.
+    Upper and lower case, "_", "-" and spaces make no difference. None if no class matches, or if
+    several match and none of them is exactly `name`.
     """
     matches = [known for known in classes if simplified(known) == simplified(name)]
     if name in matches:
@@ -38,15 +43,18 @@ def class_of_name(name: str, classes: Sequence[str]) -> str | None:
 
 
 def name_of_mesh(mesh: str) -> str:
-    """Return what a mesh shows according to its name: NAME of "solid:NAME" or "NAME.glb"."""
+    """Return what a mesh shows according to its name: NAME of "solid:NAME" or "NAME.glb".
+
+    A seed, as in "solid:NAME:SEED", is left out.
+    """
     return solid_name(mesh) or Path(mesh).stem
 
 
 def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> list[str]:
     """Find the class of each mesh by its label or, without a label, by its name.
 
-    Without a label, the file "banana.glb" and the solid "solid:banana" are of the
-    class "banana".
+    Without a label, the file "banana.glb" and the solid "solid:banana" are of the class "banana".
+    An unknown class raises InputError, whose message names `key`.
     """
     found = []
     for index, item in enumerate(items):
@@ -85,7 +93,7 @@ def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
 
 
 def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:
-    """Find the class of meshes that are all of one class."""
+    """Find the class of meshes, and raise InputError if they are of several classes."""
     found = set(classes_of_meshes(items, classes, key))
     if len(found) != 1:
         raise InputError(
@@ -101,8 +109,9 @@ def require_others(
 ) -> None:
     """Check that no hard negative is an object of a positive class.
 
-    With several positive classes, an object of one of them may be a hard
-    negative for the others. The settings must then give its class as a label.
+    With several positive classes, an object of one of them may be a hard negative for the others.
+    The settings must then give its class as a label. The keys are such as
+    "scene.hard_negatives[0]", and labels such as "", "other" and "other_lemon" are of no class.
     """
     for key, item in hard_negatives.items():
         is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
@@ -122,7 +131,10 @@ def require_others(
 def with_classes_of_meshes(
     settings: ExperimentSettings, classes: Sequence[str]
 ) -> ExperimentSettings:
-    """Fill in the missing label of the settings of a run from the classes of its meshes."""
+    """Fill in the missing label of the settings of a run from the classes of its meshes.
+
+    The label lists each class once, and each mesh in the copy has its class.
+    """
     items = settings.scene.meshes
     names = classes_of_meshes(items, classes, "scene.meshes")
     meshes = []

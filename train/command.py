@@ -276,7 +276,7 @@ def exits_on_sigterm() -> Iterator[None]:
 
 
 def import_function(path: str) -> Callable[..., Any]:
-    """Import a function by its path."""
+    """Import a function by its path "module:function"."""
     module, _, name = path.partition(":")
     is_torch_imported = "torch" in sys.modules
     with _announced_if_slow(), _ended_by_ctrl_c():
@@ -335,7 +335,10 @@ def skip_last_collection() -> None:
 
 
 def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
-    """Convert a configuration of Hydra to an object of a settings class."""
+    """Convert a configuration of Hydra to an object of a settings class.
+
+    Missing fields get their defaults. Messages of InputError begin with the key.
+    """
     try:
         # A configuration that was read from a file does not know the types of its
         # values. Merging it into the class checks them.
@@ -350,7 +353,10 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 
 
 def _read_node(node: DictConfig, key: str) -> Any:
-    """Convert a configuration, or a group of settings in it, to an object of its settings class."""
+    """Convert a configuration, or a group of settings in it, to an object of its settings class.
+
+    `key` is dotted, and empty for the whole configuration.
+    """
     kind = cast(type, OmegaConf.get_type(node))
     values: dict[str, Any] = {}
     for item in fields(cast(Any, kind)):
@@ -376,7 +382,9 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
 
     The value of a text setting is quoted if Hydra would change or refuse it: Hydra reads 1.10 as
     1.1, and refuses an umlaut. A single value of a list setting becomes a list with one member. A
-    plus sign before a key is removed, because it would add a setting, and all settings exist.
+    plus sign before a key is removed, because it would add a setting, and all settings exist. A "~"
+    at the beginning, with which Hydra removes a setting, raises InputError. `keys` has the type of
+    each dotted key.
     """
     if argument.startswith("~"):
         raise InputError(f"{argument}: a setting cannot be removed: set another value")
@@ -398,9 +406,7 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
 
 
 def _as_text(key: str, value: str) -> str:
-    """Write the override of a text setting, with quotes if Hydra would change or refuse the
-    value.
-    """
+    """Write the override of a text, with quotes if Hydra would change or refuse the value."""
     override = f"{key}={value}"
     # A value that begins with "~" is a path in the home folder. The error of Hydra
     # about it is better than a quoted path that does not exist.
@@ -423,7 +429,10 @@ def _as_text(key: str, value: str) -> str:
 
 
 def _as_list(key: str, value: str, is_text: bool) -> str:
-    """Write the override of a list setting."""
+    """Write the override of a list setting.
+
+    A list, null and a sweep of Hydra stay the same. Any other value becomes the only member.
+    """
     if not value or value.startswith("["):
         return f"{key}={value}"
     try:
@@ -463,7 +472,10 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
-    """Explain an error of Hydra or OmegaConf in one sentence that begins with the key."""
+    """Explain an error of Hydra or OmegaConf in one sentence that begins with the key.
+
+    None if neither Hydra nor OmegaConf raised the error.
+    """
     # An error of Hydra is often caused by an error of OmegaConf. Only the error of
     # OmegaConf has the attribute `full_key`, the key of the wrong setting.
     with_key = [cause for cause in causes(error) if getattr(cause, "full_key", None)]
@@ -494,7 +506,8 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
 def _name_conf_file(error: BaseException) -> str:
     """Name the file of conf/ in which Hydra found an error.
 
-    Such an error begins with a text like "In 'attack': ".
+    Such an error begins with a text like "In 'attack': ". The result is such as " (In 'attack')",
+    or empty if the error names no file.
     """
     start = _first_line(error).partition(":")[0]
     return f" ({start})" if start.startswith("In ") else ""
@@ -543,7 +556,7 @@ def _explain_choice(file: str) -> str:
 
 
 def _explain_overflow(words: Sequence[str]) -> str | None:
-    """Explain the error of a whole number that is too large for a float."""
+    """Explain the error of the first whole number too large for a float. None if there is none."""
     for word in words:
         key, _, value = word.partition("=")
         if value.lstrip("-").isdigit() and len(value) > MAX_DIGITS:
@@ -568,7 +581,11 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
 
 
 def program(name: str, as_called: bool = False) -> list[str]:
-    """Return the start of a command line that runs a command in the way of this process."""
+    """Return the start of a command line that runs a command in the way of this process.
+
+    It is "pnb-NAME", or "python -m MODULE" if the package is not installed, after torchrun and its
+    options if that started this process. `as_called` gives full paths.
+    """
     called = Path(sys.argv[0])
     process_count = int(os.environ.get("WORLD_SIZE", "1"))
     installed_name = f"{PREFIX}{name}"

@@ -568,8 +568,9 @@ class EvaluateSettings(ClassifierSettings):
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
     """Check that the two settings that choose a threshold are given together.
 
-    The threshold on the score of a class is chosen so that a given fraction of the negatives in
-    a folder of photographs is above it.
+    The threshold on the score of a class is chosen so that a given fraction of the negatives in a
+    folder of photographs is above it. `rate` is this fraction, and both arguments must be set, or
+    none.
     """
     if (rate is None) != (calibrate is None):
         raise InputError(

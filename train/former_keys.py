@@ -27,7 +27,10 @@ FORMER_KEYS = {
 
 
 def replace_former_key(word: str) -> str:
-    """Replace the former key of a setting in an argument of the command line."""
+    """Replace the former key of a setting in an argument of the command line.
+
+    The key may begin with plus signs. Other keys stay.
+    """
     key, equals, value = word.partition("=")
     name = key.lstrip("+")
     if name not in FORMER_KEYS:
@@ -38,7 +41,7 @@ def replace_former_key(word: str) -> str:
 
 
 def rename_former_keys(config: dict[str, Any]) -> None:
-    """Rename settings that have former keys in the contents of a config.yaml."""
+    """Rename settings with former keys, in place, in the contents of a config.yaml."""
     for former, present in FORMER_KEYS.items():
         *groups, name = former.split(".")
         node: Any = config

@@ -59,7 +59,11 @@ class HelpText:
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
-    """Return the type annotation of each setting in a settings class and in its groups."""
+    """Return the type annotation of each setting in a settings class and in its groups.
+
+    Keys are dotted, and groups have entries, too. Settings of any type that are shown as text have
+    the type `str`.
+    """
     found: dict[str, Any] = {}
     for name, hint in field_types(kind).items():
         found[f"{prefix}{name}"] = str if facts_of(kind, name).is_text else hint
@@ -70,7 +74,10 @@ def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
 
 
 def without_none(hint: Any) -> Any:
-    """Remove None from a type annotation: `int | None` becomes `int`."""
+    """Remove None from a type annotation: `int | None` becomes `int`.
+
+    A union of several types with None stays as it is.
+    """
     options = [option for option in get_args(hint) if option is not NoneType]
     return options[0] if isinstance(hint, UnionType) and len(options) == 1 else hint
 
@@ -116,7 +123,10 @@ def _format_value(value: Any) -> str:
 
 
 def format_facts(kind: type, name: str) -> str:
-    """Format the explanation of a setting with its choices, its unit and its range."""
+    """Format the explanation of a setting with its choices, its unit and its range.
+
+    The text is such as "Weight decay. [≥ 0, ≤ 100000]".
+    """
     facts = facts_of(kind, name)
     limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]

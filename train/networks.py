@@ -71,7 +71,10 @@ class WideResNet(nn.Module):
         mean: Color = MEAN,
         std: Color = STD,
     ):
-        """Build a network with random weights."""
+        """Build a network with random weights.
+
+        The depth is 10, 16, 22 and so on. `mean` and `std` are of RGB images in [0, 1].
+        """
         super().__init__()
         _require_shape(depth, width, dropout)
         channels = [16, 16 * width, 32 * width, 64 * width]
@@ -92,7 +95,7 @@ class WideResNet(nn.Module):
         self.apply(_initialize)
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N classes"]:
-        """Classify images."""
+        """Classify RGB images in [0, 1]."""
         features = self.groups(self.stem((images - self.mean) / self.std))
         return self.head(F.relu(self.norm(features)).mean((2, 3)))
 
@@ -169,7 +172,10 @@ class Dropout(nn.Dropout):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Set random values to 0, and scale the others by 1 / (1 - p)."""
+        """Set random values to 0, and scale the others by 1 / (1 - p).
+
+        In evaluation mode, x is unchanged. Each process has a part of the batch.
+        """
         if not self.training or self.p == 0:
             return x
         if x.device.type == "cpu":
@@ -182,7 +188,10 @@ class Dropout(nn.Dropout):
         return x * is_kept / (1 - self.p)
 
     def _draw_factors(self, x: Tensor) -> Tensor:
-        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p)."""
+        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
+
+        The factors have the memory layout of x, which is on the CPU.
+        """
         value_count = x.numel()
         draws = _draw_int16(value_count * distributed.world_size())
         shard_start = distributed.rank() * value_count
@@ -225,7 +234,12 @@ def build_network(
     trust_code: bool = False,
     **shape: Any,
 ) -> nn.Module:
-    """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits."""
+    """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits.
+
+    The name is "wideresnet", "torchvision:NAME", "python:MODULE:FUNCTION" or, with `classifier`, a
+    pretrained network of `augment.build_classifier`. The mean of the data is 0.5 and the std 0.25
+    if they are None; a network of Python normalizes images itself. `shape` is for "wideresnet".
+    """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
         built = build_classifier(name, size, classes, normalization, trust_code)

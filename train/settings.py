@@ -513,13 +513,19 @@ class NetworkSettings(Settings):
 
 
 def normalized_light_values(value: Any) -> dict[str, float] | None:
-    """Convert a value of the setting `normalize_light` to a mapping, as files record it."""
+    """Convert a value of the setting `normalize_light` to a mapping, as files record it.
+
+    True takes the defaults, a mapping some fields, and None leaves the light as it is.
+    """
     light = read_normalized_light(value)
     return None if light is None else asdict(light)
 
 
 def class_texts(classes: Any) -> Any:
-    """Convert class names such as 0, which YAML reads as numbers, to texts."""
+    """Convert class names such as 0, which YAML reads as numbers, to texts.
+
+    None and the name of a file stay the same.
+    """
     if not isinstance(classes, list):
         return classes
     return [str(name) if is_whole(name) else name for name in classes]
@@ -664,7 +670,10 @@ class ExperimentSettings(NetworkSettings):
 
 
 def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:
-    """Read a list of objects in the settings of a scene."""
+    """Read a list of objects in the settings of a scene.
+
+    Keys are `key` followed by "[0]" and so on. An item without a class gets `label`.
+    """
     objects = {}
     for index, item in enumerate(items):
         item_key = f"{key}[{index}]"
@@ -673,7 +682,11 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
-    """Read one object in the settings of a scene."""
+    """Read one object in the settings of a scene.
+
+    `item` is a file, "solid:NAME", or a mapping with fields of `ObjectSettings`, which can have its
+    own class.
+    """
     values = item if isinstance(item, dict) else {"mesh": item}
     values = {"label": label, **values}
     # The name of a class can be a number, which YAML reads as one.
@@ -683,19 +696,25 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
 
 def solid_name(mesh: str) -> str:
-    """Return the name of a generated mesh: NAME of "solid:NAME" or "solid:NAME:SEED"."""
+    """Return the name of a generated mesh: NAME of "solid:NAME" or "solid:NAME:SEED".
+
+    It is empty for a file.
+    """
     words = mesh.split(":")
     is_solid = words[0] == "solid" and len(words) > 1
     return words[1] if is_solid else ""
 
 
 def simplified(name: str) -> str:
-    """Simplify a name, so that names that differ only in spelling compare equal."""
+    """Write a name in lower case and NFC, with spaces for "_" and "-", to compare spellings."""
     return " ".join(composed(name).lower().replace("_", " ").replace("-", " ").split())
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:
-    """List the names of the positive classes in the setting `label`."""
+    """List the names of the positive classes in the setting `label`.
+
+    There must be a name, and no name twice. A whole number is a name, too.
+    """
     is_one_name = isinstance(label, str) or is_whole(label)
     listed = [label] if is_one_name else label
     if not isinstance(listed, Sequence):
@@ -721,8 +740,9 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
 def published(run: Path) -> Path:
     """Find a path below pretrained/, also if the current folder does not contain pretrained/.
 
-    The library is installed with the folder pretrained/, which has networks and
-    test images. A clone of the repository has this folder, too.
+    The library is installed with the folder pretrained/, which has networks and test images. A
+    clone of the repository has this folder, too. The result is `run` itself if it exists, or if
+    neither has it.
     """
     candidates = [run]
     if run.parts[:1] == ("pretrained",):
@@ -745,7 +765,10 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
-    """Return a copy of nested settings in which a function has replaced each text."""
+    """Return a copy of nested settings in which a function has replaced each text.
+
+    Keys of dictionaries and values other than texts stay the same.
+    """
     if isinstance(value, dict):
         return {key: mapped(item, change) for key, item in value.items()}
     if isinstance(value, list):

@@ -148,7 +148,10 @@ def evaluate(
 def _choose_labels(
     classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
 ) -> list[str]:
-    """Choose the positive classes, on whose photographs recall is measured."""
+    """Choose the positive classes, on whose photographs recall is measured.
+
+    None chooses all classes of the network that have a sub-folder.
+    """
     if label is not None:
         return [classifier.classes[classifier.label(name)] for name in label_names(label)]
     labels = class_folders(folder, classifier.classes)
@@ -168,7 +171,10 @@ def _choose_labels(
 
 
 def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
-    """Return the operating points (thresholds on the log-odds) that are stored with a network."""
+    """Return the operating points (thresholds on the log-odds) that are stored with a network.
+
+    The list is empty if one of the classes has none.
+    """
     by_label = {point.label: point for point in classifier.operating_points}
     has_all = by_label.keys() >= set(labels)
     return [by_label[name] for name in labels] if has_all else []
@@ -181,7 +187,10 @@ def _choose_operating_points(
     rate: float,
     skip_unreadable: bool,
 ) -> list[OperatingPoint]:
-    """Choose a threshold on the log-odds of each positive class, on a folder of photographs."""
+    """Choose a threshold on the log-odds of each positive class, on a folder of photographs.
+
+    `rate` is the false-positive rate of the thresholds, in (0, 1).
+    """
     path = published(Path(folder))
     # The caller of `evaluate` knows this folder as the argument `calibrate`.
     with keyed(folder="calibrate"):

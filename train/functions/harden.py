@@ -195,7 +195,10 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
 def _read_settings(
     changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
 ) -> ExperimentSettings:
-    """Combine the settings of the experiment "classifier" with the arguments of `harden`."""
+    """Combine the settings of the experiment "classifier" with the arguments of `harden`.
+
+    `sections`, which the caller gave, win over `changes`, and these win over the experiment.
+    """
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
@@ -233,7 +236,7 @@ def _restores_torch() -> Iterator[None]:
 
 
 def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier, and write the files of the training to its folder."""
+    """Train a copy of a classifier with files in `settings.run`; return the selected network."""
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
     # The caller of `harden` knows the setting data.path as the argument `photographs`.
@@ -251,7 +254,10 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
 
 
 def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
-    """Return a copy of the network of the caller with the weights after the training."""
+    """Return a copy of the network of the caller with the weights after the training.
+
+    A returned classifier has no operating points, because its logits differ.
+    """
     if isinstance(network, Classifier):
         target = deepcopy(classifier.function)
         copy: nn.Module = Classifier(target, classifier.size, classifier.classes, classifier.name)

@@ -74,7 +74,10 @@ def published_names() -> list[str]:
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the results of a published network from the scores in its file."""
+    """Read the results of a published network from the scores in its file.
+
+    A folder's metrics are nested in `scores`, and get names such as "photographs/auc".
+    """
     results = {ACCURACY: Estimate(scores[ACCURACY])}
     for folder, metrics in scores.items():
         if not isinstance(metrics, Mapping):

@@ -29,7 +29,11 @@ EXPECTED = (
 def as_mappings(
     name: str, meshes: Sequence[MeshItem], classifier: Classifier, folder: Path
 ) -> list[dict[str, Any]]:
-    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`."""
+    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
+
+    Meshes in memory are written to `folder`, because settings can only name files. A mapping has a
+    "label" if the class is given.
+    """
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
@@ -49,7 +53,10 @@ def as_mappings(
 
 
 def _mesh_fields(source: MeshSource, folder: Path) -> dict[str, Any]:
-    """Return the fields of `ObjectSettings` that describe a mesh."""
+    """Return the fields of `ObjectSettings` that describe a mesh.
+
+    For a mesh in memory, "gloss" says whether the written file has a glossy material.
+    """
     if not isinstance(source, Mesh):
         return {"mesh": str(source)}
     with TemporaryDirectory() as temporary:
@@ -70,7 +77,11 @@ def find_positive_classes(
     mappings: Sequence[dict[str, Any]],
     classifier: Classifier,
 ) -> list[str]:
-    """Return the names of the classes that the meshes of a caller show."""
+    """Return the names of the classes that the meshes of a caller show.
+
+    Without a label, each class of the meshes is listed once, in their order. `mappings` come from
+    `as_mappings`.
+    """
     if label is not None:
         return [classifier.classes[classifier.label(label)]]
     for index, item in enumerate(meshes):
