@@ -22,7 +22,8 @@ def read_numbers(path: Path) -> np.ndarray:
     """Read an array of real numbers from an .npy file.
 
     The file is mapped into memory. A damaged header that claims a huge array
-    therefore raises an error instead of allocating memory.
+    therefore raises an error instead of allocating memory. Numbers that are too large for float32
+    become infinite.
     """
     array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind not in "fiu" or not array.size:

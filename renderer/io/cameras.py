@@ -96,7 +96,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
 
 
 def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
-    """Read the cameras of a COLMAP model from its text files."""
+    """Read the cameras of a COLMAP model from its text files, by the names of their images."""
     cameras_path = folder / COLMAP_CAMERAS
     require_file(cameras_path, "give a folder with cameras.txt and images.txt")
     # Intrinsic matrix and image size (width, height)
@@ -173,7 +173,7 @@ def _is_points(line: str) -> bool:
 
 
 def _colmap_intrinsics(model: str, parameters: list[str]) -> Float[np.ndarray, "3 3"]:
-    """Convert the parameters of a COLMAP camera to an intrinsic matrix."""
+    """Convert one or two focal lengths and a principal point to an intrinsic matrix."""
     if model not in COLMAP_PARAMETERS:
         known = " and ".join(COLMAP_PARAMETERS)
         raise InputError(
@@ -190,7 +190,7 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> Float[np.ndarray, "
 
 
 def _rotation(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
-    """Convert a quaternion to a rotation matrix."""
+    """Convert a quaternion (w, x, y, z) of any length to a rotation matrix."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     # The product of this matrix and a vector is the
     # cross product of (x, y, z) and the vector.
@@ -201,12 +201,12 @@ def _rotation(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
 def _intrinsic_matrix(
     focal_x: float, focal_y: float, center_x: float, center_y: float
 ) -> Float[np.ndarray, "3 3"]:
-    """Create the intrinsic matrix of a pinhole camera."""
+    """Create the intrinsic matrix of a pinhole camera from lengths in pixels."""
     return np.array([[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1]])
 
 
 def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
-    """Read the cameras of a transforms.json file of nerfstudio."""
+    """Read the cameras of a transforms.json file of nerfstudio, by the paths of their images."""
     require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
     cameras: dict[str, PinholeCamera] = {}
     try:
@@ -232,7 +232,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
 
 
 def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
-    """Read the intrinsic matrix and the image size of an image from transforms.json."""
+    """Read the intrinsic matrix and the size (width, height) of an image of transforms.json."""
     for name in ("camera_model", "camera_type"):
         model = entries.get(name, "PINHOLE")
         if str(model).upper() not in PERSPECTIVE:

@@ -42,7 +42,7 @@ Conversion = Callable[[Image.Image], Image.Image]
 
 
 def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | None:
-    """Find how the colors of an image file become sRGB."""
+    """Find how colors (L, RGB or CMYK) of an image file become sRGB. None if they already are."""
     codes = _coded_colors(Path(path)) if image.format == "PNG" else None
     if codes is not None:
         primaries_code, curve_code = codes

@@ -88,7 +88,8 @@ def cut_out(
 
     Alpha is the interpolated product of the texture and of the alpha of corners.
     All values are interpolated linearly at new vertices. Faces that share an
-    edge also share the new vertices on it.
+    edge also share the new vertices on it. The first three values of a corner are u, v and alpha.
+    Without texels, the alpha of the texture is 1. The result is new vertices, faces and corners.
     """
     given = vertices, faces, corners
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)

@@ -93,7 +93,7 @@ def export_mesh(
 def _glb(
     mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first: int | None
 ) -> bytes:
-    """Create the content of a .glb file."""
+    """Create the content of a .glb file. The first `first` faces are written before all others."""
     import trimesh
 
     first_count = len(mesh.faces) if first is None else first
@@ -164,7 +164,7 @@ def _part_for_trimesh(
 
 
 def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
-    """Create the glTF material of faces with one texture and gloss."""
+    """Create the glTF material of one texture and gloss. Its name ends with the specular factor."""
     from trimesh.visual.material import PBRMaterial
 
     texture = None
@@ -198,7 +198,8 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
 
     All meshes become primitives of one glTF mesh. Colors, normals and specular
     factors get their names in glTF, and the cameras are added. trimesh itself
-    would write colors with 8 bits, which is too coarse for dark linear colors.
+    would write colors with 8 bits, which is too coarse for dark linear colors. The JSON object is
+    changed in place.
     """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
@@ -254,7 +255,8 @@ def _split_vertices(
     """Repeat vertices until all face corners at a vertex have the same values.
 
     In a mesh, two faces may have different colors at the same vertex. In a file,
-    each vertex has only one color, one normal and so on.
+    each vertex has only one color, one normal and so on. The result is the original vertex (N,)
+    and the values (N, D) of each new vertex, and the faces with new indices.
     """
     # Corners with the same key become one new vertex. The key
     # of a corner is its original vertex, followed by its

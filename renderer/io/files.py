@@ -25,7 +25,9 @@ def replacing(
     """Replace a file by a temporary file that is written in a `with` block.
 
     At the end of the block, the temporary file is moved to `path`. If the block
-    raises an error, the temporary file is removed and the old file stays.
+    raises an error, the temporary file is removed and the old file stays. If `path` is a symbolic
+    link, the file it points to is replaced. `durable` waits about 20 ms until the file is on the
+    disk. The old file is moved to `previous`, or deleted.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(TEMPORARY.replace("*", uuid4().hex))
@@ -64,7 +66,8 @@ def atomic_write(
     """Write a file so that a reader sees either the old content or all of the new content.
 
     The content is written to a temporary file, which then replaces the old file
-    (see `replacing`).
+    (see `replacing`). Characters of names of files that UTF-8 cannot encode are written as
+    escapes.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     with replacing(path, durable, previous) as temporary:
@@ -72,7 +75,7 @@ def atomic_write(
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files that a killed process left in a folder."""
+    """Remove the temporary files of a killed process, if no other process writes to the folder."""
     for unfinished in folder.glob(TEMPORARY):
         unfinished.unlink(missing_ok=True)
 

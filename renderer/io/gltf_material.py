@@ -153,7 +153,7 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
 
 
 def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
-    """Read a material. Without an index, it is white and matte."""
+    """Read a material. Without an index, it is white and matte. Without `gloss`, it is matte."""
     if index is None:
         return Material(color=np.ones(4))
     entry = file.entry("materials", index)

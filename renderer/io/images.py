@@ -35,7 +35,7 @@ MIN_DECODED_RATIO = 16
 
 
 def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
-    """Read the central square of an image file."""
+    """Read the central square of an image file as RGB values in [0, 1]."""
     require_file(path, "give an image file")
     # Pillow can raise almost any exception for a damaged file.
     try:
@@ -47,8 +47,8 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
-def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "1 size size"]:
-    """Create a gray image, or read the central square of an image file."""
+def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "C size size"]:
+    """Create a gray image from a value in [0, 1] or its text, or read the square of an image."""
     advice = "give gray values in [0, 1] or image files"
     # `float` would accept True as 1.
     if isinstance(choice, bool):
@@ -77,7 +77,7 @@ def read_square(path: str | Path, size: int) -> UInt8[np.ndarray, "size size 3"]
 
 @contextmanager
 def open_image(path: str | Path) -> Iterator[Image.Image]:
-    """Open an image file of one of `FORMATS`, without decoding its pixels."""
+    """Open a regular image file of one of `FORMATS`, without decoding its pixels."""
     require_file(path, "give an image file")
     # From a path, Pillow would map a TIFF file to memory, and scramble it if it is rotated.
     with Path(path).open("rb") as file, identify(file) as image:
@@ -103,7 +103,8 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
     """Read an image file as an upright sRGB image on a white background.
 
     A large JPEG file is decoded at 1/2, 1/4 or 1/8 of its size, which is several
-    times faster.
+    times faster. An image is not reduced below `min_side`. Rotation (EXIF), transparency and
+    color profile are applied.
     """
     with open_image(path) as image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
@@ -121,7 +122,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
 
 
 def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
-    """Return the upright pixels of an open image with 8 bits per channel."""
+    """Return upright colors (L, RGB or CMYK) and opacity (L or None) with 8 bits per channel."""
     ImageOps.exif_transpose(image, in_place=True)
     image = eight_bits(image)
     if image.mode == "La":
@@ -142,7 +143,7 @@ def central_square(image: Image.Image, size: int) -> Image.Image:
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Convert an image to 8 bits per channel."""
+    """Convert an image to 8 bits per channel. If white is unknown, this raises a ValueError."""
     if image.format not in (None, "MPO", *FORMATS):
         raise ValueError(f"the format {image.format} of an image is not read: use PNG or JPEG")
     if image.mode == "F" or (image.mode == "I" and image.format == "TIFF"):

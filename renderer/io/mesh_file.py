@@ -181,9 +181,13 @@ def triangles_of(
     file: MeshFile,
     vertices: Float[np.ndarray, "V 3"],
     indices: Int[np.ndarray, " C"],
-    sizes: Float[np.ndarray, " P"],
+    sizes: Int[np.ndarray, " P"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Divide the faces of a file into triangles."""
+    """Divide the faces of a file into triangles.
+
+    The result is the places in `indices` of the corners of the T triangles, shape (T, 3), and the
+    face of each triangle.
+    """
     require_bounded(coordinates=vertices)
     highest = len(vertices) - 1
     if len(indices) and not 0 <= indices.min() <= indices.max() <= highest:
@@ -206,7 +210,7 @@ def colored_mesh(
     texture_ids: Int[np.ndarray, " F"] | None = None,
     textures: Sequence[np.ndarray] = (),
 ) -> Mesh:
-    """Create a matte mesh from the arrays of a file."""
+    """Create a matte mesh from the arrays of a file. Colors are sRGB in [0, 1], absent uvs NaN."""
     corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
     if not textures or texture_ids is None:
         texture_ids = np.full(len(faces), NO_TEXTURE)

@@ -25,7 +25,11 @@ TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
-    """Describe an integrator, which computes the light that reaches the camera, for Mitsuba."""
+    """Describe an integrator, which computes the light that reaches the camera, for Mitsuba.
+
+    With 0 bounces, only light that comes directly from emitters is rendered, with one ray in a
+    random direction besides the `emitter_samples`.
+    """
     if bounces:
         # Mitsuba's depth counts path segments: two more than
         # the bounces between surfaces, from the emitter to the
@@ -37,12 +41,16 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
 
 
 def environment(radiance: Scene, scale: float = 1.0) -> Scene:
-    """Describe an environment map for Mitsuba."""
+    """Describe an environment map, {"bitmap": array} or {"filename": name}, for Mitsuba."""
     return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
 def projector(pose: Float[np.ndarray, "4 4"], fov: float, pattern: Scene, scale: float) -> Scene:
-    """Describe a projector for Mitsuba."""
+    """Describe a projector for Mitsuba.
+
+    A white surface that faces the projector at distance 1 has the radiance pattern · scale. The
+    pose is that of `pose_of`, and `fov` is in degrees.
+    """
     irradiance = {"type": "bitmap", **pattern, "raw": True}
     lens = {"fov": fov, "scale": scale, "to_world": pose}
     return {"type": "projector", "irradiance": irradiance, **lens}
@@ -56,7 +64,13 @@ def sensor(
     film_center: tuple[float, float] = (0.0, 0.0),
     pixel_aspect: float = 1.0,
 ) -> Scene:
-    """Describe a camera for Mitsuba, which calls it a sensor."""
+    """Describe a camera for Mitsuba, which calls it a sensor.
+
+    The angle `fov` is horizontal, in degrees. None shows x and y from -1 to 1 without
+    perspective. `film_center` is the offset of the image center from the principal point, right
+    and down, as fractions of the image. Mitsuba has square pixels, so the number of rows is size
+    divided by `pixel_aspect`.
+    """
     row_count = max(1, round(size / pixel_aspect))
     film = {
         "type": "hdrfilm",
@@ -90,7 +104,8 @@ def pose_of(camera: Camera, scale: float = 1.0) -> Float[np.ndarray, "4 4"]:
     """Compute the pose of a camera, or of a projector at the same place, for Mitsuba.
 
     Mitsuba's cameras and projectors look along +z, and x points to the left. Our
-    cameras look along -z, and x points to the right.
+    cameras look along -z, and x points to the right. The matrix maps to world axes. One unit of x
+    and y in Mitsuba is `scale` world units.
     """
     pose = camera.pose()
     # The columns are the axes x, y and z and the

@@ -168,7 +168,7 @@ def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
 
 
 def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Parse lines of numbers as an array with zeros at the end of short lines."""
+    """Parse N lines of numbers, filled up with zeros, and return how many each has, shape (N,)."""
     counts, text = lines.words()
     wrong = counts[~np.isin(counts, lengths)]
     if len(wrong):
@@ -203,7 +203,11 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
 def _polygons(
     lines: dict[str, _Lines], file: MeshFile
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parse the faces."""
+    """Parse the P faces with C corners.
+
+    Return the line number (P,) of each face, the indices (C, 3) of the position, uv and normal of
+    each corner, or -1, and the number of corners (P,) of each face.
+    """
     line_numbers = lines["f"].numbers()
     sizes, text = lines["f"].words()
     indices = _corners(text.split())
@@ -249,7 +253,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
 def _materials(
     lines: dict[str, _Lines], line_numbers: np.ndarray, file: MeshFile
 ) -> tuple[list[_Material], np.ndarray]:
-    """Read the materials in use, and find the material of each face."""
+    """Read the materials in use, the first for faces without one, and find that of each face."""
     library = _library(lines["mtllib"].texts(), file)
     materials = [_Material()]
     # Index of the material of each line "usemtl", after the index for faces before these lines.

@@ -19,7 +19,12 @@ BRADFORD = np.array(
 
 
 def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray, "3 3"] | None:
-    """Compute the matrix from linear RGB of other primaries to Rec. 709."""
+    """Compute the matrix from linear RGB of other primaries to Rec. 709.
+
+    The chromaticities are CIE x and y of red, green, blue and white. `adapt` maps white to white,
+    as for photographs (Bradford). Otherwise each light keeps its chromaticity, as for radiance.
+    None stands for Rec. 709.
+    """
     given = np.asarray(chromaticities, dtype=np.float64)
     if given.shape == (8,) and np.abs(given - REC_709).max() <= ROUNDING:
         return None

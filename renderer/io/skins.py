@@ -53,7 +53,11 @@ class Skeleton:
     def posed(
         self, node: int, vertices: np.ndarray, attributes: dict[str, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute how far each joint carries each vertex of a part that a node shows."""
+        """Compute how far each joint carries each vertex of a part that a node shows.
+
+        The result is the shares of the joints as in `Skin.carried` (V, J, 4), the vertices in the
+        scene, and a matrix (4, 4) that tells whether the part is mirrored.
+        """
         node_pose = self._file.poses[node]
         weights = np.zeros((len(vertices), len(self)))
         # Matrix that maps a vertex to where each joint alone would move it.

@@ -51,7 +51,7 @@ class Tile:
     caption: tuple[str, ...]
 
     def captioned(self) -> Image.Image:
-        """Draw the image with its caption below."""
+        """Draw the image with its caption below. It is as wide as the image or the longest line."""
         image = Image.fromarray(self.image)
         line_widths = [_text_width(line, CAPTION_SIZE) for line in self.caption]
         width = max([image.width, *line_widths])
@@ -73,7 +73,8 @@ def tiles_of(
     """Create a tile for each image.
 
     Small images are enlarged without smoothing, so that a tile shows the pixels
-    that a classifier saw.
+    that a classifier saw. Images have values in [0, 1]. They are enlarged by the smallest whole
+    factor that makes them `side` pixels wide.
     """
     tiles = []
     for image, caption in zip(images, captions, strict=False):
@@ -90,7 +91,7 @@ def draw_grid(
     """Draw rows of tiles on a sheet.
 
     Each column is as wide as its widest tile or title. Each row is as high as its
-    highest tile.
+    highest tile. The last row may be shorter.
     """
     images = [[tile.captioned() for tile in row] for row in rows]
     row_heights = [max(image.height for image in row) for row in images]
