@@ -99,7 +99,7 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
 
 
 def _degree_of_rows(coefficients: Tensor) -> int | None:
-    """Find the degree of a light from the number of its SH coefficients."""
+    """Find the degree of a light from the number of its SH coefficients, or None."""
     if coefficients.ndim != 2 or len(coefficients) == 0:
         return None
     degree = math.isqrt(len(coefficients)) - 1
@@ -197,7 +197,8 @@ def evaluate_harmonics(directions: Tensor, indices: Iterable[int]) -> list[Tenso
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
     """Evaluate the orthonormal associated Legendre functions P_l^m / sin^m θ of one order m.
 
-    The functions are polynomials in z = cos θ.
+    The functions are polynomials in z = cos θ. They are yielded for l = m to degree. The first is
+    constant and yielded as a number, because multiplying by a number is faster.
     """
     ratios = [(2 * k + 1) / (2 * k) for k in range(1, m + 1)]
     constant = math.sqrt(math.prod(ratios) / (4 * math.pi))
@@ -248,7 +249,8 @@ def _set_gradients(matrices: Float[Tensor, "3 K K"], l: int, m: int) -> None:
     coefficients of the harmonics of band l - 1 in its derivative. The derivative
     of Y_lm with respect to z is a harmonic of the same order in band l - 1. The
     derivatives with respect to x and y are sums of harmonics of the orders m - 1
-    and m + 1 in band l - 1 (ladder operators).
+    and m + 1 in band l - 1 (ladder operators). The three matrices are the derivatives with
+    respect to x, y and z. l is at least 1, and m at least 0.
     """
     norm = (2 * l + 1) / (2 * l - 1)
     # Factors of the harmonics of the orders m - 1 (down) and m + 1 (up) in band l - 1.
@@ -462,7 +464,7 @@ def irradiance_error(
 
 
 def _pad_bands(coefficients: Float[Tensor, "... K C"], size: int) -> Float[Tensor, "... size C"]:
-    """Append zeros to the SH coefficients of lights."""
+    """Append zeros to the SH coefficients of lights, up to `size` coefficients."""
     return F.pad(coefficients, (0, 0, 0, size - coefficients.shape[-2]))
 
 
@@ -571,7 +573,7 @@ def project(
 
 
 def _project_map(radiance: Float[Tensor, "height width channels"], degree: int) -> Tensor:
-    """Compute the SH coefficients of an environment map with the midpoint rule."""
+    """Compute the SH coefficients of an environment map with the midpoint rule, in float64."""
     if radiance.ndim != 3:
         shape = tuple(radiance.shape)
         raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")

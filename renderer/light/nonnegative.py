@@ -135,7 +135,9 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
 
     A light is non-negative if its radiance is negative in no direction. The
     channels of a light are projected separately, in float64. The result has no
-    gradient.
+    gradient. The radiance is at least -`TOLERANCE` times the largest one of the channel. The
+    first coefficient stays, or becomes 0 if it was negative. A channel without negative radiance
+    is unchanged.
     """
     # Find the distinct channels, so that the equal channels of a gray light are projected
     # only once.
@@ -159,7 +161,8 @@ def _project_channel(channel: bytes) -> Float[Tensor, " K"]:
     """Call `_project_with_mean` for one color channel, and cache the result.
 
     Several attacks often start in the same light. At degree 39, a projection takes
-    half a minute.
+    half a minute. The bytes of the channel (float64) are used because a cache needs something
+    that can be hashed.
     """
     return torch.from_numpy(_project_with_mean(np.frombuffer(channel).copy()))
 
@@ -200,7 +203,8 @@ def _project_with_mean(light: Array) -> Array:
 def _mix_to_nonnegative(light: Array, filler: Array, harmonics: Array) -> Array:
     """Mix a second light into a light until its radiance is non-negative in D directions.
 
-    The result is light + s (filler - light) with the smallest possible s ≥ 0.
+    The result is light + s (filler - light) with the smallest possible s ≥ 0. The filler must be
+    brighter than the light wherever the light is negative.
     """
     radiance = harmonics @ light
     difference = harmonics @ (filler - light)
@@ -215,7 +219,10 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     A light is non-negative if its radiance is negative in no direction. The
     distance between two lights is the Euclidean distance of their coefficients.
     The mean radiance changes, and often rises if a light is far below zero in
-    some directions. The computation uses float64. The result has no gradient.
+    some directions. The computation uses float64. The result has no gradient. With `within`, each
+    of A lights (A, K, C) lies in its ball, whose center must be non-negative. The norm "l2" is
+    taken over all channels of a light together. The radiance of a channel is at least
+    -`TOLERANCE` times its largest one.
     """
     programs = _create_programs(coefficients, within)
     unsolved = programs
@@ -243,7 +250,7 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
 def _create_programs(
     coefficients: Float[Tensor, "... K C"], within: Ball | None
 ) -> "list[_QuadraticProgram]":
-    """Create the quadratic programs whose solutions are the nearest non-negative lights."""
+    """Create the quadratic program of each light, or of each channel if no L2 ball couples them."""
     original = _split_channels(coefficients)
     if within is None:
         return [_QuadraticProgram(channel) for channel in original]
@@ -264,12 +271,12 @@ def _create_programs(
 
 
 def _rounding_radiance(channels: Array) -> Array:
-    """Compute the largest radiance that may be nothing but a rounding error."""
+    """Compute the largest radiance of each row that may be nothing but a rounding error."""
     return _DARK_FRACTION * np.linalg.norm(channels, axis=1)
 
 
 def _split_channels(coefficients: Float[Tensor, "... K C"]) -> Array:
-    """Convert lights to an array with one row for each color channel of each light."""
+    """Convert lights to an array (R, 1, K) of the R color channels of all of them."""
     rows = coefficients.detach().mT.flatten(0, -2)
     return rows[:, None].cpu().double().numpy()
 
@@ -332,7 +339,8 @@ class _QuadraticProgram:
         dropped. With a ball of center c and radius r, the solution x is the
         projection of the point c + t (v - c) between the center (t = 0) and the
         given light v (t = 1). Newton steps change t until x lies on the sphere
-        |x − c| = r, or inside of it with t = 1.
+        |x − c| = r, or inside of it with t = 1. The new harmonics are one matrix (M, K) for each
+        channel.
         """
         constraints = [
             np.concatenate(pair)
@@ -365,7 +373,7 @@ class _QuadraticProgram:
         self.nearest = self._center + displacement * scale
 
     def _project(self, target: Array, constraints: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Find the light nearest to a given light that satisfies all constraints but the ball."""
+        """Find the nearest light in all constraints but the ball, and the active constraints."""
         nearest = []
         active_constraints = []
         channels = zip(target, constraints, self._low, self._high, strict=True)
@@ -383,7 +391,8 @@ class _QuadraticProgram:
         The solution is the projection of the point c + t (v - c), which lies between
         the center c of the ball (t = 0) and the given light v (t = 1). The change s
         of t solves the quadratic equation |displacement + s velocity| = r. It is
-        clipped so that t stays between its minimum and 1.
+        clipped so that t stays between its minimum and 1. `velocity` is the derivative of x with
+        respect to t, `displacement` is x - c, and `missing_squared` is r² - |x - c|².
         """
         squared_speed = float((velocity * velocity).sum())
         slope = float((velocity * displacement).sum())
@@ -421,7 +430,8 @@ def _differentiate(offset: Array, correction: Array, active_rows: Array) -> _Sol
 
     With the matrix R of the M active constraints, the solution is
     x = c + t (v − c) + Rᵀ μ, and R x = 0. The derivative of the multipliers μ is
-    therefore the solution μ' of the least squares problem Rᵀ μ' ≈ −(v − c).
+    therefore the solution μ' of the least squares problem Rᵀ μ' ≈ −(v − c). `offset` is v − c,
+    and `correction` is Rᵀ μ, from which μ is computed.
     """
     right_sides = np.stack([-offset, correction], axis=1)
     solution = np.linalg.lstsq(active_rows.T, right_sides)[0]
@@ -442,7 +452,8 @@ def _least_distance(
     G and a vector h. Algorithm LDP of Lawson and Hanson (1974, chapter 23) finds
     the shortest d. It stacks Gᵀ and the row hᵀ to a matrix E, and minimizes
     |E u − f| over all u ≥ 0, with f = (0, ..., 0, 1). With the residual r = E u − f
-    of size K + 1, the result is d_j = −r_j / r_(K+1).
+    of size K + 1, the result is d_j = −r_j / r_(K+1). A bound may be infinite. The result is x
+    and the rows of `harmonics` with positive multipliers.
     """
     if not len(harmonics):
         return original, harmonics
@@ -477,7 +488,11 @@ def _least_distance(
 def _find_negative_minima(
     lights: Array, rounding_radiance: Array, limits: _StartLimits
 ) -> tuple[Array, Array]:
-    """Find the directions in which the radiance of R lights has a negative local minimum."""
+    """Find the directions in which the radiance of R lights has a negative local minimum.
+
+    A light that is nowhere brighter than its `rounding_radiance` has none. The result is the
+    index of the light of each minimum, and the harmonics in its direction (D, K).
+    """
     degree = math.isqrt(lights.shape[1]) - 1
     is_coarse = degree <= _COARSE_GRID_DEGREE
     grid = _grid(degree, _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS)
@@ -504,7 +519,11 @@ def _choose_starts(
     grid: "_Grid",
     limits: _StartLimits,
 ) -> tuple[Array, Array]:
-    """Choose the grid directions from which the search for a negative minimum starts."""
+    """Choose the grid directions from which the search for a negative minimum starts.
+
+    `radiance` has a row for each light, and `largest` is its largest magnitude. The result is the
+    index of the light and of the grid direction of each start.
+    """
     upper_limit = np.where(largest > rounding_radiance, limits.above_zero * largest, -np.inf)
     light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
     margin = limits.above_neighbors * largest
@@ -518,7 +537,7 @@ def _choose_starts(
 
 
 def _step_down(directions: Array, derivatives: Array) -> Array:
-    """Take one Newton step on the unit sphere toward lower radiance, from D directions."""
+    """Take a Newton step toward lower radiance on the sphere. `derivatives` is (D, 12, K)."""
     degree = math.isqrt(derivatives.shape[2]) - 1
     # Values of the derivatives in the directions, shape (D, 12, 1).
     values = derivatives @ _harmonics(directions, degree)[..., None]
@@ -551,7 +570,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
     A factor x² + y² + z² is 1 on the unit sphere, and raises the degree of a
     polynomial by 2. So each harmonic equals a homogeneous polynomial of degree
     `degree` or `degree` - 1 in x, y and z. For few directions, this is faster than
-    `harmonics.evaluate_harmonics`.
+    `harmonics.evaluate_harmonics`. The result has one row for each direction.
     """
     exponents, coefficients = _polynomials(degree)
     # Powers 0 to degree of x, y and z of D directions, shape (degree + 1, 3, D).
@@ -570,7 +589,8 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
 
     The monomials have a + b + c = degree or a + b + c = degree - 1. Harmonics of
     bands with the same parity as `degree` only need the first kind, and the other
-    harmonics only need the second kind.
+    harmonics only need the second kind. The result is the exponents a, b and c, shape (3, J), and
+    the coefficients of the monomials in the K harmonics, shape (J, K).
     """
     exponents = []
     coefficients = []
@@ -588,7 +608,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
 
 @cache_tensors
 def _derivatives(degree: int) -> Array:
-    """Compute the matrix that maps SH coefficients to those of first and second derivatives."""
+    """Return the matrix (K, 12 K) to the coefficients of the 3 first, then 9 second derivatives."""
     # The shapes are (3, K, K) for the first and (9, K, K) for the second derivatives.
     first = gradient_matrices(degree)
     second = (first[:, None] @ first).flatten(0, 1)

@@ -33,7 +33,8 @@ def shortest(matrix: Array, lower_bounds: Array) -> Array:
     s_i μ_i = 0 for each inequality i. The predictor-corrector method solves
     these conditions (Mehrotra 1992, "On the implementation of a primal-dual
     interior point method"). The computing time does not depend on how many
-    inequalities hold with equality.
+    inequalities hold with equality. Some y must satisfy all inequalities strictly, and y = 0 must
+    violate one of them. They hold up to 10⁻⁹ of the largest bound.
     """
     scale = np.abs(lower_bounds).max()
     iterate = _Iterate(matrix, lower_bounds / scale)
