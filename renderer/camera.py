@@ -266,7 +266,7 @@ class Camera(ABC):
         return F.pad(axes[2], (0, 1))
 
     def _differentiable_axes(self) -> tuple[Tensor, Tensor]:
-        """Compute the axes of the camera differentiably with respect to its fields."""
+        """Compute `axes` differentiably, and the camera coordinates of the origin, shape (3,)."""
         # Camera coordinates of the origin and of the
         # unit vectors give the axes of the camera.
         origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
@@ -320,7 +320,7 @@ class Camera(ABC):
         """Convert points from world axes to the axes right, up and back of the camera.
 
         The result is differentiable with respect to the points, and with respect
-        to angles of the camera that are tensors.
+        to angles of the camera that are tensors. The coordinates are measured from the origin.
         """
         polar = _as_tensor(_in_radians(self.polar), points)
         azimuth = _as_tensor(_in_radians(self.azimuth), points)
@@ -337,7 +337,11 @@ class Camera(ABC):
 
     @abstractmethod
     def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w and the nearness of points."""
+        """Compute the homogeneous coordinate w and the nearness of points.
+
+        Image coordinates are divided by w. The nearness is larger for nearer points. `back` is
+        the coordinate along the axis from the origin to the camera.
+        """
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
         """Compute the depths of points, which a perspective projection divides by.
@@ -393,7 +397,7 @@ class OrthographicCamera(Camera):
         return coordinates.T
 
     def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w, which is 1, and the nearness of points."""
+        """Compute the homogeneous coordinate w, which is 1, and the nearness, which is `back`."""
         return torch.ones_like(back), back
 
 
@@ -470,7 +474,7 @@ class PerspectiveCamera(Camera):
         return np.stack([x, y, normalized_depth]).T
 
     def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w and the nearness of points."""
+        """Compute w, the depth divided by the camera's distance, and the nearness 1 / w."""
         w = 1 - back / self.distance
         return w, 1 / w
 
@@ -715,7 +719,7 @@ class PinholeCamera(PerspectiveCamera):
         return torch.stack([x, y, w]).T, nearness
 
     def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
-        """Convert points from world axes to the axes right, up and back of the camera."""
+        """Convert points to the axes right, up and back, starting at the pivot (`_from_pivot`)."""
         center = [self.center_x, self.center_y, self.center_z]
         pivot = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
         right, up, back = super()._camera_coordinates(points - pivot)
@@ -748,7 +752,7 @@ class PinholeCamera(PerspectiveCamera):
 
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Check a view matrix, and split it into a rotation matrix and a translation."""
+    """Check and split a view matrix, (4, 4) or (3, 4): rotation (3, 3) and translation (3,)."""
     matrix = as_array("view", view).astype(np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"view has shape {matrix.shape}: give a matrix (4, 4) or (3, 4)")
@@ -765,7 +769,7 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
-    """Check an intrinsic matrix, and return its focal lengths and principal point."""
+    """Check an intrinsic matrix in pixels, and return fx, fy, cx and cy."""
     matrix = as_array("intrinsics", intrinsics).astype(np.float64)
     if matrix.shape != (3, 3):
         raise InputError(f"intrinsics has shape {matrix.shape}: give a matrix (3, 3)")
@@ -789,7 +793,7 @@ def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _as_scalar(name: str, value: Any) -> Any:
-    """Convert the value of a camera's field to a number, or to a tensor of shape ()."""
+    """Convert a camera's field to a number, or a tensor to shape (), which keeps its gradient."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.reshape(())
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:

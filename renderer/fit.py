@@ -179,7 +179,9 @@ def fit_photograph(
     (see `renderer.photograph`). The window is fitted with `fit_scene`. The upward
     direction in the window depends on the height of the camera, which is only
     known after the fit. If the first window was tilted, a second window is cut
-    and fitted.
+    and fitted. The camera of the photograph is upright, and its optical axis passes through the
+    center of the photograph. The mask is white where the object is. `fov` is the field of view of
+    the window in degrees, or None for no perspective.
     """
     is_object = mask > MASK_THRESHOLD
     rows = np.flatnonzero(is_object.any(axis=1))
@@ -249,7 +251,7 @@ class _WindowFit:
     options: dict[str, Any]
 
     def fit(self, window: Window, start: Camera | None) -> FittedScene:
-        """Fit the camera and the light in one window."""
+        """Fit the camera and the light in one window. Without a start camera, search for one."""
         linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
         # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
@@ -257,7 +259,7 @@ class _WindowFit:
 
 
 def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
-    """Convert the world's z-axis to the axes of the camera that took the photograph."""
+    """Return the world's z-axis, a unit vector, in the photograph's axes right, up and back."""
     # The z-components of the axes right, up and back of the fitted
     # camera. These axes are also the axes of the window.
     z_axis_in_window = camera.axes()[:, 2]
@@ -407,7 +409,11 @@ def fit_scene(
 def _plausible_cameras(
     target: _Target, mask: Float[Tensor, "size size"], fov: float | None
 ) -> list[Camera]:
-    """Search all directions for a few cameras, one of which should be near the best camera."""
+    """Search all directions for a few cameras, one of which should be near the best camera.
+
+    There are at most `KEPT_CAMERAS` different ones, the best one first. A `fov` (degrees) of None
+    means no perspective.
+    """
     mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
     first_cameras = []
@@ -431,7 +437,7 @@ def _plausible_cameras(
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
-    """Remove cameras that look in nearly the same direction as an earlier camera."""
+    """Remove cameras whose axes all lie within `MIN_CAMERA_ANGLE` degrees of an earlier one's."""
     kept_cameras: list[Camera] = []
     max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
     for camera in cameras:
@@ -495,7 +501,8 @@ class _Target(NamedTuple):
         """Resample a photograph and its mask, and replace the background by black or white.
 
         Pixels on the border of the object show a mixture of object and
-        background. They get the mean color of the object's pixels around them.
+        background. They get the mean color of the object's pixels around them. Values are linear,
+        and the mask is the share of each pixel that the object covers.
         """
         # 1 in pixels that the object covers
         # completely, and 0 elsewhere, shape (1, H, H).
@@ -521,7 +528,11 @@ class _Target(NamedTuple):
     def fit_light(
         self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
     ) -> _LightFit:
-        """Find the light under which a render from a camera resembles the photograph most."""
+        """Find the light under which a render from a camera resembles the photograph most.
+
+        Only pixels of which the mesh and the mask both cover at least `min_coverage` count. The
+        radiance is constrained at the vertices of an icosphere with `grid` subdivisions.
+        """
         operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
@@ -554,7 +565,10 @@ class _Target(NamedTuple):
         """Fit a light to P pixels of the photograph by least squares.
 
         A pixel that is clipped in the photograph may have been brighter. The fit
-        is repeated without the clipped pixels that the render makes brighter than 1.
+        is repeated without the clipped pixels that the render makes brighter than 1. `transfer`
+        is the radiance under 49 lights with one coefficient of 1 each. The result is the light
+        (49, 3), the values (3, P) of its render, and the weighted differences (3, 49) from the
+        expected light.
         """
         object_radiance = image - background
         is_clipped = image >= CLIPPED_VALUE
@@ -575,7 +589,7 @@ class _Target(NamedTuple):
         return light, rendered, penalty.sqrt() * (light - expected_light).T
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-        """Sort cameras by the squared error of a render with the best light of each camera."""
+        """Sort cameras by the squared error of a render with their best light, smallest first."""
         pairs = []
         for camera in cameras:
             residuals = self.fit_light(camera).residuals
@@ -590,7 +604,8 @@ class _Target(NamedTuple):
         proportional to 1 + (l (l + 1))², because -l (l + 1) is the eigenvalue of
         the Laplacian on the sphere. It is also proportional to the squared
         brightness of the object under uniform light. The fit therefore does not
-        depend on the scale of the albedo.
+        depend on the scale of the albedo. Entry (j, k) of a normal matrix is the sum over pixels
+        of the radiance under coefficient j times that under k.
         """
         # Entry (0, 0) is the sum over pixels of the squared radiance under
         # uniform light (coefficient 0). The small summand keeps the sum
@@ -673,7 +688,11 @@ class _Descent:
         return self._camera_of(found.x)
 
     def _camera_of(self, parameters: Float[np.ndarray, " 5"]) -> Camera:
-        """Convert the five parameters of the refinement to a camera."""
+        """Convert the five parameters of the refinement to a camera.
+
+        They are the polar angle and the azimuth in radians, and the width and the shifts right
+        and up divided by the first camera's width.
+        """
         polar, azimuth, relative_width, right, up = parameters.tolist()
         width = self._first_camera.width
         moved = replace(
@@ -691,7 +710,7 @@ class _Descent:
         return moved
 
     def _residuals(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
-        """Compute the differences between the photograph and a render with the best light."""
+        """Compute the residuals of the best light. The sum of their squares is minimized."""
         return self._target.fit_light(self._camera_of(parameters)).residuals.numpy()
 
     def _jacobian(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
@@ -719,7 +738,8 @@ def _fit_channels(
     An object may hardly reflect one color. For example, a yellow object hardly
     shows from where blue light comes. The light of each channel is therefore
     expected to be a multiple of the light of the brightest channel. Differences
-    between the light and this expected light are penalized.
+    between the light and this expected light are penalized. The result is the light and the
+    expected light, shape (49, 3) each. The latter is zero for the brightest channel.
     """
     regularized = normal_matrix + torch.diag(penalty)
     # The brightest channel reflects most of a
@@ -808,7 +828,8 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     """Change the width and the shift of a camera so that the mesh is as large as the mask.
 
     The bounding box of the mesh in the image gets the center and the area of the
-    bounding box of the mask.
+    bounding box of the mask. The direction is kept. A perspective camera also gets another
+    distance.
     """
     # Bounding boxes in image coordinates from
     # -1 to 1, with x to the right and y up.
@@ -831,7 +852,7 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
 
 
 def _mask_box(mask: Float[Tensor, "size size"]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Compute the bounding box of the pixels that an object covers by more than half."""
+    """Find the corners (lower left, upper right; -1 to 1) of the pixels covered by over half."""
     size = len(mask)
     rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
     columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())

@@ -348,7 +348,7 @@ class Mesh:
 # faces, for example if it is another instance of the same procedural solid.
 @lru_cache(maxsize=1)
 def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
-    """Find the connected parts of a mesh, all of which must be closed surfaces."""
+    """Find the connected part of each face. None if one is open or has mixed orientations."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.graph import connected_component_labels
 
@@ -377,7 +377,7 @@ def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
 
 
 def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
-    """Check textures, and convert them to a tuple of arrays."""
+    """Check textures, and convert them to a tuple. A tuple of arrays is returned as it is."""
     expected = f"a list of arrays (height, width, {channels}) of uint8"
     if not isinstance(textures, list | tuple):
         raise InputError(f"{name} is {describe(textures)}: give {expected}")
@@ -440,7 +440,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def _concatenate_gloss(meshes: Sequence[Mesh]) -> Float[np.ndarray, "F 3"] | None:
-    """Concatenate the gloss (specular reflection) of the faces of several meshes."""
+    """Concatenate roughness, metallic and specular factor. None if all meshes are matte."""
     if all(mesh.gloss is None for mesh in meshes):
         return None
     gloss_by_mesh = []
@@ -454,7 +454,8 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
     """Concatenate the gloss textures of several meshes.
 
     A gloss texture has factors for roughness and metallic. If a mesh has any, it
-    has one for each of its color textures.
+    has one for each of its color textures. Meshes without gloss textures get the factor 1, unless
+    no mesh has any.
     """
     if not any(mesh.gloss_textures for mesh in meshes):
         return ()
@@ -466,7 +467,7 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
 
 
 def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
-    """Create a skin with the joints of the first mesh for the vertices of several meshes."""
+    """Create a skin for several meshes with the joints of the first one, or None if it has none."""
     skin = meshes[0].skin
     if skin is None:
         return None
@@ -520,7 +521,8 @@ def normalize(mesh: Mesh) -> Mesh:
 def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     """Compute the center of a mesh, and its largest extent from the center along an axis.
 
-    `normalize` moves the center to the origin and scales the extent to 1.
+    `normalize` moves the center to the origin and scales the extent to 1. The center is the mean
+    of the face centers, weighted with the areas.
     """
     areas = mesh.face_areas()
     if not areas.sum() > 0:
@@ -536,7 +538,8 @@ def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
     """Return a copy of a mesh after an affine transformation.
 
     A transformation that mirrors the mesh would make its faces clockwise seen
-    from outside. The order of their corners is therefore reversed.
+    from outside. The order of their corners is therefore reversed. The matrix is multiplied by
+    columns (x, y, z, 1).
     """
     is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
     corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
@@ -593,7 +596,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
     The surface stays the same, but the order of the faces changes. The old
     vertices keep their indices. A new vertex of a divided face may lie in the
-    middle of an edge of a neighboring face that is not divided.
+    middle of an edge of a neighboring face that is not divided. The largest allowed `area` of a
+    face is in squared world units.
     """
     is_large = mesh.face_areas() > area
     if not is_large.any():
@@ -615,7 +619,7 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
-    """Return a copy of a mesh with some of its faces and all of its vertices."""
+    """Return a copy of a mesh with some faces (indices, mask or slice) and all of its vertices."""
     selected_rows = {}
     for name in PER_FACE:
         rows = getattr(mesh, name)
@@ -629,7 +633,7 @@ def _quartered(mesh: Mesh) -> Mesh:
     """Return a copy of a mesh in which each face is divided into four triangles.
 
     New vertices are the midpoints of edges. Two faces that share an edge also
-    share its midpoint.
+    share its midpoint. The first vertices are the old ones.
     """
     edge_ends, edge_of_side = _shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
@@ -660,7 +664,7 @@ def _quartered(mesh: Mesh) -> Mesh:
 
 
 def _shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """List the E edges of a mesh. Sides of faces with the same two vertices are one edge."""
+    """List the ends (E, 2) of the edges of a mesh, and the edge (F, 3) of each side of a face."""
     vertex_count = faces.max() + 1
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
@@ -679,7 +683,7 @@ def _interpolate_quarters(
     """Interpolate values at the corners of faces to the corners of the four parts of each face.
 
     The four parts are the triangles between the corners of a face and the
-    midpoints of its edges.
+    midpoints of its edges. They have the order of `_QUARTERS`.
     """
     # Values at both ends of each edge of each
     # face, shape (F, 3 edges, 2 ends, D).

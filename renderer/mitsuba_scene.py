@@ -98,7 +98,8 @@ MIN_SPECULAR = 1e-4
 def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     """Import Mitsuba, and set its variant for a `with` block.
 
-    The previous variant is restored at the end of the block.
+    The previous variant is restored at the end of the block. A variant that needs LLVM raises an
+    `InputError` without it.
     """
     try:
         import drjit
@@ -124,7 +125,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
-    """Create a Mitsuba object, such as a scene or a material, from a dictionary."""
+    """Create a Mitsuba object from a dictionary with NumPy arrays as transformations and images."""
     converted = dict(scene)
     for name, value in scene.items():
         # A dictionary of the type "rgb" is a
@@ -139,7 +140,7 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """Render a scene file with Mitsuba, from the first cameras in the file."""
+    """Render the first cameras of a file: linear RGB and coverage, (views, 4, size, size)."""
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
@@ -154,7 +155,7 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 
 
 def _as_square(image: Float[np.ndarray, "H W C"]) -> torch.Tensor:
-    """Move the channels of an image to the first axis, and stretch the image to a square."""
+    """Move the channels of an image to the first axis, and stretch it to a square of its width."""
     channels = torch.from_numpy(image).permute(2, 0, 1)
     height, width = channels.shape[1:]
     if height == width:
@@ -167,7 +168,7 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
 
     In Mitsuba, the centers of the first and the last row are the poles. In our
     maps, the outer edges of these rows are the poles. If Mitsuba read one of our
-    maps with 256 rows, the light would be 0.2% too dim.
+    maps with 256 rows, the light would be 0.2% too dim. The map has 2 · height columns.
     """
     # The directions of a map with a single row are horizontal: they have z = 0.
     horizontal, _ = equirectangular(1, 2 * height)
@@ -210,7 +211,8 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     """Split a mesh into parts, each of which has one texture and one specular reflection.
 
     Mitsuba cannot multiply a texture by corner colors. If corners of faces with a
-    texture are not white, the colors are first multiplied into new textures.
+    texture are not white, the colors are first multiplied into new textures. Parts ascend by the
+    index of the texture and of the gloss.
     """
     textured_colors = mesh.corner_colors[mesh.texture_ids >= 0]
     if (textured_colors != 1).any():
@@ -253,7 +255,11 @@ def shape(
     uvs: Float[np.ndarray, "V 2"] | None = None,
     colors: Float[np.ndarray, "V 3"] | None = None,
 ) -> Any:
-    """Create a Mitsuba mesh in memory."""
+    """Create a Mitsuba mesh in memory.
+
+    Without normals, each face is shaded with its own. Colors are linear, and become the attribute
+    "vertex_color".
+    """
     properties = module.Properties()
     properties["bsdf"] = load(module, surface)
     properties["face_normals"] = normals is None
@@ -289,7 +295,11 @@ def write_mitsuba_scene(
     light: str,
     local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
 ) -> None:
-    """Write a scene file for Mitsuba, with the mesh and texture files that it refers to."""
+    """Write a scene file for Mitsuba, with the mesh and texture files that it refers to.
+
+    The environment map `light` is a path relative to the folder. Local lights have the
+    coefficients (N, 3).
+    """
     folder.mkdir(parents=True, exist_ok=True)
     local_emitters = _local_emitters(folder, local_lights, albedo_scale)
     sky = environment({"filename": light}, math.pi * albedo_scale)
@@ -315,7 +325,7 @@ def write_mitsuba_scene(
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Append a value of a Mitsuba scene to an XML element."""
+    """Append a value to an XML element. An array (4, 4) is a transformation."""
     attributes = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", attributes)
@@ -378,7 +388,7 @@ class _PartWriter:
         self._albedo_factor = 1.0 if self._gloss is None else _reflected_albedo(self._gloss)
 
     def write(self) -> Scene:
-        """Write the mesh and the textures of the part as files."""
+        """Write the mesh and the textures of the part, and return its entry for a Mitsuba scene."""
         mesh_file = self._write_mesh()
         albedo = self._albedo()
         material = {"type": "diffuse", "reflectance": albedo}
@@ -411,7 +421,7 @@ class _PartWriter:
         return name
 
     def _albedo(self) -> Scene:
-        """Write the texture of the part as an image file, if there is a texture."""
+        """Write the texture, if any, and return the albedo: the image file or the vertex colors."""
         texture = self._part.texture
         if texture is None:
             return {"type": "mesh_attribute", "name": "vertex_color"}
@@ -425,7 +435,7 @@ class _PartWriter:
         """Describe a material with specular reflection for Mitsuba.
 
         If the part has a texture of roughness and metallic, it is written as image
-        files.
+        files. The values of `gloss` are roughness, metallic and specular factor.
         """
         roughness, metallic, specular_factor = gloss.tolist()
         # A metal has no coat and needs the full albedo, but

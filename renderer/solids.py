@@ -224,7 +224,7 @@ def cup(rng: np.random.Generator) -> Mesh:
 
 
 def _handle(end_radii: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "19 12 3"]:
-    """Create the rings of points of the handle of a cup: a tube that is bent in the xz-plane."""
+    """Create the rings of the handle of a cup, whose ends have these distances from the axis."""
     x_axis = [1, 0, 0]
     y_axis = [0, 1, 0]
     z_axis = [0, 0, 1]
@@ -394,7 +394,7 @@ def fruit(rng: np.random.Generator) -> Mesh:
 
 
 def _random_shade(rng: np.random.Generator, hue: float) -> Float[np.ndarray, " 3"]:
-    """Draw a color of a given hue with a random saturation and brightness (HSV)."""
+    """Draw a color (HSV) of a hue, a fraction of the circle, clipped to exclude oranges."""
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
     value = rng.uniform(0.3, 0.95)
@@ -429,7 +429,7 @@ HARD_NEGATIVES: dict[str, Maker] = {
 
 @cache
 def sphere(subdivisions: int = SUBDIVISIONS) -> tuple[np.ndarray, np.ndarray]:
-    """Create a unit sphere of triangles of similar size."""
+    """Create a unit sphere (vertices, faces) by dividing faces of an icosahedron into four."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 
@@ -443,7 +443,9 @@ def revolve(
     """Create a surface of revolution by rotating a profile about the z-axis.
 
     The profile is a polygonal line from the axis back to the axis,
-    counter-clockwise around the right half of the cross section of the solid.
+    counter-clockwise around the right half of the cross section of the solid. Each section is a
+    list of points (radius, height) and begins where the previous one ends. The result is
+    vertices, faces, and the section of each face.
     """
     profile, section_of_piece = _divided_profile(sections)
     azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
@@ -460,7 +462,7 @@ def revolve(
 def _divided_profile(
     sections: Sequence[np.ndarray | Sequence[tuple[float, float]]],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Join the sections of a profile, and divide its long edges into pieces of equal length."""
+    """Return the P points of a profile with divided edges, and the section of its P - 1 pieces."""
     corners = np.concatenate(sections)
     point_counts = [len(section) for section in sections]
     section_of_corner = np.repeat(np.arange(len(sections)), point_counts)
@@ -480,7 +482,12 @@ def _divided_profile(
 
 
 def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Create a closed surface that connects each ring of points to the next ring."""
+    """Create a closed surface that connects each ring of points to the next ring.
+
+    The points are counter-clockwise about the direction from the first to the last ring. All
+    points of these two rings coincide, which closes the surface. The result is vertices, faces,
+    and for each face the first of its two rings.
+    """
     ring_count, point_count = rings.shape[:2]
     first_point = rings[0, :1]
     last_point = rings[-1, :1]
@@ -508,7 +515,7 @@ def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def surface_of_cells(is_filled: Bool[np.ndarray, "X Y Z"]) -> tuple[np.ndarray, np.ndarray]:
-    """Create the surface of a solid that consists of cubic cells of a grid."""
+    """Create the surface of a solid of cubic cells: vertices in units of cells, and faces."""
     padded = np.pad(is_filled, 1)
     unit_vectors = np.eye(3, dtype=int)
     squares = []
@@ -540,7 +547,7 @@ def paint(
     section: Int[np.ndarray, " F"],
     *colors: ArrayLike,
 ) -> Mesh:
-    """Create a mesh whose faces have the colors of the sections to which they belong."""
+    """Create a mesh whose faces have the color of their section, one color or one per vertex."""
     # Color that each vertex has in each section, shape (sections, V, 3).
     vertex_colors = np.stack([np.broadcast_to(color, vertices.shape) for color in colors])
     # The color of a corner depends on the
@@ -552,7 +559,11 @@ def paint(
 def arc(
     center: ArrayLike, radii: ArrayLike, start: float, stop: float
 ) -> Float[np.ndarray, "ARC_POINTS 2"]:
-    """Create points on an arc of an ellipse, for the profile of a surface of revolution."""
+    """Create points on an arc of an ellipse, for the profile of a surface of revolution.
+
+    Points and radii are (radius, height). Angles are in degrees: 0 is away from the axis of
+    revolution, 90 is up.
+    """
     angle = np.radians(np.linspace(start, stop, ARC_POINTS))[:, None]
     on_unit_circle = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
     return np.array(center) + radii * on_unit_circle
@@ -569,7 +580,7 @@ def ripples(
     """Draw a smooth random field, and evaluate it at points.
 
     The field is a sum of plane waves in random directions, with the mean 0 and
-    the variance 1.
+    the variance 1. The wavelength is in world units.
     """
     wave_vectors = rng.normal(size=(3, WAVES))
     wave_vectors *= 2 * np.pi / wavelength / np.linalg.norm(wave_vectors, axis=0)
@@ -584,12 +595,12 @@ def ripples(
 def choose(
     rng: np.random.Generator, *colors: tuple[float, float, float]
 ) -> Float[np.ndarray, " 3"]:
-    """Draw one of several colors, and change it by up to 0.04 per channel."""
+    """Draw one of several colors, and change it by up to 0.04 per channel. Colors are in [0, 1]."""
     return np.clip(rng.choice(colors) + rng.uniform(-0.04, 0.04, 3), 0, 1)
 
 
 def mix(
     from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray
 ) -> Float[np.ndarray, "V 3"]:
-    """Interpolate between two colors."""
+    """Interpolate from a color (weight 0) to another (weight 1). Weights are clipped to [0, 1]."""
     return from_color + np.clip(weight, 0, 1)[..., None] * (np.asarray(to_color) - from_color)
