@@ -68,7 +68,11 @@ class Averages:
         soup: bool,
         keeps_latest: bool = False,
     ):
-        """Create the averages, which are empty at first."""
+        """Create the averages, which are empty at first.
+
+        `ema_decay` is the decay in a step, or 0 for no moving average. With `keeps_latest` or a
+        soup, the last network is kept instead of the one with the highest validation accuracy.
+        """
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:
@@ -84,7 +88,8 @@ class Averages:
     def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:
         """Restart the training from the initial weights if the run makes a soup.
 
-        A soup averages networks that all begin with the same weights.
+        A soup averages networks that all begin with the same weights. `initial` is None if the run
+        began with random weights.
         """
         if self._soup is None or initial is None:
             return

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Int, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
@@ -30,7 +30,11 @@ class Baseline:
     """Augmentation of training images, chosen by its name."""
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
-        """Create the augmentation."""
+        """Create the augmentation.
+
+        "pgd" attacks the pixels of the images, and any other name but "none" is a transform of
+        torchvision.
+        """
         self._name = name
         self._model = model
         self._seed = seed
@@ -40,7 +44,7 @@ class Baseline:
             self._transform = _transform(name)
 
     def apply(
-        self, images: UInt8[Tensor, "B 3 H W"], labels: Float[Tensor, " B"], step: int
+        self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
     ) -> UInt8[Tensor, "B 3 H W"]:
         """Augment the images of a batch.
 
@@ -83,13 +87,14 @@ def _transform(name: str) -> Any:
 def pgd(
     model: nn.Module,
     images: UInt8[Tensor, "B 3 H W"],
-    labels: Float[Tensor, " B"],
+    labels: Int[Tensor, " B"],
     draws: torch.Generator,
     absent: Sequence[int] = (),
 ) -> UInt8[Tensor, "B 3 H W"]:
     """Attack images by projected gradient descent from a random start (Madry et al. 2018).
 
-    All PGD_STEPS steps are taken, also if an image is misclassified earlier.
+    All PGD_STEPS steps are taken, also if an image is misclassified earlier. A negative label is
+    complementary: the image shows neither this class nor the classes `absent`.
     """
     clean = to_unit(images)
     clip_to_unit = partial(nearest_in_box, low=0, high=1)

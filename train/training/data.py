@@ -19,7 +19,10 @@ SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 
 
 def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> DataSet:
-    """Load the data set of a run."""
+    """Load the data set of a run.
+
+    Without a size in the settings, the images get the size that `initial` takes.
+    """
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
     console.debug("data: %s", name)

@@ -110,7 +110,10 @@ class Initial:
         return stored if isinstance(stored, dict) else None
 
     def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
-        """Copy the weights of the initial network to the network of the run."""
+        """Copy the weights of the initial network to the network of the run.
+
+        Networks that differ in classes, image size or architecture raise InputError.
+        """
         own = {"name": WIDERESNET, **self.architecture}
         other = {"name": WIDERESNET, **description}
         for key in SHARED:
@@ -127,7 +130,7 @@ class Initial:
 
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
-    """Load the initial network, with whose weights a run begins."""
+    """Load the initial network, with whose weights a run begins. None stands for random weights."""
     name = settings.train.init_from
     if not name:
         return None
@@ -226,7 +229,10 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:
-    """Use a classifier in memory as the initial network of a run."""
+    """Use a classifier in memory as the initial network of a run.
+
+    `size` is None for the size that the classifier takes.
+    """
     network = without_normalized_light(classifier.function)
     shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
     if classifier.normalized_light is not None:
@@ -259,7 +265,8 @@ def choose_validation(
 
     Networks of one data set leave out nested sets of images: a smaller fraction is a subset of a
     larger one. The smallest fraction of a network and of the networks with whose weights it began
-    is therefore the fraction from which none of them has learned.
+    is therefore the fraction from which none of them has learned. Without `data.validation`, it is
+    the fraction that the initial network left out, or else VALIDATION.
     """
     asked = settings.data.validation
     fraction = _default_fraction(data) if asked is None else asked
@@ -302,7 +309,10 @@ def _learned_from_other_kind(initial: Initial, data: DataSet) -> bool:
 
 
 def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | None:
-    """Return the fraction of the training images from which the initial network did not learn."""
+    """Return the fraction of the training images from which the initial network did not learn.
+
+    None if this network was trained on another or an unknown data set.
+    """
     initial_record = initial.validation or {}
     fraction = initial_record.get("fraction")
     if not isinstance(fraction, float):

@@ -43,7 +43,9 @@ def interpolate(
     The loss is measured on validation images. It is a weighted sum of two
     divergences from the predictions of the initial network for these images:
     that of the predictions of the interpolated network for the same images, and
-    that of its predictions for the images in the light of a projector.
+    that of its predictions for the images in the light of a projector. `weights` belong to the
+    unchanged and to the relit images. Return the interpolated weights on the CPU, and the factor,
+    which is the smallest of equally good ones.
     """
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation)
@@ -75,7 +77,10 @@ def interpolate(
 def mix(
     initial: Mapping[str, Tensor], trained: Mapping[str, Tensor], factor: float
 ) -> dict[str, Tensor]:
-    """Interpolate linearly between the weights of two networks."""
+    """Interpolate linearly between the weights of two networks.
+
+    The factor 0 gives `initial`. Integers, such as counters, are those of `trained`.
+    """
     mixed = {}
     for name, value in trained.items():
         mixed[name] = value.clone()
@@ -98,7 +103,10 @@ def divergence(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N cla
 def predict(
     model: MixedPrecision, split: Split, *light_key: int | str
 ) -> Float[Tensor, "N classes"]:
-    """Compute the logits of a network for images, as they are or in the light of a projector."""
+    """Compute the logits of a network for images, as they are or in the light of a projector.
+
+    Without a key for the random stream of the light, there is no projector.
+    """
     device = next(model.parameters()).device
     batches = torch.arange(len(split)).split(BATCH)
     logits = []

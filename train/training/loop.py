@@ -76,7 +76,10 @@ class EpochState:
     step: int = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, with sums over all processes."""
+        """Return the state for a checkpoint, with sums over all processes.
+
+        The renders are rounded to 8 bits, as for the training.
+        """
         return {
             "images": to_bytes(self.renders.images),
             "labels": self.renders.labels,
@@ -231,7 +234,8 @@ class Trainer:
 
         Afterwards, best.pt contains the network of the epoch with the highest
         validation accuracy. For a model soup, and for data without labels, it
-        contains the network after the last epoch.
+        contains the network after the last epoch. `held_out` marks the validation images, and `log`
+        is None in all processes but the first one.
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
@@ -281,7 +285,8 @@ class Trainer:
     ) -> bool:
         """Take the training steps of an epoch that remain.
 
-        If the run was resumed within the epoch, some steps were taken before.
+        If the run was resumed within the epoch, some steps were taken before. Return False if a
+        signal stopped the epoch before its last step.
         """
         plan = self._plan(split, rows)
         if self._epoch_state is None:
@@ -324,8 +329,9 @@ class Trainer:
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
     ) -> Generator[Batch, None, None]:
-        """Yield the batches of an epoch that remain, and render new images before each new
-        round.
+        """Yield the remaining batches of an epoch, and render new images before each new round.
+
+        `state` is updated when a round begins.
         """
         # `state.diagnostics` has an item for each round that has begun. The last of them
         # is the current round.
@@ -369,12 +375,15 @@ class Trainer:
     def _step(
         self,
         images: UInt8[Tensor, "B 3 H W"],
-        labels: Float[Tensor, " B"],
+        labels: Int[Tensor, " B"],
         rendered: Bool[Tensor, " B"],
         epoch_fraction: float,
         step_in_run: int,
     ) -> Float[Tensor, " 2"]:
-        """Take a training step: change the weights by the gradient of the loss of a batch."""
+        """Take a training step: change the weights by the gradient of the loss of a batch.
+
+        Return the sum of the losses of the images, and the number of correct predictions.
+        """
         settings = self.settings
         done = (self.epoch + epoch_fraction) / settings.epochs
         if settings.soup:
@@ -402,7 +411,7 @@ class Trainer:
         """Compute the gradient of the loss of a batch.
 
         The batch is divided into smaller batches to save memory. Their gradients
-        are added.
+        are added. Return the sum of the losses of the images, and the number of hits.
         """
         count = self.settings.accumulation_steps
         sums = torch.zeros(2, device=self.device)
@@ -508,8 +517,9 @@ class Trainer:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the content of a checkpoint, from which a run continues as if it had not
-        stopped.
+        """Return the content of a checkpoint, from which a run continues as if it never stopped.
+
+        "under_way" is the epoch that has begun, or None between two epochs.
         """
         return {
             **self._description(),
@@ -525,7 +535,10 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a run from the content of a checkpoint."""
+        """Restore the state of a run from the content of a checkpoint.
+
+        The state of another run raises errors of many types.
+        """
         self.epoch = state["epoch"]
         self.history = state["history"]
         accuracies = [line["validation/accuracy"] for line in self.history]
@@ -607,8 +620,9 @@ class Trainer:
             ) from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
-        """Raise ValueError if a checkpoint has another architecture or other classes than this
-        run.
+        """Raise ValueError if a checkpoint has another architecture or other classes than the run.
+
+        An older checkpoint may lack entries, which are then not compared.
         """
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
@@ -658,7 +672,8 @@ def evaluate(
     """Measure the loss and the accuracy of a network in evaluation mode.
 
     If a run has several processes, each of them scores a part of the images, and
-    all of them return the result for all images.
+    all of them return the result for all images. Return the mean cross entropy as "loss" and the
+    fraction of correct predictions as "accuracy".
     """
     device = split.labels.device
     if rows is None:

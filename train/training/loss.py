@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from augment.losses import is_correct, kl_divergence, label_loss, ranking_loss
@@ -31,7 +31,11 @@ class TrainingLoss:
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
-        """Store the arguments."""
+        """Store the arguments.
+
+        If not `labeled`, only renders count in the cross entropy, and for other images the
+        predictions of the teacher are the correct ones.
+        """
         self._model = model
         self._settings = settings
         self._positive_classes = positive_classes
@@ -41,11 +45,15 @@ class TrainingLoss:
     def compute(
         self,
         images: UInt8[Tensor, "B 3 H W"],
-        labels: Float[Tensor, " B"],
+        labels: Int[Tensor, " B"],
         rendered: Bool[Tensor, " B"],
         augmented: UInt8[Tensor, "B 3 H W"] | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Compute the loss of a batch."""
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
+        """Compute the loss of a batch.
+
+        A negative label says of which class the image is not. Return the loss and the number of
+        correct predictions.
+        """
         settings = self._settings
         logits = self._model(to_unit(images))
         teacher_logits = None

@@ -60,7 +60,10 @@ SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
 
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
-    """Compute the learning rate at a time of the training."""
+    """Compute the learning rate at a time of the training.
+
+    `done` is the fraction of the training that is done.
+    """
     return settings.learning_rate * SCHEDULE_FACTORS[settings.schedule](done)
 
 
@@ -91,8 +94,9 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
 
 
 def last_layer(network: nn.Module) -> str:
-    """Return the name of the last layer that learns: the module that has the last such
-    parameter.
+    """Return the name of the module that has the last parameter which is not frozen.
+
+    It is empty if the network itself is this module.
     """
     names = [name for name, parameter in network.named_parameters() if parameter.requires_grad]
     return _module_of(names[-1])
@@ -103,7 +107,8 @@ def _last_called_layer(network: nn.Module, size: int) -> str:
 
     The order of the calls may differ from the order of the parameters, which is
     that of the definitions. Normalizations and activations with parameters do not
-    count, unless a network has no other layer.
+    count, unless a network has no other layer. A network of TorchScript or torch.export calls no
+    modules, so the module of its last parameter is returned.
     """
     called: list[tuple[bool, str]] = []
     hooks = []
@@ -128,7 +133,10 @@ def _module_of(parameter: str) -> str:
 
 
 def freeze(network: nn.Module, stage: str, size: int) -> None:
-    """Freeze the parameters of a network from its first parameter to the last one of a module."""
+    """Freeze the parameters of a network from its first parameter to the last one of a module.
+
+    The stage "all_but_last" leaves only the layer that the network calls last.
+    """
     if next(network.parameters(), None) is None:
         raise InputError("the network has no parameters: give a network that can be trained")
     if stage == ALL_BUT_LAST:
@@ -153,7 +161,8 @@ def set_training_mode(network: nn.Module, settings: TrainSettings) -> None:
     """Put a network in training mode, except the modules that should not change.
 
     Modules of frozen parameters stay in evaluation mode, so that the statistics
-    of their batch normalization do not change either.
+    of their batch normalization do not change either. With the setting `eval_mode`, no module is in
+    training mode.
     """
     network.train(not settings.eval_mode)
     for module in network.modules():
@@ -170,7 +179,8 @@ def scale_learning_rate(
     A step with a clipped gradient changes the weights of the layer by at most
     the learning rate. It then changes a logit by at most the learning rate
     times the norm of the features. With the adapted rate, this product is the
-    same for all networks.
+    same for all networks. It is not adapted if more than this layer learns, or without the setting
+    `feature_norm`.
     """
     if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate

@@ -36,7 +36,11 @@ class RelitBatches:
         teacher: nn.Module | None,
         seed: int,
     ):
-        """Store the arguments."""
+        """Store the arguments.
+
+        The attack leads away from the classes that `teacher` predicts; without it, the light is
+        random.
+        """
         self._radius = math.log(settings.relight_gain)
         self._steps = settings.relight_steps
         self._model = model

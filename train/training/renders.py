@@ -28,7 +28,10 @@ def build_service(
     data: DataSet,
     device: torch.device,
 ) -> AugmentationService:
-    """Build the service that renders the training images of a run anew in each round."""
+    """Build the service that renders the training images of a run anew in each round.
+
+    It has no images if the run trains without renders.
+    """
     scene: Scene | None = None
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64, device=device)
@@ -108,7 +111,10 @@ def _build_scene(
 
 
 def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | int, int]:
-    """Return the index of each class that a mesh or a hard negative of a run has."""
+    """Return the index of each class that a mesh or a hard negative of a run has.
+
+    The class "other", which no network has, is left out.
+    """
     indices: dict[str | int, int] = {}
     for key, item in settings.objects.items():
         if item.label != OTHER:
@@ -117,7 +123,10 @@ def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | in
 
 
 def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, Tensor]:
-    """Load images that are used as renders from the folder in the setting `augment.folder`."""
+    """Load images that are used as renders from the folder in the setting `augment.folder`.
+
+    A label is the index of a class, or the complementary label in a subfolder that is no class.
+    """
     folder = Path(str(settings.augment.folder))
     positive_classes = label_names(settings.label)
     label_of_class = {name: index for index, name in enumerate(data.classes)}

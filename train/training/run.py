@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -222,7 +222,10 @@ class Run:
             console.info("it needs images with normalized light: normalize_light=%s", given)
 
     def _require_folder(self) -> DictConfig | None:
-        """Check that the run may write to its folder."""
+        """Check that the run may write to its folder.
+
+        Return the settings of the earlier run that is resumed, or None.
+        """
         resumes = self.settings.train.resume
         overwrites = self.settings.overwrite and not resumes
         if overwrites or not checkpoint.exists(self.folder):
@@ -314,7 +317,7 @@ class Run:
             self._score_photographs(cached_model, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
 
-    def _label_with(self, model: Model, test_predictions: Float[Tensor, " N"]) -> None:
+    def _label_with(self, model: Model, test_predictions: Int[Tensor, " N"]) -> None:
         """Label the validation and test images with the predictions of the initial network.
 
         The training images need no labels, because the loss computes these
@@ -360,7 +363,8 @@ class Run:
     def _test_scores(self) -> dict[str, float]:
         """Measure the test accuracy of the network in best.pt, and of the one after the last epoch.
 
-        Afterwards, `self.trainer.selected` has the weights in best.pt.
+        Afterwards, `self.trainer.selected` has the weights in best.pt. "test/epoch" is the epoch of
+        the network in best.pt.
         """
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
@@ -389,7 +393,10 @@ class Run:
         return scores
 
     def _interpolate(self, best: dict[str, Any]) -> dict[str, Any]:
-        """Interpolate between the weights before and after the training, and write best.pt."""
+        """Interpolate between the weights before and after the training, and write best.pt.
+
+        Weights that an earlier process of the run interpolated stay as they are.
+        """
         trainer = self.trainer
         if INTERPOLATION in best or trainer.initial is None:
             return best
@@ -408,7 +415,7 @@ class Run:
             checkpoint.save(self.folder / checkpoint.BEST, interpolated)
         return interpolated
 
-    def _agreement(self, initial_predictions: Float[Tensor, " N"]) -> float:
+    def _agreement(self, initial_predictions: Int[Tensor, " N"]) -> float:
         """Measure for which fraction of the test images training did not change the prediction."""
         # The predictions of the initial network serve as labels of data without labels. The
         # test accuracy then is this fraction.
@@ -457,7 +464,10 @@ class Run:
 
 
 def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
-    """Load several runs before the first one is trained, so that mistakes are reported at once."""
+    """Load several runs before the first one is trained, so that mistakes are reported at once.
+
+    All of them have the data set and the initial network of the first one.
+    """
     data, initial = load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
     for run in runs:
@@ -488,7 +498,8 @@ def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
 def _relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
     """Convert the labels of the data to indices into the classes of the network.
 
-    A data set and the initial network can have different lists of classes.
+    A data set and the initial network can have different lists of classes. Without an initial
+    network, the network has the classes of the data.
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
@@ -510,7 +521,10 @@ def build_trainer(
     validation: ValidationPart,
     threads: int | None,
 ) -> Trainer:
-    """Build the network, the optimizer and the scene of a run. No file is written."""
+    """Build the network, the optimizer and the scene of a run. No file is written.
+
+    Without `threads`, `choose_threads` chooses them.
+    """
     keys = keys_of("train", settings.train)
     with keyed(**keys):
         device = choose_device(settings.train.device)
@@ -578,7 +592,10 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
 
 
 def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """Describe in words what the test accuracy of a run is measured on."""
+    """Describe in words what the test accuracy of a run is measured on.
+
+    An example is "rendered solids of 5 of the network's 1000 classes".
+    """
     if not data.labeled:
         return f"the predictions of {settings.train.init_from} for held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
@@ -591,7 +608,10 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
 
 
 def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
-    """List the metrics on a folder of photographs under their names in metrics.jsonl."""
+    """List the metrics on a folder of photographs under their names in metrics.jsonl.
+
+    Several positive classes add names such as "photographs/orange/auc".
+    """
     metrics_by_prefix = {name: scores.overall}
     for label, metrics in scores.by_label.items():
         metrics_by_prefix[f"{name}/{label}"] = metrics

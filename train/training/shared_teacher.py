@@ -48,13 +48,11 @@ class SharedTeacher(nn.Module):
         self._hook.remove()
 
     def _store_features(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        """Store the input of the last layer of the pupil. torch calls this hook before the
-        layer.
-        """
+        """Store the input of the last layer of the pupil. torch calls this before the layer."""
         self._features = inputs[0].detach()
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B classes"]:
-        """Return the logits of the teacher for the last images of the network in training."""
+        """Return the logits of the teacher for the images with which the pupil was called last."""
         is_mixed = self._dtype != torch.float32
         with torch.autocast(images.device.type, self._dtype, enabled=is_mixed):
             return self.layer(self._features).float()
@@ -63,7 +61,10 @@ class SharedTeacher(nn.Module):
 def share_layers(
     settings: TrainSettings, pupil: MixedPrecision, teacher: MixedPrecision, size: int
 ) -> nn.Module:
-    """Return a teacher that shares layers with its pupil, if that does not change its logits."""
+    """Return a teacher that shares layers with its pupil, if that does not change its logits.
+
+    They are shared if only the last layer learns, and if the logits for two test images stay equal.
+    """
     # The features would depend on the statistics of the batch in training mode.
     is_frozen = settings.freeze == ALL_BUT_LAST and settings.eval_mode
     # `SharedTeacher` registers a hook, which modules of TorchScript do not support.
