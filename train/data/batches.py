@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from augment import distributed
@@ -81,13 +81,16 @@ class Draws:
             data set is in memory, because its images are not cropped.
     """
 
-    order: Float[Tensor, "N B"]
-    shifts: Float[Tensor, "2 N B"]
+    order: Int[Tensor, "N B"]
+    shifts: Int[Tensor, "2 N B"]
     flips: Bool[Tensor, "N B"]
-    seeds: Float[Tensor, "N B"] | None = None
+    seeds: Int[Tensor, "N B"] | None = None
 
     def of_columns(self, first: int, columns: slice) -> "Draws":
-        """Select some batches of a round, and some images of each of them."""
+        """Select some batches of a round, and some images of each of them.
+
+        All batches from `first` on are selected.
+        """
         return Draws(
             order=self.order[first:, columns],
             shifts=self.shifts[:, first:, columns],
@@ -104,7 +107,10 @@ def rounds_of_epoch(
     images_per_epoch: int | None,
     images_per_round: int | None,
 ) -> list[Round]:
-    """Divide the training images of an epoch into rounds. Each round shows all renders."""
+    """Divide the training images of an epoch into rounds. Each round shows all renders.
+
+    A limit of None shows all images in the epoch, or in a single round.
+    """
     draws = generator(seed, epoch, "rounds")
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
     render_numbers = torch.arange(image_count, image_count + render_count)
@@ -129,7 +135,7 @@ def training_batches(
     Each of P processes gets `batch_size` / P images of each batch. All batches
     have the same size: the last batch is filled up with the first images of the
     round. All random draws are made on the CPU, so they are the same for every
-    device and every number of processes.
+    device and every number of processes. Yield images, labels, and whether each image is a render.
     """
     draws = _draw(images, batch_size, seed, this_round, flips)
     own_size = batch_size // distributed.world_size()
@@ -174,7 +180,7 @@ def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Bool[Te
     """Return whether each image is flipped in an epoch, if flips alternate.
 
     A random half of the images is flipped in even epochs. The other images are
-    flipped in odd epochs.
+    flipped in odd epochs. The renders follow the images of the data set.
     """
     count = len(images.rows) + len(images.renders)
     draws = generator(seed, "flips")
@@ -186,7 +192,7 @@ def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) ->
     """Yield the batches of a round (part of an epoch) from a data set in memory.
 
     A chunk of several batches is shifted and flipped in one call, which takes
-    less time than one call for each batch.
+    less time than one call for each batch. `batch_size` is that of this process.
     """
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
@@ -264,15 +270,16 @@ def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws)
 
 
 def crop_and_flip(
-    images: Float[Tensor, "N 3 H W"],
+    images: UInt8[Tensor, "N 3 H W"],
     chosen: Int[Tensor, " B"],
-    shifts: Float[Tensor, "2 B"],
+    shifts: Int[Tensor, "2 B"],
     flips: Bool[Tensor, " B"],
-) -> Float[Tensor, "B 3 H W"]:
+) -> UInt8[Tensor, "B 3 H W"]:
     """Select images, shift each by whole pixels, and flip some of them left to right.
 
     A shift uncovers pixels at a border of the image. They are filled by
-    reflection at this border.
+    reflection at this border. `shifts` are vertical and horizontal, in pixels; positive ones move
+    an image up and to the left.
     """
     height, width = images.shape[2:]
     device = images.device

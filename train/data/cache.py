@@ -24,7 +24,10 @@ CHECKSUM_BYTES = 32
 
 
 def cache_folder(choice: str | None) -> Path | None:
-    """Return the folder of the cache that a user chooses."""
+    """Return the folder of the cache that a user chooses.
+
+    "auto" is a folder in $XDG_CACHE_HOME or ~/.cache, and None is no cache.
+    """
     if not choice:
         return None
     if choice != "auto":
@@ -37,7 +40,7 @@ def source_key(*packages: Path) -> str:
     """Hash the source code of packages.
 
     As part of the key of a cache, the hash makes cached results of other code
-    unused.
+    unused. The versions of torch and NumPy count, too.
     """
     files = []
     for folder in packages:
@@ -62,7 +65,10 @@ class TensorCache:
         self.writable = folder is not None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
-        """Read the tensors that were written under a key."""
+        """Read the tensors that were written under a key.
+
+        None if there is no such file, or if it is damaged.
+        """
         if self.folder is None:
             return None
         try:

@@ -73,7 +73,10 @@ class ImageFiles:
         return [(str(path), (self.folder / path).stat().st_size) for path in self.paths]
 
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Read the central squares of images, batch by batch."""
+        """Read the central squares of images, batch by batch.
+
+        Each batch has B indices into `paths`, and gives uint8 images of shape (B, 3, size, size).
+        """
         return self._read([(row, None) for row in batch.tolist()] for batch in rows)
 
     def crops(self, rows: Iterable[Tensor], seeds: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -84,7 +87,11 @@ class ImageFiles:
         )
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
-        """Read batches of images in worker processes."""
+        """Read batches of images in worker processes.
+
+        The key of an image is its index in `paths` and the seed of its crop, or None for its
+        square.
+        """
         errors: ReadErrors = {}
         loader: DataLoader = DataLoader(
             _Reader(self),
@@ -126,7 +133,10 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
 
     def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
-        """Read an image, or another image of its subfolder if it cannot be read."""
+        """Read an image, or another image of its subfolder if it cannot be read.
+
+        It is black if none can be read. The dictionary has the error of each unreadable file.
+        """
         index, seed = key
         errors: ReadErrors = {}
         for path in self._candidates(index):

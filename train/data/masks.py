@@ -21,7 +21,8 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
 
     The opaque part of an image with transparency is the object. In an image of two
     values or colors, of which one is black, the other one is the object. Otherwise,
-    white is the object. What is not plain white on black is printed.
+    white is the object. What is not plain white on black is printed. The mask is 255 where the
+    object is, and less where it covers a part of a pixel.
     """
     require_file(path, "give an image file as mask")
     try:

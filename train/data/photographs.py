@@ -200,7 +200,7 @@ def find_unlabeled(folder: Path) -> list[Photograph]:
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
     """List the image files, and all files, of a folder and its subfolders.
 
-    Hidden files are left out.
+    Hidden files are left out. Return the sorted images, and all files, relative to the folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
@@ -279,7 +279,10 @@ def _has_class_folders(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> bool:
-    """Return whether a folder has a subfolder for each class, and check their names."""
+    """Return whether a folder has a subfolder for each class, and check their names.
+
+    Only a folder without subfolders has none; wrong names raise InputError.
+    """
     names = folder_names(folder)
     no_classes = [
         name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)
@@ -314,7 +317,10 @@ def _is_like(name: str, label: str) -> bool:
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
-    """Read the table photos.csv, which has the source and the object of each photograph."""
+    """Read the table photos.csv, which has the source and the object of each photograph.
+
+    It is empty if the file is missing.
+    """
     rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
         return rows
@@ -357,9 +363,10 @@ def load_photographs(
 
     Each image is rotated as its EXIF orientation says, and converted to sRGB as its
     color profile says. Transparent pixels are blended with white, and 16-bit
-    channels are converted to 8 bits. The central
-    square is reduced with Pillow's Lanczos filter. The filter is wider for a
-    larger reduction, which prevents aliasing.
+    channels are converted to 8 bits. The central square is reduced with Pillow's
+    Lanczos filter. The filter is wider for a larger reduction, which prevents
+    aliasing. Return the photographs that could be read, their uint8 sRGB images, and
+    the paths of the others.
     """
     shape = (len(photographs), 3, size, size)
     cpu = torch.device("cpu")
@@ -392,7 +399,10 @@ def _read_into(
     folder: Path,
     photographs: Sequence[Photograph],
 ) -> list[Exception | None]:
-    """Read the central squares of photographs into a tensor, in several threads."""
+    """Read the central squares of photographs into a tensor, in several threads.
+
+    Return the error for each photograph, or None.
+    """
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
     # it decodes and resizes.

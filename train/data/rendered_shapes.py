@@ -50,7 +50,10 @@ def load_shapes(
     seed: int,
     cache: TensorCache | None = None,
 ) -> DataSet:
-    """Render a data set with one class for each kind of solid, or read it from a cache."""
+    """Render a data set with one class for each kind of solid, or read it from a cache.
+
+    `train` and `test` are numbers of images of each class. Every 20 of them show another shape.
+    """
     count = len(CLASSES) * (train + test)
     require_memory(f"{count} images of {size} pixels", 3 * size**2 * count, torch.device("cpu"))
     cache = cache or TensorCache()
@@ -73,7 +76,8 @@ def soft_front_light(
 ) -> Float[Tensor, "49 3"]:
     """Draw uniform ambient light plus a directional light from near the camera.
 
-    The direction, color and strength of the light are random.
+    The direction, color and strength of the light are random. `to_camera` is a unit vector; the
+    spherical harmonics have linear RGB.
     """
     direction = F.normalize(to_camera + 0.5 * torch.randn(3, generator=draws), dim=0)
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
@@ -84,7 +88,7 @@ def soft_front_light(
 def _render(
     split_name: str, images_per_class: int, seed: int, settings: ImageSettings
 ) -> UInt8[Tensor, "_ 3 size size"]:
-    """Render the images of all classes for one split of the data set."""
+    """Render the images of all classes for one split of the data set. They are sorted by class."""
     solids_per_class = math.ceil(images_per_class / (CAMERAS * BACKGROUNDS))
     draws = generator(seed, split_name)
     images = []

@@ -78,8 +78,11 @@ class Split:
         images = self.images
         return (images[batch] for batch in rows)
 
-    def sample(self, count: int) -> UInt8[Tensor, "count 3 H W"]:
-        """Return images whose indices are evenly spread from the first to the last image."""
+    def sample(self, count: int) -> UInt8[Tensor, "_ 3 H W"]:
+        """Return images whose indices are evenly spread from the first to the last image.
+
+        A smaller split returns all of its images.
+        """
         indices = torch.linspace(0, len(self) - 1, min(count, len(self))).long()
         return next(iter(self.squares([indices])))
 
@@ -156,7 +159,8 @@ def channel_statistics(images: UInt8[Tensor, "N 3 H W"]) -> tuple[list[float], l
     """Compute the mean and the standard deviation of the pixels of each color channel.
 
     They are computed in float64 from a histogram of the 256 pixel values. This
-    makes rounding errors negligible.
+    makes rounding errors negligible. Pixels are scaled to [0, 1], and a deviation is at least
+    0.001.
     """
     values = torch.arange(256, dtype=torch.float64) / 255
     means = []
@@ -205,6 +209,8 @@ def load_npz(path: str) -> DataSet:
     - train_images and test_images: uint8 RGB, shape (N, 3, S, S);
     - train_labels and test_labels: index of the class of each image, shape (N,);
     - classes: names of the C classes, shape (C,).
+
+    Pickled arrays raise InputError, because they could run code.
     """
     if not Path(path).is_file():
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
@@ -238,9 +244,7 @@ def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
     return DataSet(tuple(names), train, test)
 
 
-def _npz_split(
-    images: UInt8[np.ndarray, "N 3 S S"], labels: Int[np.ndarray, " N"], class_count: int
-) -> Split:
+def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
     """Check arrays of images and labels, and convert them to a `Split`."""
     is_square = images.ndim == 4 and images.shape[1] == 3 and images.shape[2] == images.shape[3]
     if not is_square or images.dtype != np.uint8:
@@ -267,7 +271,8 @@ def load_folder(
     subfolder for each class.
 
     If `size` is at most `MAX_SIZE_IN_MEMORY`, the central squares of all images
-    are read and reduced to this size. Otherwise the images stay on disk.
+    are read and reduced to this size. Otherwise the images stay on disk. `test_fraction` is not
+    used if there is a subfolder `test`.
     """
     root = Path(path)
     if not root.is_dir():
@@ -315,7 +320,10 @@ def load_unlabeled(
     skip_unreadable: bool,
     workers: int,
 ) -> DataSet:
-    """Load all images of a folder and its subfolders as an unlabeled data set."""
+    """Load all images of a folder and its subfolders as an unlabeled data set.
+
+    It has no classes, every label is 0, and at most HELD_OUT images are test images.
+    """
     found = find_unlabeled(Path(path))
     _, images = _read(Path(path), found, size, skip_unreadable, workers)
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
@@ -341,7 +349,10 @@ def _folder_split(
 def _read(
     root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
 ) -> tuple[list[Photograph], Tensor | ImageFiles]:
-    """Read photographs into memory if `size` is small. Otherwise leave them on disk."""
+    """Read photographs into memory if `size` is small. Otherwise leave them on disk.
+
+    Unreadable photographs are missing in both results; files on disk are not read yet.
+    """
     if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
         return found, ImageFiles(root, paths, size, workers, skip_unreadable)
