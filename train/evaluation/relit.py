@@ -142,7 +142,10 @@ class RelitScores(ShortRepr):
 
 
 def _sum_of_kept_fractions(row: Sequence[Any]) -> float:
-    """Add up the fractions of photographs that keep their class in each kind of light."""
+    """Add up the fractions of photographs that keep their class in each kind of light.
+
+    `row` has the class, its number of photographs, and for each light how many keep their class.
+    """
     _, photograph_count, *kept_counts = row
     return sum(kept_counts) / photograph_count
 
@@ -158,7 +161,11 @@ def attack_folder(
     seed: int = 0,
     limit: int | None = None,
 ) -> RelitScores:
-    """Attack a network by the light of a projector on photographs, and write the results."""
+    """Attack a network by the light of a projector on photographs, and write the results.
+
+    `sensor_noise` is a standard deviation in units of 1/255. `limit` photographs at equal distances
+    in the list are attacked, or all if it is None.
+    """
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, limit or len(found))
     readable, images, unreadable = load_photographs(
@@ -224,7 +231,8 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes
     in only one kind of light come first, which is usually the gradient attack.
     Photographs whose class changes in more kinds of light follow. Photographs
-    whose class never changes come last.
+    whose class never changes come last. Return the file name of each picture by the index of its
+    photograph.
     """
     # Each entry is about one kind of light: whether any slide changes the class of each
     # photograph, shape (N,).
@@ -248,7 +256,10 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
 
 
 def _slide_to_show(result: PhotographAttackResult, photograph: int) -> int:
-    """Choose the slide with which a picture shows a photograph."""
+    """Choose the slide with which a picture shows a photograph.
+
+    It is the first one that changes the class in the strongest light, or 0.
+    """
     # The kinds of light are in the order of their strength.
     *_, changed_in_strongest = result.changed.values()
     return int(changed_in_strongest[photograph].int().argmax())

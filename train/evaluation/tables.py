@@ -91,7 +91,10 @@ def _align(cells: Sequence[str]) -> Column:
 
 
 def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
-    """Divide the columns of a table into several tables that fit the width of the terminal."""
+    """Divide the columns of a table into several tables that fit the width of the terminal.
+
+    Each begins with the first column, the titles. Output to a file is one table.
+    """
     terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     first, *others = columns
     tables = [[first]]
@@ -157,7 +160,7 @@ def fraction(hits: int, n: int) -> Proportion:
 
 
 def format_fraction(proportion: Proportion) -> str:
-    """Format a fraction of images with its interval."""
+    """Format a fraction of images with its interval. An example is "8 of 40 [10%, 35%]"."""
     if proportion.n == 0:
         return "-"
     counts = f"{proportion.hits} of {proportion.n}"
@@ -165,7 +168,10 @@ def format_fraction(proportion: Proportion) -> str:
 
 
 def format_interval(estimate: Estimate | None, sign: str = "") -> str:
-    """Format the value of a metric with its interval."""
+    """Format the value of a metric with its interval.
+
+    `sign` "+" writes a plus before positive numbers.
+    """
     if estimate is None or estimate.value is None:
         return "-"
     value = f"{estimate.value:{sign}.3f}"
@@ -175,7 +181,7 @@ def format_interval(estimate: Estimate | None, sign: str = "") -> str:
 
 
 def describe_intervals(estimates: Iterable[Estimate | None]) -> str:
-    """Say what the intervals of metrics are over."""
+    """Say what the intervals of metrics are over. Empty if no metric has an interval."""
     over = {item.over for item in estimates if item is not None and item.low is not None}
     # A set has no order, and the more general statement comes first.
     units = sorted(over - {""}, key=lambda words: (THESE_OBJECTS in words, words))

@@ -34,7 +34,8 @@ def kept_aside_settings(
     """Choose objects and lighting for test renders that training does not use.
 
     If a positive class is the name of a generated solid, new solids are
-    generated. Otherwise the meshes of training are rendered in other lighting.
+    generated. Otherwise the meshes of training are rendered in other lighting. The number of setups
+    is a multiple of the number of projected patterns.
     """
     labels = label_names(settings.label)
     meshes: list[Any] = []
@@ -74,7 +75,10 @@ def _solid_name(label: str) -> str:
 
 
 def _positives(settings: ExperimentSettings, label: str) -> list[Any]:
-    """Choose the objects of a positive class for the test renders."""
+    """Choose the objects of a positive class for the test renders.
+
+    These are generated solids of its name, or else the meshes of the training.
+    """
     if can_be_generated(label):
         return _generated(_solid_name(label), label, POSITIVE_COUNT)
     return [asdict(item) for item in settings.objects.values() if item.label == label]

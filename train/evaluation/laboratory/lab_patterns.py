@@ -110,9 +110,7 @@ def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[T
 
 
 def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
-    """Draw the shadows of leaves: ellipses at random places, which cover about half of the
-    image.
-    """
+    """Draw the shadows of leaves: random ellipses that cover about half of the image."""
     half_length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
     leaf_area = math.pi * half_length**2 / LEAF_RATIO
@@ -143,9 +141,7 @@ def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Ten
 
 
 def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
-    """Draw smoothly varying colors: random values on a coarse grid, interpolated by cubic
-    splines.
-    """
+    """Draw smooth colors: random values on a coarse grid, interpolated by cubic splines."""
     row_count = rng.integers(3, 6)
     column_count = rng.integers(3, 6)
     grid = rng.uniform(0, 1, (row_count, column_count, 3))
@@ -155,7 +151,10 @@ def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[T
 def _sample(
     image: Float[np.ndarray, "H W C"], points: Float[Tensor, "2 _ _"], order: int
 ) -> Float[Tensor, "C _ _"]:
-    """Interpolate an image at given positions with splines."""
+    """Interpolate an image at given positions with splines.
+
+    The image spans [-1, 1] in x and y, and is mirrored at its borders. `points` are (x, y).
+    """
     height_and_width = np.array(image.shape[:2])[:, None, None]
     # `flip` swaps (x, y) to (y, x). The interval [-1, 1] becomes [-0.5, size - 0.5],
     # so that whole numbers are centers of pixels.
@@ -191,7 +190,10 @@ def draw_pattern(
     rng: np.random.Generator,
     slides: Sequence[np.ndarray] = (),
 ) -> Float[np.ndarray, "RESOLUTION RESOLUTION 3"]:
-    """Draw an image for a projector: a pattern with random colors, angle, scale and position."""
+    """Draw an image for a projector: a pattern with random colors, angle, scale and position.
+
+    The image and the slides are linear RGB. "slides" chooses one of the slides.
+    """
     first_color = torch.from_numpy(draw_color(rng))[:, None, None]
     second_color = torch.from_numpy(draw_color(rng))[:, None, None]
     # The brightness is drawn even if it is not used, so that all patterns take the same
@@ -215,6 +217,9 @@ def draw_pattern(
 
 
 def draw_color(rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """Draw a color of light with a random hue and a random saturation."""
+    """Draw a color of light with a random hue and a random saturation.
+
+    It is linear RGB, and its largest channel is 1.
+    """
     hue_and_saturation = torch.from_numpy(rng.uniform(size=(1, 2)))
     return patterns.random_colors(hue_and_saturation).flatten().numpy()

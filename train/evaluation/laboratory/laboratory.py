@@ -74,7 +74,8 @@ class Subject(NamedTuple):
 def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
     """Split a mesh by texture, and convert its colors from sRGB to linear RGB.
 
-    The parts have smooth normals, except at sharp edges.
+    The parts have smooth normals, except at sharp edges. `albedo_scale` multiplies the linear
+    colors, which are then limited to [0, 1].
     """
     normals = mesh.written_normals("smooth")
     parts = []
@@ -105,7 +106,8 @@ def path_traced(
 
     Each light source is rendered alone, and the images are added. With all
     light sources in one scene, each path would choose one of them at random,
-    and this choice would cause most of the noise.
+    and this choice would cause most of the noise. `spp` is the number of paths for each pixel and
+    light source; the result is linear radiance.
     """
     with mitsuba() as module:
         scene = {
@@ -148,7 +150,8 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
 def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> dict[str, Any]:
     """Describe a large diffuse square by a dictionary that Mitsuba takes.
 
-    The table and the wall are such squares.
+    The table and the wall are such squares. `pose` leads from the square in the plane z = 0, which
+    faces +z, to the world; `color` is linear RGB.
     """
     scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
     surface = {"type": "diffuse", "reflectance": _rgb(color)}
@@ -195,7 +198,7 @@ def write_laboratory(settings: LabSettings) -> int:
     The folder gets a subfolder of PNG files for each class, the table
     photos.csv and the settings lab.json. `find_photographs` of
     `train.data.photographs` reads such a folder. The same settings and the same
-    versions of the packages give the same bytes.
+    versions of the packages give the same bytes. Return the number of renders.
     """
     out = writable_folder(settings.out, "out")
     subjects = []
@@ -242,7 +245,8 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
     """Group meshes by their class.
 
     With several positive classes, the meshes of each are the negatives of the
-    others. With a single positive class, meshes of another class are needed.
+    others. With a single positive class, meshes of another class are needed. The last group has all
+    other meshes, if there are any.
     """
     negatives = [subject for subject in subjects if subject.label not in labels]
     needs_negatives = len(labels) == 1
@@ -261,7 +265,10 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
 
 
 def _require_empty(out: Path, overwrite: bool) -> None:
-    """Check that the folder of the test set is empty, or remove earlier renders."""
+    """Check that the folder of the test set is empty, or remove earlier renders.
+
+    Only renders are removed, no other files.
+    """
     if overwrite:
         # lab.json says that the renders are complete.
         for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
@@ -280,7 +287,10 @@ def _write_render(
     shot: Shot,
     number: int,
 ) -> str:
-    """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file."""
+    """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file.
+
+    Return its path in `out`. `number` is part of it, and decides the seed of the path tracer.
+    """
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
@@ -297,7 +307,11 @@ def _read_slide(path: str) -> np.ndarray:
 
 
 def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
-    """Read an environment map from a file, or render a built-in light to such a map."""
+    """Read an environment map from a file, or render a built-in light to such a map.
+
+    It is linear radiance, whose upper half is above the horizon. Negative radiance of a built-in
+    light is removed.
+    """
     if str(path) in PROBES:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
         return to_map(light, BUILT_IN_MAP_HEIGHT).clamp(min=0).numpy()

@@ -104,7 +104,7 @@ def draw_shots(
 
     The shots of a pattern, or of an environment map, have evenly spread
     logarithms of the brightness. An environment map is rotated about the
-    vertical axis by a random angle.
+    vertical axis by a random angle. `environments` and `slides` are linear RGB.
     """
     dimmest, brightest = settings.brightness
     lightings = [*settings.patterns, *environments]
@@ -129,7 +129,10 @@ def _scale_environment(
     brightness: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "H W 3"]:
-    """Rotate an environment map about the vertical axis by a random angle, and scale it."""
+    """Rotate an environment map about the vertical axis by a random angle, and scale it.
+
+    `brightness` is the radiance of a white diffuse surface that faces up.
+    """
     directions, solid_angles = equirectangular(*radiance.shape[:2])
     cosines = directions[..., 2].clamp(min=0)
     weights = cosines * solid_angles
@@ -149,7 +152,11 @@ def _draw_shot(
     rng: np.random.Generator,
     extra_rng: np.random.Generator,
 ) -> Shot:
-    """Draw a random shot of an object in the light of projectors."""
+    """Draw a random shot of an object in the light of projectors.
+
+    `brightness` is the radiance of a white surface that faces all projectors. `extra_rng` draws
+    what later versions added, so that older draws do not change.
+    """
     first_pattern, *other_patterns = pattern_names.split("+")
     azimuth = rng.uniform(0, 360)
     half_width = rng.uniform(*HALF_WIDTHS)
@@ -193,14 +200,21 @@ def _draw_shot(
 def _draw_projector(
     settings: LabSettings, azimuth: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " 3"]:
-    """Draw the position of a projector, relative to the point that it faces."""
+    """Draw the position of a projector, relative to the point that it faces.
+
+    `azimuth` is that of the camera in degrees.
+    """
     projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
     elevation = _draw_between(settings.elevation, rng)
     return _from_angles(projector_azimuth, elevation, rng.uniform(*PROJECTOR_DISTANCES))
 
 
 def _draw_wall(azimuth: float, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """Draw the position of a vertical wall behind the object, as seen from the camera."""
+    """Draw the position of a vertical wall behind the object, as seen from the camera.
+
+    It is the vector from the center of the object to the nearest point of the wall. `azimuth` is in
+    degrees.
+    """
     wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
     return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))
 
@@ -211,7 +225,10 @@ def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, " 3"]:
-    """Convert spherical to Cartesian coordinates, with z up."""
+    """Convert spherical to Cartesian coordinates, with z up.
+
+    `azimuth` is the angle from +x toward +y in degrees, and `elevation` that above z = 0.
+    """
     azimuth_radians = math.radians(azimuth)
     elevation_radians = math.radians(elevation)
     horizontal = math.cos(elevation_radians)

@@ -19,7 +19,7 @@ from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from renderer.short_repr import ShortRepr
 from train.evaluation.scores.predictions import Prediction
@@ -141,7 +141,10 @@ class Metrics:
     class_top5: Estimate | None = None
 
     def find(self, name: str) -> Estimate | None:
-        """Return a metric by its name."""
+        """Return a metric by its name.
+
+        A name is "auc", "top5" or "recall_at/0.05". None if it was not computed.
+        """
         attribute, _, rate = name.partition("/")
         if rate:
             return self.recall_at[rate]
@@ -358,7 +361,10 @@ def _count_objects(predictions: Sequence[Prediction]) -> int:
 
 
 def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
-    """Collect predictions that are scored together, with one ROC curve of all of them."""
+    """Collect predictions that are scored together, with one ROC curve of all of them.
+
+    `thresholds` are limits of the log-odds by label. None omits the metrics that need them.
+    """
     positives = [prediction for prediction in predictions if prediction.positive]
     negatives = [prediction for prediction in predictions if not prediction.positive]
     return Pool(
@@ -421,7 +427,10 @@ class Pooled(ShortRepr):
         return pools
 
     def _hard_negatives(self, positives: Sequence[Prediction], source: str) -> list[Prediction]:
-        """Find the negatives in the sources that positives name as hard negatives."""
+        """Find the negatives in the sources that positives name as hard negatives.
+
+        The negatives of `source` itself are left out.
+        """
         wanted = set()
         for prediction in positives:
             for other_source in prediction.photograph.hard_negatives:
@@ -479,7 +488,10 @@ class Pooled(ShortRepr):
 def _group(
     predictions: Sequence[Prediction], name_of: Callable[[Prediction], str | None]
 ) -> dict[str, list[Prediction]]:
-    """Group predictions by a name, such as the name of their source."""
+    """Group predictions by a name, such as the name of their source.
+
+    Predictions whose name is None are left out. The names are sorted.
+    """
     groups: dict[str, list[Prediction]] = {}
     for prediction in predictions:
         name = name_of(prediction)
@@ -537,7 +549,8 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
 
     Images of the same object are not independent, so an object is left out with
     all its images. The groups of units depend only on `units`. Metrics of two
-    networks on the same images are therefore paired.
+    networks on the same images are therefore paired. `statistic` takes, for each group, how often
+    each of its n images counts, shape (..., n), and returns an array of shape (M, ...).
     """
     counts = [np.ones(len(unit_of_image), int) for unit_of_image in units.groups]
     values = statistic(*counts)
@@ -578,7 +591,8 @@ def change(
 
     The interval combines those of both means and their correlation (Zou and
     Donner 2008), so it is as asymmetric as they are. If both groups have the
-    same values without each unit, it is that of 0 changes in Wilson's sense.
+    same values without each unit, it is that of 0 changes in Wilson's sense. `is_paired` says that
+    run i of both has the same seed.
     """
     one, other = average(after), average(before)
     value = one.value - other.value
@@ -656,13 +670,14 @@ def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def class_means(
-    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Float[np.ndarray, "... n"]
+    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Int[np.ndarray, "... n"]
 ) -> Float[np.ndarray, "K ..."]:
     """Compute the fraction of hits in each class, and average it over the classes.
 
     This is the mean over all images if an image of a class with n images has
     the weight 1 / n. `functools.partial(class_means, hits, names)` is a
-    statistic for `leave_out`.
+    statistic for `leave_out`. `hits` has a row for each definition of a hit, such as top-1, and
+    `counts` says how often each image counts.
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
     weights = 1 / class_sizes[class_of_image]
@@ -673,15 +688,16 @@ def class_means(
 def auc_and_recalls(
     positives: Float[np.ndarray, " n"],
     negatives: Float[np.ndarray, " m"],
-    positive_counts: Float[np.ndarray, "... n"] | None = None,
-    negative_counts: Float[np.ndarray, "... m"] | None = None,
+    positive_counts: Int[np.ndarray, "... n"] | None = None,
+    negative_counts: Int[np.ndarray, "... m"] | None = None,
 ) -> Float[np.ndarray, "4 ..."]:
     """Compute the AUC, and the recall at each false-positive rate in `RATES`.
 
     The AUC is the probability that a random positive has a higher score than a
     random negative. A tie counts half (Mann and Whitney 1947). The recall is the
     fraction of the positives that score above the threshold for a
-    false-positive rate. A positive at the threshold counts as missed.
+    false-positive rate. A positive at the threshold counts as missed. The counts say how often each
+    image counts. None counts each once.
     """
     if positive_counts is None:
         positive_counts = np.ones(len(positives), int)
@@ -713,14 +729,15 @@ def auc_and_recalls(
 
 def thresholds(
     negatives: Float[np.ndarray, " m"],
-    counts: Float[np.ndarray, "... m"],
+    counts: Int[np.ndarray, "... m"],
     rates: Sequence[str] = RATES,
 ) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
 
     The threshold is the score of a negative. It is the lowest such score that
     at most the given fraction of the negatives exceed. With the rate 0.10 and
-    20 negatives, at most 2 negatives exceed the threshold.
+    20 negatives, at most 2 negatives exceed the threshold. `rates` are decimal strings, because
+    these are exact.
     """
     order = negatives.argsort()
     sorted_negatives = negatives[order]
@@ -743,12 +760,13 @@ def thresholds(
 def roc_curve(
     positives: Float[np.ndarray, " n"],
     negatives: Float[np.ndarray, " m"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Compute the points of the ROC curve, from (0, 0) to (1, 1).
 
     An image counts as detected if its score exceeds a threshold. Each distinct
     score is the threshold of one point of the curve. The last point has the
-    threshold minus infinity, which all scores exceed.
+    threshold minus infinity, which all scores exceed. Return the false-positive rates, the recalls
+    and the descending thresholds.
     """
     distinct_scores = np.unique([*positives, *negatives])
     descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
@@ -780,7 +798,7 @@ def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
-    """Read a metric from the content of summary.json."""
+    """Read a metric from the content of summary.json. None if the file lacks it."""
     entry = _find_entry(summary, name)
     if not entry:
         return None
@@ -805,7 +823,7 @@ def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
 
 
 def metric_title(name: str) -> str:
-    """Return the title of a metric in tables."""
+    """Return the title of a metric in tables. An example is "recall at 10% FPR"."""
     if name in TITLES:
         return TITLES[name]
     # All other names have the form "recall_at/RATE".

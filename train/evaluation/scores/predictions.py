@@ -191,7 +191,9 @@ def compute_logits(
 ) -> torch.Tensor:
     """Compute the logits of a model for images.
 
-    A module is called in eval mode. Its mode is restored afterwards.
+    A module is called in eval mode. Its mode is restored afterwards. The images are 8-bit sRGB,
+    and the model gets them in [0, 1]. The logits are on the CPU, and raise InputError if they are
+    not finite.
     """
     if classes < 2:
         raise InputError(
@@ -225,7 +227,10 @@ def rank_classes(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[Prediction]:
-    """Convert logits to predicted classes with their probabilities, ranks and log-odds."""
+    """Convert logits to predicted classes with their probabilities, ranks and log-odds.
+
+    All photographs come for the first positive class, then for the next one.
+    """
     logits = logits.double()
     probabilities = logits.softmax(dim=1).tolist()
     # Classes are sorted by logits, because small probabilities may all round to 0.
@@ -276,7 +281,7 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
     probability, probability_of_true and rank_of_true do not depend on the
     positive class. For each positive class, such as orange, there are the
     columns orange_probability, orange_rank and orange_log_odds. The cell of a
-    value that is None is empty.
+    value that is None is empty. `predictions` are in the order of `rank_classes`.
     """
     predictions_by_class = by_label(predictions).values()
     rows = [_to_row(predictions) for predictions in zip(*predictions_by_class, strict=True)]
@@ -310,7 +315,10 @@ def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
 
 
 def read_predictions(path: Path, label: Label) -> list[Prediction]:
-    """Read the table predictions.csv, which `write_predictions` wrote."""
+    """Read the table predictions.csv, which `write_predictions` wrote.
+
+    The predictions come in the order of `rank_classes`.
+    """
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))

@@ -204,7 +204,7 @@ def score(
     All metrics have 95% intervals. They are over objects if photos.csv names at
     least MIN_OBJECTS of each kind, and otherwise over images, for these objects.
     Intervals of fractions of different objects are Wilson's. All others come
-    from a jackknife.
+    from a jackknife. `by` is "mesh", "class" or "source"; "source" adds no groups.
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
@@ -294,7 +294,8 @@ def choose_operating_points(
 
     The threshold is the log-odds of a negative. It is the lowest of these
     values at which the false-positive rate is at most `rate`. With rate 0.1 and
-    20 negatives, at most 2 negatives score above the threshold.
+    20 negatives, at most 2 negatives score above the threshold. Fewer than 1 / `rate` negatives
+    raise InputError.
     """
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))

@@ -71,7 +71,8 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Im
 
     Each positive class has three sections: true positives, false negatives and
     false positives. A section has at most MAX_IMAGES images. If there are more,
-    it shows images at equal distances in the order of probability.
+    it shows images at equal distances in the order of probability. The images are enlarged without
+    smoothing, so that pixels stay visible.
     """
     grids = [draw_grid([], heading=LEGEND)]
     for label, predictions_of_label in by_label(predictions).items():
@@ -93,7 +94,7 @@ def _sections(
 ) -> list[_Section]:
     """Divide images into true positives, false negatives and false positives of a class.
 
-    True negatives are left out.
+    True negatives are left out. The most confident predictions come first.
     """
     pairs = list(zip(predictions, images, strict=True))
     pairs.sort(key=lambda pair: pair[0].probability, reverse=True)
@@ -123,7 +124,10 @@ def _section_grid(label: str, section: _Section) -> Image.Image:
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Choose items of a list at equal distances, including the first and the last one."""
+    """Choose items of a list at equal distances, including the first and the last one.
+
+    All, if there are at most `count`.
+    """
     indices = np.linspace(0, len(items) - 1, min(count, len(items)))
     return [items[index] for index in indices.round().astype(int)]
 
@@ -156,7 +160,8 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     """Write ROC curves to the table roc.csv and to the figure roc.png.
 
     There is a curve for all images, and one for each source or label. A curve
-    is left out if it lacks positives or negatives.
+    is left out if it lacks positives or negatives. A pair has the log-odds of positives and of
+    negatives.
     """
     # This import is here because it takes half a second.
     from matplotlib.figure import Figure
@@ -191,7 +196,10 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
 
 def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
-    """Make a row of roc.csv for each point of a ROC curve."""
+    """Make a row of roc.csv for each point of a ROC curve.
+
+    A row has the name (empty for all images), false-positive rate, recall and threshold.
+    """
     points = zip(*roc_curve(*pair), strict=True)
     return [(name, *map(float, point)) for point in points]
 
@@ -203,7 +211,9 @@ def draw_roc(
 ) -> None:
     """Draw ROC curves, with the AUC in the legend.
 
-    Dotted vertical lines mark the false-positive rates in `RATES`.
+    Dotted vertical lines mark the false-positive rates in `RATES`. `scores` has pairs of log-odds
+    of positives and negatives. Several runs have a curve each in one style, and their mean AUC in
+    the legend.
     """
     # The ROC curve of a random classifier is the diagonal.
     axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
