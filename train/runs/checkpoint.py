@@ -28,7 +28,10 @@ HASH = "sha256"
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write a checkpoint with the hash of its content. The file is never half written."""
+    """Write a checkpoint with the hash of its content. The file is never half written.
+
+    An existing file is moved to `previous`.
+    """
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
     atomic_write(path, content.getbuffer(), durable=True, previous=previous)
@@ -53,7 +56,10 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Check that the content of a checkpoint has an architecture and finite weights."""
+    """Check that the content of a checkpoint has an architecture and finite weights.
+
+    The content of a later version of the library raises InputError, too.
+    """
     try:
         version = state["architecture"].get("version", 1)
         is_finite = all(value.isfinite().all() for value in state["model"].values())
@@ -79,7 +85,10 @@ def exists(folder: Path) -> bool:
 
 
 def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Read the newest undamaged checkpoint of a run: last.pt, or else previous.pt."""
+    """Read the newest undamaged checkpoint of a run: last.pt, or else previous.pt.
+
+    The second value says what is wrong with last.pt, or is None.
+    """
     try:
         return load(folder / LAST), None
     except InputError as error:
@@ -89,13 +98,16 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the states of the random generators of torch."""
+    """Return the states of the random generators of torch. "cuda" has one state for each GPU."""
     states = cuda.get_rng_state_all() if cuda.is_available() else []
     return {"cpu": torch.get_rng_state(), "cuda": states}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Set the random generators of torch to states that `random_state` returned."""
+    """Set the random generators of torch to states that `random_state` returned.
+
+    Surplus states or GPUs are ignored.
+    """
     torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
         cuda.set_rng_state(values, device)

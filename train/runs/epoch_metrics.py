@@ -19,7 +19,11 @@ def epoch_metrics(
     diagnostics: list[Mapping[str, float]],
     seconds: Mapping[str, float],
 ) -> dict[str, float]:
-    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have."""
+    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
+
+    "augment/" has means of the diagnostics over all rounds, and "round_1/" those of one of several
+    rounds.
+    """
     means = {}
     for name in diagnostics[0]:
         means[name] = fmean(of_round[name] for of_round in diagnostics)
@@ -40,7 +44,10 @@ def epoch_metrics(
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
-    """Write the line that the console shows after an epoch."""
+    """Write the line that the console shows after an epoch.
+
+    The success of the attack counts only renders that are classified correctly before it.
+    """
     total = sum(metrics[f"seconds/{name}"] for name in PHASES)
     parts = [
         f"epoch {epoch}/{epochs}",
@@ -64,7 +71,7 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
     """Compute the success rate of an attack on renders that are classified correctly before it.
 
     With the fraction b of misclassified renders before the attack, and the
-    fraction a after it, the rate is (a - b) / (1 - b).
+    fraction a after it, the rate is (a - b) / (1 - b). It is None without an attack or for b = 1.
     """
     before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
     if before == 1:

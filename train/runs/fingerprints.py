@@ -62,7 +62,10 @@ def _path_of(text: str) -> Path:
 
 
 def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts in a setting that may be paths of input files."""
+    """Collect the texts in a setting that may be paths of input files.
+
+    An object can have a "mesh" and "props", which are other meshes beside it.
+    """
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("props")]
     if isinstance(value, list):

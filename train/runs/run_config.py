@@ -56,7 +56,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """Parse a JSON object."""
+    """Parse a JSON object. Raise ValueError if it is empty or no object."""
     parsed = json.loads(text)
     if not isinstance(parsed, dict) or not parsed:
         raise ValueError("it holds no object of keys and values")
@@ -85,7 +85,10 @@ def read_config(path: Path) -> DictConfig:
 
 
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
-    """Write config.yaml: settings, facts, hashes of the input files, and versions of packages."""
+    """Write config.yaml: settings, facts, hashes of the input files, and versions of packages.
+
+    A fact that contains "${" is left out, because `read_config` refuses it.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
         facts["working_folder"] = _working_folder(folder, str(facts["command"]))
@@ -99,7 +102,10 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
 
 
 def _working_folder(folder: Path, command: str) -> str:
-    """Return the folder in which the command of a run was started for the first time."""
+    """Return the folder in which the command of a run was started for the first time.
+
+    A command that begins with the recorded command continues the run.
+    """
     with suppress(InputError):
         recorded = read_config(folder / CONFIG)
         if command.startswith(str(recorded.get("command"))):
@@ -111,7 +117,8 @@ def decisive_settings(settings: Any) -> dict[str, object]:
     """Select the settings that decide the result of a run.
 
     The number of threads, for example, is left out. In paths, "<run>" stands for
-    the folder of the run. A run whose folder was moved then has equal settings.
+    the folder of the run. A run whose folder was moved then has equal settings. The keys are
+    dotted, such as "train.epochs".
     """
     if isinstance(settings, DictConfig):
         nested: Any = OmegaConf.to_container(settings)
@@ -151,7 +158,10 @@ def _recorded(overrides: Sequence[str]) -> list[str]:
 
 
 def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
-    """Combine the settings of an earlier run with the arguments of a command that resumes it."""
+    """Combine the settings of an earlier run with the arguments of a command that resumes it.
+
+    Return the configuration, and the recorded command followed by the new arguments.
+    """
     folder = Path(config.run).absolute()
     recorded = _read_recorded(folder)
     names = [item.name for item in fields(ExperimentSettings)]
@@ -214,7 +224,9 @@ def require_same(
 ) -> DictConfig:
     """Check that an earlier command wrote a folder with the same settings and input files.
 
-    Only settings that decide the result are compared (see `decisive_settings`).
+    Only settings that decide the result are compared (see `decisive_settings`). `is_permitted` gets
+    the dotted key, the old value and the new value of a setting that differs. Return the recorded
+    configuration.
     """
     config = read_config(folder / CONFIG)
     # A setting that the earlier version did not have has its default value.

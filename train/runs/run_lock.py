@@ -23,7 +23,7 @@ def locked(folder: Path) -> Iterator[bool]:
     """Try to lock a folder until the block ends, so that no other process writes to it.
 
     If this succeeds, temporary files that a stopped process left in the folder
-    are removed.
+    are removed. Yield False if another process has the lock.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
@@ -66,7 +66,10 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 def state(folder: Path) -> str:
-    """Describe the state of a run that is not finished."""
+    """Describe the state of a run that is not finished.
+
+    It is "not begun", "in training", "interrupted" or "failed: " and the reason.
+    """
     if not folder.exists():
         return "not begun"
     with locked(folder) as is_ours:

@@ -64,7 +64,11 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
-        """Begin the log."""
+        """Begin the log.
+
+        `history` replaces the lines in metrics.jsonl, because a resumed run repeats the epochs
+        after its checkpoint.
+        """
         # This import takes half a second. Programs that only read metrics do not
         # need it.
         from torch.utils.tensorboard import SummaryWriter
@@ -77,7 +81,10 @@ class RunLog:
         self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
-        """Write the metrics of an epoch, or the final scores, to the log."""
+        """Write the metrics of an epoch, or the final scores, to the log.
+
+        `epoch` counts from 1, and is None for the final scores, after which nothing is logged.
+        """
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")

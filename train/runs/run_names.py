@@ -25,7 +25,8 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     For the arguments seed=0 and augment=none, the name is
     `augment-none+seed-0@7d0a3f52`. It has the settings in alphabetical order,
     and ends with a hash of them. Characters that are special to file systems or
-    to Hydra are replaced by "_".
+    to Hydra are replaced by "_". `fixed` settings count in the hash, but are not shown. A folder in
+    `parent` with the same hash keeps its name.
     """
     pairs = []
     for override in overrides:

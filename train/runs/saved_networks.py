@@ -186,7 +186,10 @@ def is_classifier(name: str) -> bool:
 
 
 def selected_file(run: Path) -> Path | None:
-    """Find the file of the network that a training run selected, or of a published network."""
+    """Find the file of the network that a training run selected, or of a published network.
+
+    None if there is none. `run` can also be the file itself, or a folder below pretrained/.
+    """
     found = published(run)
     for file in (found, found / BEST, found / PUBLISHED):
         if file.is_file():
@@ -232,7 +235,10 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write the network of a checkpoint in half precision, as a file for other users."""
+    """Write the network of a checkpoint in half precision, as a file for other users.
+
+    The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
+    """
     metadata = {}
     for key in PUBLISHED_FACTS:
         if key in state:
@@ -244,7 +250,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def _load_published(path: Path) -> dict[str, Any]:
-    """Read a file that `publish` wrote."""
+    """Read a file that `publish` wrote. The weights, in single precision, are in "model"."""
     weights: dict[str, Tensor] = {}
     try:
         with safe_open(path, "pt") as file:
@@ -261,7 +267,10 @@ def _load_published(path: Path) -> dict[str, Any]:
 
 
 def export(path: Path, network: nn.Module) -> None:
-    """Write the trained weights of a classifier of the user, so that the user can load them."""
+    """Write the trained weights of a classifier of the user, so that the user can load them.
+
+    The weights have the names of the user's own network, without wrappers of this library.
+    """
     state = unwrapped(network).state_dict()
     content = io.BytesIO()
     torch.save({name: value.cpu() for name, value in state.items()}, content)
