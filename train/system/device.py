@@ -36,7 +36,10 @@ RECOMPILE_LIMIT = 4 * len(SIZES)
 
 
 def choose_device(name: str) -> torch.device:
-    """Choose the device that computes."""
+    """Choose the device that computes.
+
+    "auto" is a GPU if there is one. With "cuda", each process of torchrun gets its own GPU.
+    """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and "LOCAL_RANK" in os.environ:
@@ -91,7 +94,10 @@ def set_deterministic(deterministic: bool) -> None:
 def choose_precision(precision: str, device: torch.device, trained: nn.Module | None = None) -> str:
     """Choose the precision in which a network computes.
 
-    A warning is logged if `precision` is "bfloat16" and the CPU only emulates it.
+    A warning is logged if `precision` is "bfloat16" and the CPU only emulates it. "auto" is
+    bfloat16 if the hardware computes in it, or else float16 on a GPU and float32 on a CPU. Training
+    of depthwise convolutions on a CPU also gets float32, because their gradients take 3 times as
+    long in bfloat16.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     if device.type == "cuda":
@@ -134,7 +140,7 @@ class MixedPrecision(nn.Module):
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        """Wrap a network."""
+        """Wrap a network. Its weights are changed to channels-last."""
         super().__init__()
         self.network = network.to(memory_format=torch.channels_last)
         self.precision = precision
@@ -149,7 +155,11 @@ class MixedPrecision(nn.Module):
 
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Return whether to record the passes of a network as CUDA graphs with torch.compile."""
+    """Return whether to record the passes of a network as CUDA graphs with torch.compile.
+
+    "auto" means yes on a GPU if there is a C compiler and one process: several processes
+    communicate within a pass.
+    """
     if choice == "always" and device.type == "cpu":
         raise InputError(
             "choice=always needs a GPU, since it records CUDA graphs, but the device is a CPU: "

@@ -9,7 +9,10 @@ from torch import Tensor
 
 
 def content_hash(state: Any) -> str:
-    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint."""
+    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint.
+
+    It depends on all keys, values, types and shapes.
+    """
     digest = hashlib.sha256()
     _update(digest, state)
     return digest.hexdigest()

@@ -73,7 +73,8 @@ def wrap_ddp(model: nn.Module) -> nn.Module:
     """Wrap a model so that its gradients are averaged over all processes of a run.
 
     On GPUs, layers of batch normalization are replaced in `model` by layers that compute their
-    statistics over the batch of all processes. On CPUs, each process has its own statistics.
+    statistics over the batch of all processes. On CPUs, each process has its own statistics. A
+    single process returns the model itself.
     """
     if distributed.world_size() == 1:
         return model

@@ -24,7 +24,8 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
 
     A message of the library begins with the name of a Python argument, such as
     "name". The user of a command knows only the setting from which the command
-    took the argument, such as "train.init_from".
+    took the argument, such as "train.init_from". The key of "lighting" also holds for
+    "lighting.radius" and "lighting[0]", and `group` is put before all other arguments.
     """
     try:
         yield
@@ -49,7 +50,10 @@ def keys_of(key: str, settings: Settings) -> dict[str, str]:
 
 
 def user_message(error: BaseException) -> str | None:
-    """Write a message for the user about an error that the user can fix."""
+    """Write a message for the user about an error that the user can fix.
+
+    None if it is a fault of the program, or unknown.
+    """
     match error:
         case InputError():
             return str(error)

@@ -13,9 +13,7 @@ MAX_LINES = 12
 
 
 def take_flag(words: list[str]) -> list[str]:
-    """Remove --verbose and -v from a command line, and make this process verbose if one is
-    there.
-    """
+    """Remove --verbose and -v from a command line, and make the process verbose if one is there."""
     others = [word for word in words if word not in VERBOSE_FLAGS]
     if len(others) < len(words):
         os.environ[VERBOSE] = "1"
@@ -28,7 +26,10 @@ def is_verbose() -> bool:
 
 
 def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
-    """Shorten a list of lines that a command prints, unless the command is verbose."""
+    """Shorten a list of lines that a command prints, unless the command is verbose.
+
+    The last line says how many were left out.
+    """
     if is_verbose() or len(lines) <= limit:
         return list(lines)
     kept = limit - 1
