@@ -193,7 +193,10 @@ class Adversary(ShortRepr):
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
-    """Return a copy of an object with the shape, the colors and the gloss after an attack."""
+    """Return a copy of an object with the shape, the colors and the gloss after an attack.
+
+    A field of the conditions that is None changes nothing.
+    """
     mesh = item.mesh
     albedo_scale = item.albedo_scale
     if changed.albedo is not None:
@@ -220,8 +223,9 @@ def _exact_numpy(values: Tensor) -> np.ndarray:
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     """Write the files of an adversary: those that `reload` reads, and a scene for Mitsuba.
 
-    In the scene for Mitsuba, negative radiance is replaced by 0. Environment
-    maps (.hdr and .exr) are written only if the light is nowhere negative.
+    In the scene for Mitsuba, negative radiance is replaced by 0. Environment maps (.hdr and .exr)
+    are written only if the light is nowhere negative. Return the fraction of the energy of the
+    environment light that is negative, under the key "negative_light".
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = adversary.shown
@@ -282,7 +286,8 @@ def save_lights(
 ) -> list[tuple[Any, Tensor]]:
     """Write the environment light to light.json, and each local light to a file of its name.
 
-    Local lights are the projector and the lamps.
+    Local lights are the projector and the lamps. The suffix `when`, such as "_before", ends the
+    name of each file. Return basis and coefficients of each light, the environment light first.
     """
     lights: list[tuple[Any, Tensor]] = []
     for rows, basis_of_light in parts_of(basis):
@@ -295,7 +300,10 @@ def save_lights(
 
 
 def _write_background(background: Float[Tensor, "_ size size"], folder: Path) -> float | str:
-    """Write a background to an image file, except if all its values are the same."""
+    """Write a background to an image file, except if all its values are the same.
+
+    Return the value of all pixels, or the name of the written file.
+    """
     gray = float(background.flatten()[0])
     if (background == gray).all():
         return gray
@@ -388,7 +396,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 
 
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Create a camera from its fields in adversary.json."""
+    """Create a camera from its fields in adversary.json.
+
+    `angle_unit` is None in files of earlier versions.
+    """
     described = angles_in_degrees(description, angle_unit)
     # Earlier versions of the library wrote `clip_range` under the name "reach".
     if "reach" in described:

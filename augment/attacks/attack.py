@@ -321,7 +321,10 @@ class AttackResult(ShortRepr):
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
     def _values_between(self, fraction: float) -> Float[Tensor, "E D"]:
-        """Interpolate linearly between the attack values before and after the attack."""
+        """Interpolate linearly between the attack values before and after the attack.
+
+        The fraction is 0 before the attack and 1 after it.
+        """
         start = self.problem.start
         return start + fraction * (self.descent.values.to(start) - start)
 
@@ -469,7 +472,11 @@ def _attack(
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Attack a classifier whose arguments have been checked. See `attack`."""
+    """Attack a classifier whose arguments have been checked. See `attack`.
+
+    A target of None accepts any misclassification, and settings of None change the light without a
+    limit.
+    """
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     has_gradients = classifier.is_differentiable(scene.lights)
@@ -545,7 +552,7 @@ def with_optimizer(
 def _count_queries(
     descent: DescentResult,
     images: Float[Tensor, "E V 3 size size"],
-    predicted: Float[Tensor, "E V"],
+    predicted: Int[Tensor, "E V"],
     criterion: Criterion,
     settings: AttackSettings,
 ) -> Int[Tensor, " E"]:
@@ -606,10 +613,13 @@ def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[T
 def require_clean_correct(
     scene: Scene,
     logits: Float[Tensor, "E V C"],
-    source: Bool[Tensor, "E V"],
+    source: Int[Tensor, "E V"],
     classifier: Classifier,
 ) -> None:
-    """Check that every image of a scene is classified correctly."""
+    """Check that every image of a scene is classified correctly.
+
+    The error names the five most probable classes of the first image that is misclassified.
+    """
     misclassified = (logits.argmax(2) != source).nonzero().tolist()
     if not misclassified:
         return
@@ -632,11 +642,14 @@ def require_clean_correct(
 
 def target_labels(
     target: str | int | Sequence[str | int] | None,
-    source: Bool[Tensor, "E V"],
+    source: Int[Tensor, "E V"],
     logits: Float[Tensor, "E V C"],
     classifier: Classifier,
 ) -> Int[Tensor, "E V"] | None:
-    """Return the target class of each view as an index of the classifier."""
+    """Return the target class of each view as an index of the classifier.
+
+    None stands for an untargeted attack. A target that is the true class is refused.
+    """
     if target is None:
         return None
     if isinstance(target, str) and target == LEAST_LIKELY:
@@ -708,13 +721,13 @@ def fooled_in_views(
     criterion: Criterion,
     settings: AttackSettings,
     seed: int,
-) -> Float[Tensor, "A V"]:
+) -> Bool[Tensor, "A V"]:
     """Decide which views count as a success of an attack.
 
-    A view is a success if it meets the criterion without noise and with each of
-    `NOISE_DRAWS` draws of sensor noise. The noise of an example depends only on
-    the seed and on the index of the example. An attack that tries many images
-    therefore cannot succeed by drawing the noise again.
+    A view is a success if it meets the criterion without noise and with each of `NOISE_DRAWS` draws
+    of sensor noise. The noise of an example depends only on the seed and on the index of the
+    example. An attack that tries many images therefore cannot succeed by drawing the noise again.
+    With `sensor_noise=0`, only the images without noise count.
     """
     is_fooled = criterion.reached_in_views(predicted)
     # Noise is tested only in examples with a view that is fooled without noise.

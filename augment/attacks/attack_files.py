@@ -119,7 +119,10 @@ def require_renderers(names: Sequence[str]) -> None:
 
 
 def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """Write the figure and the folder of each example."""
+    """Write the figure and the folder of each example.
+
+    Return the numbers of each example for attack.jsonl, without the key "versions".
+    """
     problem = result.problem
     scene = problem.scene
     conditions_before = problem.conditions(problem.start, problem.all_examples)
@@ -180,8 +183,9 @@ def _versions(
 ) -> dict[str, list[dict[str, Any]]]:
     """Classify several versions of the images after an attack.
 
-    The versions are the images as floats, with 8 bits, as JPEG, and as each
-    renderer renders them from the saved files.
+    The versions are the images as floats, with 8 bits, as JPEG, and as each renderer renders them
+    from the saved files. Return, for the name of each version, a dictionary for each example: its
+    successes, predictions, and differences from the floats.
     """
     # Images of V views of each of the E examples, shape (E, V, 3, size, size).
     images = result.images_in_views.cpu()
@@ -206,7 +210,11 @@ def _versions(
 def _numbers_of_version(
     result: AttackResult, images: Float[Tensor, "E V 3 size size"]
 ) -> list[dict[str, Any]]:
-    """Classify another version of the attacked images, such as renders of Mitsuba."""
+    """Classify another version of the attacked images, such as renders of Mitsuba.
+
+    Return a dictionary for each example: its successes, predictions, and differences from the
+    images of the result.
+    """
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     predicted = logits.argmax(2)
     success_in_views = fooled_in_views(
@@ -240,7 +248,10 @@ def render_again(
     renderers: Sequence[str],
     rasterizer: Rasterizer,
 ) -> dict[str, Tensor]:
-    """Render the V views of an example from its saved files alone."""
+    """Render the V views of an example from its saved files alone.
+
+    Return images of shape (V, 3, size, size) by the name of the renderer.
+    """
     adversary = reload(folder)
     images = {}
     if "reload" in renderers:
@@ -284,7 +295,11 @@ def figure(result: AttackResult, example: int) -> Image.Image:
 
 
 def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
-    """Draw a white ball in the light before and after an attack, as each camera sees it."""
+    """Draw a white ball in the light before and after an attack, as each camera sees it.
+
+    Return the two columns by their titles, or an empty dictionary if the attack did not change the
+    light.
+    """
     problem = result.problem
     scene = problem.scene
     examples = problem.all_examples[[example]]
@@ -312,7 +327,11 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
 def _captions(
     result: AttackResult, logits: Float[Tensor, "E V C"], example: int
 ) -> list[tuple[str, ...]]:
-    """Return the captions of the V views of an example in the figure of an attack."""
+    """Return the captions of the V views of an example in the figure of an attack.
+
+    The first line has the probability and the name of the predicted class. If it is wrong, a second
+    line has those of the true class.
+    """
     classes = result.classifier.classes
     labels = result.criterion.source[example].tolist()
     captions = []

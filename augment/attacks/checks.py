@@ -129,7 +129,7 @@ def check(result: AttackResult) -> dict[str, Any]:
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:
-    """Return reasons to doubt the strength of an attack."""
+    """Return reasons to doubt the strength of an attack, as one sentence each."""
     success = checks["success"]
     lost_to_noise = checks["success_without_noise"] - success
     reasons = []
@@ -302,9 +302,7 @@ def _as_classifier(
     value_range: tuple[float, float],
     argument: str,
 ) -> Classifier:
-    """Convert a plain network to a classifier like the attacked one. Return a classifier as it
-    is.
-    """
+    """Convert a plain network to a classifier like the attacked one. Others stay as they are."""
     if isinstance(network, Classifier):
         return network
     attacked = result.classifier
@@ -420,7 +418,11 @@ def _success_by_draws(
     found: Successes,
     draw: Callable[[], Tensor],
 ) -> Successes:
-    """Search for successes by random draws of the attack values."""
+    """Search for successes by random draws of the attack values.
+
+    Only examples without a success in `found` are searched. Return a copy of `found` with the
+    additional successes.
+    """
     found = found.clone()
     for _ in progress(range(_count_draws(result)), "random search"):
         examples = found.unsuccessful
@@ -451,9 +453,9 @@ def _count_draws(result: AttackResult) -> int:
 def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
     """Repeat an attack with 3 and 10 times as many steps, and find the successes.
 
-    An attack without gradients is repeated with 3 and 10 times as many queries.
-    Only the examples without a success so far are attacked again, each from its
-    start.
+    An attack without gradients is repeated with 3 and 10 times as many queries. Only the examples
+    without a success so far are attacked again, each from its start. The keys are numbers of steps
+    or queries. Successes with fewer steps are included.
     """
     settings = result.settings
     successes = Successes(result.success, result.success_without_noise)
@@ -499,7 +501,11 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
 
 
 def _scaled(settings: StepSettings, scale: float) -> StepSettings:
-    """Return a copy of the settings of a parameter with a scaled norm-ball."""
+    """Return a copy of the settings of a parameter with a scaled norm-ball.
+
+    Radius and step size are multiplied by the scale. Without a radius, the scale becomes the
+    radius, and the step size stays.
+    """
     if settings.radius is None:
         return replace(settings, radius=scale)
     return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
@@ -511,7 +517,10 @@ def _descend_further(
     values: Float[Tensor, "E D"],
     found: Successes,
 ) -> None:
-    """Continue the descent of the examples without a success, in larger norm-balls."""
+    """Continue the descent of the examples without a success, in larger norm-balls.
+
+    Values and successes are updated in place.
+    """
     examples = found.unsuccessful
     if not len(examples):
         return
@@ -529,7 +538,10 @@ def _descend_further(
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
-    """Select the successes among the N examples that are correct before the attack."""
+    """Select the successes among the N examples that are correct before the attack.
+
+    Keys: `method` with sensor noise, and `method` + "_without_noise".
+    """
     is_clean = result.clean_correct
     return {
         method: found.with_noise[is_clean].cpu(),
@@ -664,6 +676,9 @@ def _with_size(images: Float[Tensor, "N C H W"], size: int) -> Tensor:
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    """Return a copy of an adversary whose cameras are turned around the vertical axis."""
+    """Return a copy of an adversary whose cameras are turned around the vertical axis.
+
+    The angle in degrees is added to the azimuth of each camera.
+    """
     cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
     return replace(adversary, cameras=tuple(cameras))

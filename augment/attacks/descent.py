@@ -161,12 +161,12 @@ class DescentResult(ShortRepr):
             tensors[item.name] = tensor.new_empty(example_count, *tensor.shape[1:])
         return DescentResult(**tensors)
 
-    def write(self, rows: Float[Tensor, " A"], group: DescentResult) -> None:
+    def write(self, rows: Int[Tensor, " A"], group: DescentResult) -> None:
         """Copy the result of a group of examples into the given rows of this result."""
         for item in fields(self):
             getattr(self, item.name)[rows] = getattr(group, item.name)
 
-    def add_restart(self, rows: Float[Tensor, " A"], restart: DescentResult) -> None:
+    def add_restart(self, rows: Int[Tensor, " A"], restart: DescentResult) -> None:
         """Add a restart, which attacks some examples again from other initial values.
 
         Its steps and passes are added to the counts. Where the restart
@@ -215,7 +215,12 @@ class Descent:
         start: Float[Tensor, "A D"],
         restarts: Iterable[Tensor],
     ) -> DescentResult:
-        """Attack A examples from one or more initial values, until they succeed."""
+        """Attack A examples from one or more initial values, until they succeed.
+
+        Further initial values are used for the examples that have not succeeded, or whose success
+        does not survive sensor noise, unless their share of the queries is less than one
+        evaluation.
+        """
         result = self.run(criterion, examples, start)
         limit = self.settings.query_limit_of_start
         if limit is not None and limit < self._passes_of_candidate(criterion):
@@ -330,7 +335,10 @@ class Descent:
     def _score(
         self, images: Float[Tensor, "N V 3 H W"], criterion: Criterion, batch_size: BatchSize
     ) -> tuple[Score, Tensor]:
-        """Compute the costs, logit gaps and predictions of N examples, batch by batch."""
+        """Compute the costs, logit gaps and predictions of N examples, batch by batch.
+
+        Return also the gradients of the costs with respect to the images.
+        """
         view_count = images.shape[1]
         all_images = images.flatten(0, 1)
         all_gradients = torch.empty_like(all_images)
@@ -405,7 +413,7 @@ class Descent:
         is_finished: Bool[Tensor, " N"],
         state: State,
         evaluation: Evaluation,
-    ) -> Float[Tensor, " N"]:
+    ) -> Bool[Tensor, " N"]:
         """Return a mask of the finished examples that remain successes with sensor noise.
 
         Only examples with a noise margin are checked. The images that the classifier sees for this
@@ -435,7 +443,7 @@ class Descent:
     @torch.no_grad()
     def _is_robust_to_noise(
         self, images: Float[Tensor, "A V 3 H W"], examples: Int[Tensor, " A"], criterion: Criterion
-    ) -> Float[Tensor, " A"]:
+    ) -> Bool[Tensor, " A"]:
         """Return a mask of the examples whose logit gaps change little with sensor noise.
 
         The logit gap tells by how much a view reaches the criterion. It is
@@ -509,7 +517,10 @@ class Score:
     def of_logits(
         cls, cost: Tensor, logits: Float[Tensor, "N C"], expected_logits: Tensor, classes: Criterion
     ) -> Score:
-        """Return the scores of N images."""
+        """Return the scores of N images.
+
+        `expected_logits` are averages over random transformations of the images.
+        """
         return cls(
             cost=cost,
             gap=logit_gap(expected_logits, classes.source, classes.target),
@@ -519,7 +530,11 @@ class Score:
 
     @classmethod
     def of_examples(cls, batches: Sequence[Score], view_count: int) -> Score:
-        """Combine the scores of single images to scores of examples."""
+        """Combine the scores of single images to scores of examples.
+
+        Batches are in order, and the views of an example follow each other. Costs are summed, and
+        the smallest logit gap counts.
+        """
         cost = torch.cat([score.cost for score in batches]).unflatten(0, (-1, view_count))
         gap = torch.cat([score.gap for score in batches]).unflatten(0, (-1, view_count))
         predicted = torch.cat([score.predicted for score in batches]).unflatten(0, (-1, view_count))
@@ -614,7 +629,7 @@ class State:
     criterion: Criterion
     examples: Int[Tensor, " A"]
     batch_size: BatchSize
-    active_rows: Float[Tensor, " N"]
+    active_rows: Int[Tensor, " N"]
     values: Float[Tensor, "A D"]
     gradient: Float[Tensor, "A D"]
     cost: Float[Tensor, " A"]
@@ -678,7 +693,10 @@ class State:
         self.active_rows = self.active_rows[unfinished]
 
     def _accept(self, accepted: Tensor, evaluation: Evaluation) -> None:
-        """Let the next step of some examples start from their evaluated candidates."""
+        """Let the next step of some examples start from their evaluated candidates.
+
+        `accepted` are indices among the candidates of the evaluation.
+        """
         rows = self.active_rows[accepted]
         self.values[rows] = evaluation.values[accepted]
         if evaluation.gradient is not None:
@@ -686,7 +704,10 @@ class State:
         self.cost[rows] = evaluation.score.cost[accepted]
 
     def _keep(self, kept: Tensor, evaluation: Evaluation) -> None:
-        """Make the candidates of some examples their present results."""
+        """Make the candidates of some examples their present results.
+
+        `kept` are indices among the candidates of the evaluation.
+        """
         rows = self.active_rows[kept]
         self.result.values[rows] = evaluation.values[kept]
         self.result.images[rows] = evaluation.images[kept]

@@ -56,8 +56,9 @@ def add_sensor_noise(
 ) -> Iterator[Tensor]:
     """Add sensor noise to images and round them to 8 bits, as a camera does.
 
-    This is repeated `NOISE_DRAWS` times with different noise. The noise of an
-    example depends only on the key and on the index of the example.
+    This is repeated `NOISE_DRAWS` times with different noise. The noise of an example depends only
+    on the key and on the index of the example. The deviation is in units of 1/255, and the noisy
+    images are rounded to 8 bits.
     """
     generators = [generator(*key, example) for example in examples.tolist()]
     for _ in range(NOISE_DRAWS):
@@ -87,7 +88,10 @@ class ExpectationOverTransformations:
     def __call__(
         self, model: nn.Module, images: Float[Tensor, "N 3 H W"], logits: Float[Tensor, "N C"]
     ) -> Float[Tensor, "N C"]:
-        """Average the log-probabilities of images and of their random transformations."""
+        """Average the log-probabilities of images and of their random transformations.
+
+        With 0 transformations, the given logits are returned as they are.
+        """
         if not self.settings.draws:
             return logits
         log_probabilities = [logits.log_softmax(1)]
@@ -122,9 +126,7 @@ class ExpectationOverTransformations:
 
 
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function to images, with the gradient of the identity (straight-through
-    estimator).
-    """
+    """Apply a function, which need not be differentiable, with the gradient of the identity."""
     # The difference is computed from detached images, so it has no gradient.
     detached = images.detach()
     difference = change(detached) - detached
@@ -132,7 +134,7 @@ def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tens
 
 
 def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "... 3 H W"]:
-    """Compress images as JPEG and decompress them."""
+    """Compress images as JPEG and decompress them. The quality is from 1 to 100."""
     decompressed = []
     for image in to_bytes(images).flatten(0, -4):
         file = io.BytesIO()
@@ -148,9 +150,10 @@ def _moved(
 ) -> Float[Tensor, "N 3 H W"]:
     """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
-    Each new pixel takes its value from a position in the given image. The
-    movement is that of these positions, so the content of the image moves in
-    the opposite direction.
+    Each new pixel takes its value from a position in the given image. The movement is that of these
+    positions, so the content of the image moves in the opposite direction. The four numbers of a
+    movement are the shift across and the shift down as fractions of the image size, the rotation in
+    radians, and g. Distances from the center are multiplied by 1 + g.
     """
     across, down, angle, growth = movements.unbind(1)
     cos = (1 + growth) * angle.cos()

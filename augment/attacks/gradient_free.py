@@ -52,7 +52,10 @@ class GradientFree(Descent):
         return torch.stack(numbers).to(state.values)
 
     def _evaluate(self, state: State) -> Evaluation:
-        """Render and classify several candidates of each active example."""
+        """Render and classify several candidates of each active example.
+
+        Return images and scores of the best candidate of each example.
+        """
         # P candidates of D values for each example, shape (N, P, D).
         candidates = self._candidates(state)
         count = candidates.shape[1]
@@ -89,7 +92,10 @@ class GradientFree(Descent):
         criterion: Criterion,
         state: State,
     ) -> tuple[Tensor, Score]:
-        """Render and classify candidates, in groups that fit in memory."""
+        """Render and classify candidates, in groups that fit in memory.
+
+        `examples` has the index of the example to which each candidate belongs.
+        """
         image_groups = []
         scores = []
         for group in torch.arange(len(values)).split(self.problem.group_size):
@@ -130,8 +136,9 @@ def _best_candidates(
 ) -> Int[Tensor, " N"]:
     """Choose the best candidate of each of N examples.
 
-    It is the candidate of lowest cost among those that reach the criterion. If
-    none reaches the criterion, it is the candidate of lowest cost.
+    It is the candidate of lowest cost among those that reach the criterion. If none reaches the
+    criterion, it is the candidate of lowest cost. The candidates of an example follow each other,
+    and the result has indices among all N · count.
     """
     # One row for each example, one column for each of its candidates.
     costs = cost.unflatten(0, (-1, count))

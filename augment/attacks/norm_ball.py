@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.parameter_settings import StepSettings
@@ -36,9 +36,10 @@ def take_step(
 ) -> Tensor:
     """Take a step of projected gradient descent.
 
-    The values move against the gradient. Then they are replaced by the nearest
-    values that are feasible and lie in the norm-ball. Attacks on scenes and
-    adversarial training on images (PGD, Madry et al. 2018) both take this step.
+    The values move against the gradient. Then they are replaced by the nearest values that are
+    feasible and lie in the norm-ball. Attacks on scenes and adversarial training on images (PGD,
+    Madry et al. 2018) both take this step. `domain` projects onto the feasible values, which
+    contain the centers, and `length` multiplies the step.
     """
     moved = values - length * scale_gradient(settings, gradient)
     return project(settings, moved, center, domain)
@@ -47,8 +48,8 @@ def take_step(
 def scale_gradient(settings: StepSettings, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
     """Compute the step that gradient descent subtracts from the values.
 
-    The step is the gradient ("raw"), its sign ("sign") or its direction
-    ("unit"), times the step size.
+    The step is the gradient ("raw"), its sign ("sign") or its direction ("unit"), times the step
+    size. A step is zero if its gradient is zero.
     """
     if settings.step == "raw":
         return settings.step_size * gradient
@@ -69,7 +70,11 @@ def project(
     center: Float[Tensor, "A D"],
     domain: Domain = unconstrained,
 ) -> Float[Tensor, "A D"]:
-    """Find the nearest values that are feasible and lie in the norm-ball."""
+    """Find the nearest values that are feasible and lie in the norm-ball.
+
+    A radius of None means no ball. `domain` projects onto the feasible values, which contain the
+    centers.
+    """
     ball = None if settings.radius is None else Ball(center, settings.radius, settings.norm)
     return domain(values, within=ball)
 
@@ -78,9 +83,12 @@ def sample(
     settings: StepSettings,
     center: Float[Tensor, "A D"],
     generator: torch.Generator,
-    used: Float[Tensor, "A D"] | None = None,
+    used: Bool[Tensor, "A D"] | None = None,
 ) -> Float[Tensor, "A D"]:
-    """Draw a vector of values uniformly from the norm-ball around each center."""
+    """Draw a vector of values uniformly from the norm-ball around each center.
+
+    Values outside of the mask `used` are those of the center. None draws all values.
+    """
     if settings.radius is None:
         raise InputError(
             "radius is None, but random values are drawn from the norm-ball: set radius"
@@ -96,7 +104,7 @@ def sample(
 
 
 def _sample_unit_ball(
-    shape: torch.Size, generator: torch.Generator, used: Float[Tensor, "A D"] | None
+    shape: torch.Size, generator: torch.Generator, used: Bool[Tensor, "A D"] | None
 ) -> Float[Tensor, "A D"]:
     """Draw points uniformly from unit balls of the L2 norm."""
     direction = torch.randn(shape, generator=generator)

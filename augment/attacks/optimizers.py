@@ -43,9 +43,10 @@ def descend(
 ) -> DescentResult:
     """Attack examples with the optimizer that the settings choose.
 
-    The examples are attacked in groups of at most `problem.group_size`, so that
-    the gradients fit in memory. The model runs in evaluation mode, and its state
-    is restored afterwards.
+    The examples are attacked in groups of at most `problem.group_size`, so that the gradients fit
+    in memory. The model runs in evaluation mode, and its state is restored afterwards. By default,
+    all examples are attacked, starting at `problem.start`. Restarts are further initial values,
+    tried in turn for the examples that have not succeeded.
     """
     if examples is None:
         examples = torch.arange(len(problem.start), device=problem.start.device)

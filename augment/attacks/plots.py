@@ -28,7 +28,10 @@ def draw_attack(
     classes: Sequence[str],
     true_class: int,
 ) -> Figure:
-    """Draw one view before and after an attack, with the light and the most probable classes."""
+    """Draw one view before and after an attack, with the light and the most probable classes.
+
+    `ball` is a white ball in the light after the attack.
+    """
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     axes_before, axes_light, axes_after, axes_bars = figure.subplots(
         1, 4, width_ratios=[1, 1, 1, 1.2]

@@ -43,8 +43,9 @@ class AttackProblem:
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
     def conditions(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Conditions:
-        """Convert attack values to the light, shapes and colors with which examples are
-        rendered.
+        """Convert attack values of examples to conditions, differentiable in the values.
+
+        What no parameter changes is that of the scene. `examples` are indices in the scene.
         """
         conditions = self.scene.conditions(examples)
         for parameter, parameter_values in self.split_by_parameter(values):
@@ -61,7 +62,11 @@ class AttackProblem:
     def images(
         self, values: Float[Tensor, "E D"], examples: Int[Tensor, " A"] | None = None
     ) -> Float[Tensor, "A V 3 size size"]:
-        """Render the V views of examples without gradients, `group_size` examples at a time."""
+        """Render the V views of examples without gradients, `group_size` examples at a time.
+
+        The values are those of all E examples. `examples` are the indices of those to render, and
+        None renders all.
+        """
         if examples is None:
             examples = self.all_examples
         size = self.scene.settings.size
@@ -113,8 +118,9 @@ class AttackProblem:
     ) -> Float[Tensor, "E D"]:
         """Draw random feasible attack values for all examples.
 
-        A parameter with a radius draws from its norm-ball. A parameter without
-        one draws changes that are as long as those of an attack.
+        A parameter with a radius draws from its norm-ball. A parameter without one draws changes
+        that are as long as those of an attack. `reached` are the values at the end of this attack.
+        They are needed only if a parameter has no radius.
         """
         if reached is None:
             samples = [parameter.sample(generator) for parameter in self.parameters]
@@ -130,7 +136,11 @@ class AttackProblem:
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
-    """Prepare an attack on a scene."""
+    """Prepare an attack on a scene.
+
+    Unless `settings.allow_negative`, negative radiance is first removed from the light of the
+    scene.
+    """
     if not settings.allow_negative:
         scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
     parameters = []

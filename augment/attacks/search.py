@@ -56,10 +56,11 @@ def find_scene(
 ) -> Settings:
     """Search for a scene whose images a classifier recognizes before the attack.
 
-    The search tries several cameras. Each is tried in the light of the scene, in
-    the built-in environments and in uniform light, with several exposures, and
-    also in front of a light gray background. It ends when the classifier gives
-    the true class a probability of at least `CONFIDENCE_TO_STOP` in all images.
+    The search tries several cameras. Each is tried in the light of the scene, in the built-in
+    environments and in uniform light, with several exposures, and also in front of a light gray
+    background. It ends when the classifier gives the true class a probability of at least
+    `CONFIDENCE_TO_STOP` in all images. The given settings are returned if the classifier is right
+    in all their images, or if no other scene is recognized.
     """
     [confidence] = _confidences(build(settings), attack, classifier)
     # `_confidences` returns 0 if an image is misclassified.
@@ -121,7 +122,11 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
 def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """Find the light and the exposure in which a classifier recognizes a scene best."""
+    """Find the light and the exposure in which a classifier recognizes a scene best.
+
+    Return the confidence (the lowest probability of the true class in all images, or 0 if one is
+    misclassified), and the settings that give it.
+    """
     names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
     degree = harmonics_of(scene.basis).degree
     candidates = []
@@ -140,7 +145,10 @@ def _best_light(
 
 
 def _under_lights(scene: Scene, skies: Float[Tensor, "N K 3"]) -> Scene:
-    """Return a scene that repeats all examples in each of several environment lights."""
+    """Return a scene that repeats all examples in each of several environment lights.
+
+    Example n · E + e is example e in light n. Projector and lamps are those of the given scene.
+    """
     count = len(skies)
     # Environment light of each new example, shape (N · E, K, 3).
     environment = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
@@ -161,7 +169,8 @@ def _confidences(
     """Compute how surely a classifier recognizes each group of examples before an attack.
 
     The confidence of an image is the probability of its true class, or 0 if the image is
-    misclassified. The confidence of a group is the lowest one of its images.
+    misclassified. The confidence of a group is the lowest one of its images. Each group has
+    E / groups successive examples.
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)

@@ -30,5 +30,8 @@ class Albedo(MeshParameter):
     def apply(
         self, values: Float[Tensor, "A 3*F"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions with a color offset for each face."""
+        """Return a copy of the conditions with a color offset for each face.
+
+        The values are linear RGB offsets of the F faces of the largest mesh.
+        """
         return replace(conditions, albedo=self.offsets(values, examples))

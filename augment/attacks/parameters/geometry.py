@@ -35,7 +35,10 @@ class Geometry(MeshParameter):
     def apply(
         self, values: Float[Tensor, "A 3*N"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions with displaced vertices."""
+        """Return a copy of the conditions with displaced vertices.
+
+        The values are displacements of the N vertices of the largest mesh in world units.
+        """
         # Vertices before the attack, shape (A, N, 3).
         vertices = self._vertices[self._object_of[examples]]
         return replace(conditions, vertices=vertices + self.offsets(values, examples))

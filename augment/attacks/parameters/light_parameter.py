@@ -59,7 +59,10 @@ class LightParameter(Parameter):
 
 
 def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
-    """Find the environment lighting among the lights of a scene."""
+    """Find the environment lighting among the lights of a scene.
+
+    Return its rows in the coefficients of all lights, and its basis.
+    """
     # `parts_of` returns one pair for each light. The environment comes first.
     lights = parts_of(scene.basis)
     return lights[0]
@@ -68,7 +71,10 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
 def replace_light(
     conditions: Conditions, rows: slice, coefficients: Float[Tensor, "A K 3"]
 ) -> Conditions:
-    """Return a copy of the conditions with other coefficients for one light."""
+    """Return a copy of the conditions with other coefficients for one light.
+
+    `rows` are the rows of this light in the coefficients of all lights.
+    """
     all_lights = conditions.light
     # A scene with a single light needs no concatenation.
     if coefficients.shape[1] == all_lights.shape[1]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -102,7 +102,11 @@ class Material(Parameter):
     def apply(
         self, values: Float[Tensor, "A 4"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions with the given gloss and hue of the objects."""
+        """Return a copy of the conditions with the given gloss and hue of the objects.
+
+        The columns of the values are average roughness, metallic factor and specular factor, and
+        the rotation of the hue, each divided by its unit.
+        """
         if self.used_mask is not None:
             # Values that are not attacked keep their start.
             values = torch.where(self.used_mask[examples], values, self.start[examples])
@@ -131,7 +135,10 @@ class Material(Parameter):
     def _with_hue(
         self, conditions: Conditions, angle: Float[Tensor, "A 1"], objects: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions in which the hue of the objects is rotated."""
+        """Return a copy of the conditions in which the hue of the objects is rotated.
+
+        Angles are in degrees. `objects` has the index of the object of each example.
+        """
         hue = (angle * self._object_mask[objects]).expand(-1, self._face_count)
         albedo_offset = conditions.albedo
         if albedo_offset is None:
@@ -146,6 +153,6 @@ class Material(Parameter):
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
 
 
-def _stack_padded(tensors: list[Tensor]) -> Float[Tensor, "objects _ ..."]:
+def _stack_padded(tensors: list[Tensor]) -> Shaped[Tensor, "objects _ ..."]:
     """Stack tensors of several objects, and append zeros to those of objects with fewer faces."""
     return pad_sequence(tensors, batch_first=True)

@@ -23,7 +23,11 @@ class MeshParameter(Parameter):
     """
 
     def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
-        """Find the values that each example uses."""
+        """Find the values that each example uses.
+
+        A mask for each object marks the vertices or faces that belong to the object itself, not to
+        its props or table.
+        """
         # One row for each object, one column for each of the N vertices or faces of the largest
         # mesh. Rows of smaller meshes end with False.
         masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)
@@ -36,7 +40,10 @@ class MeshParameter(Parameter):
     def offsets(
         self, values: Float[Tensor, "A 3*N"], examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A N 3"]:
-        """Reshape the attack values to one vector for each vertex or face."""
+        """Reshape the attack values to one vector for each vertex or face.
+
+        The vectors of unused vertices or faces are zero.
+        """
         if self.used_mask is not None:
             values = values * self.used_mask[examples]
         return values.unflatten(1, (-1, 3))

@@ -57,14 +57,19 @@ class Parameter(ABC):
     ) -> Conditions:
         """Return a copy of the conditions in which this quantity has the given values.
 
-        Conditions are the light, shape and colors with which examples are
-        rendered.
+        Conditions are the light, shape and colors with which examples are rendered. Other
+        parameters may have changed the given conditions already. `examples` are indices in the
+        scene.
         """
 
     def project_feasible(
         self, values: Float[Tensor, "A D"], within: Ball | None = None
     ) -> Float[Tensor, "A D"]:
-        """Find the nearest feasible values. By default, all values are feasible."""
+        """Find the nearest feasible values. By default, all values are feasible.
+
+        The nearest values are meant in the Euclidean sense, and the centers of `within` are
+        feasible.
+        """
         return unconstrained(values, within)
 
     def take_step(
@@ -74,16 +79,19 @@ class Parameter(ABC):
         examples: Int[Tensor, " A"],
         length: Float[Tensor, "A 1"],
     ) -> Float[Tensor, "A D"]:
-        """Take a step of projected gradient descent."""
+        """Take a step of projected gradient descent.
+
+        `length` multiplies the step of each example.
+        """
         center = self.start[examples]
         return take_step(self.settings, values, gradient, center, self.project_feasible, length)
 
     def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Return how much a search without gradients should change each value at first.
 
-        With the norm "l2", a random change is about as long as the radius. With
-        the norm "linf", it changes each value by about half the radius. Without
-        a radius, `STEPS_OF_SEARCH` times the step size takes its place.
+        With the norm "l2", a random change is about as long as the radius. With the norm "linf", it
+        changes each value by about half the radius. Without a radius, `STEPS_OF_SEARCH` times the
+        step size takes its place. The result is 0 for values that have no effect.
         """
         settings = self.settings
         center = self.start[examples]

@@ -38,5 +38,8 @@ class Pixels(Parameter):
     def apply(
         self, values: Float[Tensor, "A _"], conditions: Conditions, examples: Tensor
     ) -> Conditions:
-        """Return a copy of the conditions with an offset for each pixel value."""
+        """Return a copy of the conditions with an offset for each pixel value.
+
+        The values are in the order (V, 3, size, size) of the images.
+        """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))

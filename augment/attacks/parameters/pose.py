@@ -9,7 +9,7 @@ from itertools import chain
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -105,7 +105,11 @@ class Pose(Parameter):
     def apply(
         self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions with moved objects and cameras."""
+        """Return a copy of the conditions with moved objects and cameras.
+
+        The values are the pose divided by the units of the settings. Vertices that another
+        parameter has displaced are moved, too.
+        """
         objects = self._object_of[examples]
         changes = values * self._unit[objects]
         vertices = conditions.vertices
@@ -127,7 +131,12 @@ class Pose(Parameter):
 
 
 def _pose_units(settings: PoseSettings, item: SceneObject) -> Float[Tensor, " D"]:
-    """Return the units of the attack values of a pose."""
+    """Return the units of the attack values of a pose.
+
+    They are those of the rotation vector in degrees (3), the shift in world units (2), the
+    logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), the logarithm
+    of their distance (1), and a rotation vector in degrees for each attacked joint (3 each).
+    """
     units = [settings.rotation, settings.rotation, settings.rotation]
     units += [settings.shift, settings.shift]
     units += [math.log1p(settings.scale)]
@@ -173,7 +182,7 @@ class _MovableObject:
             skin, or 0 if joints are not attacked.
     """
 
-    object_mask: Float[Tensor, " N"]
+    object_mask: Bool[Tensor, " N"]
     ground_height: float | None
     skin: Skin | None
     rotated_joint_count: int
@@ -181,7 +190,11 @@ class _MovableObject:
     def move(
         self, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
     ) -> Float[Tensor, "N 3"]:
-        """Move the object: rotate its joints, then scale, rotate and shift it."""
+        """Move the object: rotate its joints, then scale, rotate and shift it.
+
+        The change is in degrees, world units and logarithms, in the order of `_pose_units`. Props
+        and table do not move, and the lowest vertex of an object on a ground stays on it.
+        """
         bent = self._bend(vertices, change[JOINTS : JOINTS + 3 * self.rotated_joint_count])
         scaled = change[SCALE].exp() * bent
         rotated = scaled @ rotation_matrices(change[ROTATION]).T
@@ -196,7 +209,10 @@ class _MovableObject:
     def _bend(
         self, vertices: Float[Tensor, "N 3"], joint_rotations: Float[Tensor, " 3*J"]
     ) -> Tensor:
-        """Rotate the J joints, and return all vertices after that, shape (N, 3)."""
+        """Rotate the J joints, and return all vertices after that, shape (N, 3).
+
+        The rotation vectors of the joints are in degrees, one after the other.
+        """
         if self.skin is None or not self.rotated_joint_count:
             return vertices
         # One rotation matrix for each joint, shape (J, 3, 3).
@@ -210,7 +226,11 @@ class _MovableObject:
 
 
 def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
-    """Return the largest rotation of each joint of an object, as an attack permits it."""
+    """Return the largest rotation of each joint of an object, as an attack permits it.
+
+    The limits of each joint of the skin about each axis are in degrees. The list is empty if no
+    joint is attacked.
+    """
     if not settings.joints:
         return []
     if item.mesh.skin is None:

@@ -39,5 +39,8 @@ class Positions(Parameter):
     def apply(
         self, values: Float[Tensor, "A 3*L"], conditions: Conditions, examples: Tensor
     ) -> Conditions:
-        """Return a copy of the conditions with moved lamps."""
+        """Return a copy of the conditions with moved lamps.
+
+        The values are x, y and z of the L lamps in world units.
+        """
         return replace(conditions, positions=values.unflatten(1, (-1, 3)))

@@ -66,7 +66,10 @@ class Skylight(Parameter):
     def apply(
         self, values: Float[Tensor, "A 3"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
-        """Return a copy of the conditions with the sky in place of the environment lighting."""
+        """Return a copy of the conditions with the sky in place of the environment lighting.
+
+        The values are zenith angle, azimuth and turbidity, each divided by its unit.
+        """
         # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
