@@ -214,7 +214,10 @@ def _load_member(
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
-    """Check the arguments `cameras`, `views` and `normalize` of `build_scene`."""
+    """Check the arguments `cameras`, `views` and `normalize` of `build_scene`.
+
+    Return the given cameras without gradients, or an empty list for None.
+    """
     if cameras is None:
         if not normalize:
             raise InputError(
@@ -245,7 +248,11 @@ def _build_lights(
     degree: int | None,
     roughness: float | None = None,
 ) -> tuple[Basis, Tensor]:
-    """Join the environment lighting with the projector and the lamps of the settings."""
+    """Join the environment lighting with the projector and the lamps of the settings.
+
+    A named lighting is loaded with the degree, for a roughness that is None without gloss. Return
+    the basis of all lights and their RGB coefficients.
+    """
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
     local_settings = [getattr(settings, name) for name in LOCAL_LIGHTS]
@@ -254,7 +261,11 @@ def _build_lights(
 
 
 def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
-    """Build a local light, which is a projector or a group of lamps."""
+    """Build a local light, which is a projector or a group of lamps.
+
+    Return its basis and its RGB coefficients: the pixels of the projector or the powers of the
+    lamps.
+    """
     for name, kind in LOCAL_LIGHTS.items():
         if type(settings) is LOCAL_LIGHT_SETTINGS[name]:
             return kind.from_settings(settings)
@@ -262,7 +273,10 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
-    """Load the backgrounds of a scene."""
+    """Load the backgrounds of a scene.
+
+    The shape is (B, 3, size, size), or (B, 1, size, size) if all backgrounds are gray.
+    """
     expected = "a list of gray values in [0, 1] or image files"
     choices = as_list("backgrounds", choices, object, expected)
     if not choices:

@@ -32,9 +32,10 @@ def draw_camera_effects(
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """Draw the effects of a camera and of a projector for the images of each example.
 
-    The linear light of an image is multiplied by a random pattern, as of a
-    projector, and by a random white balance. Then the image is blurred, and
-    noise is added.
+    The linear light of an image is multiplied by a random pattern, as of a projector, and by a
+    random white balance. Then the image is blurred, and noise is added. The returned function takes
+    images of A examples, shape (A, V, 3, size, size), and their indices. `points` are x and y in
+    [-1, 1] of the point of the pattern that each pixel shows. None lets the pattern fill the image.
     """
     # Relative light of the projector at each pixel, shape (count, 3, size, size).
     patterns = draw_patterns(count, image.size, draws, points)
@@ -113,7 +114,7 @@ def _blur(
 ) -> Float[Tensor, "A V 3 size size"]:
     """Blur the images of each example by a Gaussian of its own width.
 
-    The pixels at the border of an image are repeated beyond the border.
+    The pixels at the border of an image are repeated beyond the border. Deviations are in pixels.
     """
     count = len(images)
     size = images.shape[-1]

@@ -87,7 +87,10 @@ def reached_gloss(
     material: MaterialSettings | None = None,
     layer: SpecularLayerSettings | None = None,
 ) -> Smoothest:
-    """Find the smoothest surface that objects have, or get by an attack or a random variation."""
+    """Find the smoothest surface that objects have, or get by an attack or a random variation.
+
+    Surfaces of props count, too. None stands for no attack or no variation.
+    """
     lowest = Smoothest(MATTE, "")
     for item in objects:
         initial_roughness = smallest_roughness(item.mesh)
@@ -102,7 +105,10 @@ def reached_gloss(
 def _reached_roughness(
     item: SceneObject, material: MaterialSettings | None, layer: SpecularLayerSettings | None
 ) -> float:
-    """Compute the lowest roughness that an attack or a random variation can give to an object."""
+    """Compute the lowest roughness that an attack or a random variation can give to an object.
+
+    It is `MATTE` if neither changes the gloss. Props and table do not count.
+    """
     has_specular_layer = layer is not None and any(layer.specular_factor)
     is_attacked = material is not None and any(
         (material.roughness, material.metallic, material.specular_factor)

@@ -75,9 +75,7 @@ class FrozenTransport:
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
 
     def is_near(self, vertices: Float[np.ndarray, "V 3"]) -> bool:
-        """Return whether a shape is so close to the mesh that it has the same shadows and
-        bounces.
-        """
+        """Return whether a shape is so close to the mesh that shadows and bounces are the same."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> None:
@@ -110,7 +108,8 @@ class FrozenTransport:
     ) -> Float[Tensor, "3 P"]:
         """Compute the radiance that shadows and bounces add to a view of a shape.
 
-        It is differentiable in albedo and light.
+        It is differentiable in albedo and light. `add` has been called for the camera, and the
+        shape may differ a little from the mesh. There are S samples in P pixels.
         """
         view = self.views[camera]
         if view is None:
@@ -172,7 +171,10 @@ class DirectRenderer:
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
     def view(self, object_index: int, camera: Camera) -> tuple[Fragments, Tensor]:
-        """Rasterize an object whose vertices have not moved."""
+        """Rasterize an object whose vertices have not moved.
+
+        Return the S samples that the camera sees, and the albedo at the samples, shape (S, 3).
+        """
         key = (object_index, camera)
         view = self._views.get(key)
         if view is None:
@@ -282,7 +284,10 @@ class DirectRenderer:
     def transport_near(
         self, example: int, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
     ) -> FrozenTransport:
-        """Return the shadows and bounces of a shape, or of a kept shape that is close to it."""
+        """Return the shadows and bounces of a shape, or of a kept shape that is close to it.
+
+        One shape is kept for each example, in addition to the unmoved objects.
+        """
         frozen = self._transport_of_object.get(object_index)
         if frozen is None:
             frozen = self._freeze(object_index, self.objects[object_index].mesh)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.scene.objects import SceneObject
@@ -33,7 +33,7 @@ class FaceMaterials:
     """
 
     face_gloss: Float[Tensor, "F 3"]
-    object_mask: Float[Tensor, " F"]
+    object_mask: Bool[Tensor, " F"]
 
     def average(self) -> Tensor:
         """Average roughness, metallic and specular factor over the object's faces, shape (3,)."""

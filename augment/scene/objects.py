@@ -143,14 +143,20 @@ class SceneObject:
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """Load an object and its props (meshes beside it)."""
+    """Load an object and its props (meshes beside it).
+
+    The object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
+    """
     mesh = subdivide(_load(item), vertices)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     return with_props(loaded, [_load_prop(prop) for prop in item.props])
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """Put props, which are meshes that are never attacked, beside an object."""
+    """Put props, which are meshes that are never attacked, beside an object.
+
+    Props stand on the plane z = 0 and are moved to the height of the lowest vertex of the object.
+    """
     offset = np.array([0, 0, item.lowest])
     raised = []
     for prop in props:
@@ -161,7 +167,10 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
 
 
 def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """Put a table under an object and its props."""
+    """Put a table under an object and its props.
+
+    The color is sRGB-encoded. None stands for no table.
+    """
     if color is None:
         return item
     require_color("ground", color)
@@ -181,8 +190,9 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
 
 
 def resample_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Replace a generated solid by another random shape of the same kind, such as another
-    orange.
+    """Replace a generated solid by another random shape of its kind, such as another orange.
+
+    A solid that is named with a seed, such as "solid:orange:3", and other meshes stay as they are.
     """
     kind, *name_and_seed = item.name.split(":")
     if kind != "solid" or len(name_and_seed) != 1:
@@ -196,7 +206,10 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
 
 
 def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObject:
-    """Rotate an object about the origin. Its props and its table do not rotate."""
+    """Rotate an object about the origin. Its props and its table do not rotate.
+
+    They stand at the height of its new lowest vertex.
+    """
     # Select the faces of the object itself, which come first, without those of props and table.
     mesh = select_faces(item.mesh, slice(item.own))
     # Round the vertices to float32, as `normalize` does.
@@ -205,7 +218,7 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
-    """Return a copy of an object with another specular material."""
+    """Return a copy of an object with another specular material. Props and table keep their own."""
     # Select the faces of the object itself, which come first, without those of props and table.
     own_mesh = select_faces(item.mesh, slice(item.own))
     return _with_mesh(item, gloss.on(own_mesh))
@@ -270,7 +283,10 @@ def _load_with_color(item: MeshSettings) -> Mesh:
 
 
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
-    """Generate the mesh of a solid, such as an orange."""
+    """Generate the mesh of a solid, such as an orange.
+
+    The name may end with a seed, as in "orange:3", which is 0 by default.
+    """
     name, _, seed = name_and_seed.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"{mesh_name} has the seed {seed!r}: give a whole number")
@@ -286,6 +302,9 @@ def _has_colors(mesh: Mesh) -> bool:
 
 
 def _as_gloss(values: Sequence[float]) -> Gloss:
-    """Convert the values of the setting `gloss` to a gloss."""
+    """Convert the values of the setting `gloss` to a gloss.
+
+    Their order is roughness, metallic, specular factor. Values at the end may be left out.
+    """
     roughness, *others = [float(value) for value in values]
     return Gloss(roughness, *others)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderer.image import LUMINANCE, decode
@@ -31,30 +31,31 @@ MAX_SATURATION = 3.0
 
 def stripes(
     points: Float[Tensor, "2 ..."], shift: Tensor | float, bright: float = 0.5
-) -> Float[Tensor, " ..."]:
-    """Find the points on the bright parts of vertical stripes with period 1."""
+) -> Bool[Tensor, " ..."]:
+    """Find the points on the bright parts of vertical stripes with period 1.
+
+    Row 0 of the points is x, row 1 is y. `bright` is the bright fraction of a period.
+    """
     is_bright = (points + shift) % 1 < bright
     # Vertical stripes depend on x only, which is row 0.
     return is_bright[0]
 
 
-def checkers(
-    points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]
-) -> Float[Tensor, " ..."]:
+def checkers(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
     """Find the points on the bright squares of a chessboard with period 1."""
     # A square is bright if exactly one of x and y is in the first half of its period.
     is_in_first_half = (points + shift) % 1 < 0.5
     return is_in_first_half.sum(0) == 1
 
 
-def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Float[Tensor, " ..."]:
+def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
     """Find the points in the discs of a square grid with period 1."""
     # Vector from the center of the disc in the same cell to each point, shape (2, ...).
     from_center = (points + shift) % 1 - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
-def half(points: Float[Tensor, "2 ..."], shift: Tensor | float) -> Float[Tensor, " ..."]:
+def half(points: Float[Tensor, "2 ..."], shift: Tensor | float) -> Bool[Tensor, " ..."]:
     """Find the points to the right of the vertical line x = shift - 0.5."""
     is_greater = points > shift - 0.5
     # The line is vertical, so only the coordinate x counts, which is row 0.
@@ -71,7 +72,10 @@ FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, s
 
 
 def pixel_centers(size: int) -> Float[Tensor, "2 1 size size"]:
-    """Return the coordinates of the pixel centers of an image, which spans [-1, 1]."""
+    """Return the coordinates of the pixel centers of an image, which spans [-1, 1].
+
+    Row 0 is x to the right, row 1 is y down. The second axis is for several images.
+    """
     centers = (torch.arange(size) + 0.5) / size * 2 - 1
     return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
 
@@ -79,7 +83,10 @@ def pixel_centers(size: int) -> Float[Tensor, "2 1 size size"]:
 def turned(
     points: Float[Tensor, "2 ..."], cosine: Tensor | float, sine: Tensor | float
 ) -> Float[Tensor, "2 ..."]:
-    """Rotate points about the center of the image."""
+    """Rotate points about the center of the image.
+
+    Positive angles are clockwise, since y points down.
+    """
     x, y = points
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y])
 
@@ -94,7 +101,10 @@ def two_colors(
 
 
 def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
-    """Convert hue and saturation to colors of full brightness (HSV with value 1)."""
+    """Convert hue and saturation to colors of full brightness (HSV with value 1).
+
+    The columns of `draws` are hue and saturation in [0, 1]. Colors are linear RGB.
+    """
     hue, saturation = draws.split(1, dim=1)
     # The sRGB channels of a pure hue are piecewise linear in the hue (HSV, Smith 1978).
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6
@@ -110,7 +120,9 @@ def draw_patterns(
 ) -> Float[Tensor, "count 3 size size"]:
     """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
 
-    Kind, colors, angle, period and position are random.
+    Kind, colors, angle, period and position are random. The result is linear light. `points` has x
+    and y of the point of the pattern that each pixel shows. By default, the pattern fills the
+    image, which spans [-1, 1].
     """
     if points is None:
         points = pixel_centers(size)
@@ -152,7 +164,8 @@ def draw_photograph_patterns(
 ) -> Float[Tensor, "N 3 size size"]:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
-    Beyond its border, a photograph is mirrored.
+    Beyond its border, a photograph is mirrored. Photographs are linear light. `points` has x and y
+    of the point of the pattern that each pixel shows.
     """
     # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
     turn, zoom, relative_saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)

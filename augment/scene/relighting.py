@@ -132,9 +132,7 @@ class Relighting:
             yield Layer(rows, built.operators.pixels, composite)
 
     def _build_missing(self, indices: Iterable[int]) -> None:
-        """Build the stacks of transfer operators with the given indices, if they do not exist
-        yet.
-        """
+        """Build the stacks of transfer operators with the given indices that do not exist yet."""
         missing = [index for index in indices if index not in self._built]
         if not missing:
             return
@@ -156,9 +154,7 @@ class Relighting:
         require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
-        """Build a stack of transfer operators, and the backgrounds of the images that it
-        renders.
-        """
+        """Build a stack of transfer operators, and the backgrounds of its images."""
         first_operator = index * self._operators_per_stack
         end = first_operator + self._operators_per_stack
         views = self._views_of_operators[first_operator:end]

@@ -351,7 +351,8 @@ class Scene:
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:
         """Convert indices of examples to an integer tensor on the device of the lights.
 
-        The range of indices on a GPU is not checked, because the CPU would wait for the GPU.
+        The range of indices on a GPU is not checked, because the CPU would wait for the GPU. A
+        count of None allows any number.
         """
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
@@ -377,6 +378,8 @@ class Scene:
         - If lamps have moved, transfer operators (matrices from light to image) render all other
           light. The light of the lamps is computed for each view and added.
         - If only the light has changed, transfer operators render all of it.
+
+        Image a · V + v of a layer is view v of the example with the index `examples[a]`.
         """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
@@ -391,7 +394,11 @@ class Scene:
     def _relight(
         self, light: Float[Tensor, "A K 3"], examples: Int[Tensor, " A"]
     ) -> Iterator[Layer]:
-        """Render the V views of examples with transfer operators, which map light to images."""
+        """Render the V views of examples with transfer operators, which map light to images.
+
+        The light is multiplied by the exposure already. There is one layer for each stack of
+        operators.
+        """
         views = torch.arange(self.views, device=examples.device)
         # The renderer numbers the views of all examples of the scene, shape (A · V,).
         images = (examples[:, None] * self.views + views).flatten()
@@ -434,7 +441,11 @@ class Scene:
     def _render_directly(
         self, light: Float[Tensor, "A K 3"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Iterator[Layer]:
-        """Render each view of examples by rasterization, without transfer operators."""
+        """Render each view of examples by rasterization, without transfer operators.
+
+        The light, times the exposure, replaces that of the conditions. There is one layer for each
+        of the A · V images.
+        """
         row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             row_and_view = progress(list(row_and_view), "rendering views")

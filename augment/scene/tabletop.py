@@ -82,7 +82,11 @@ class _SeenPoints:
 
 @cache_tensors
 def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
-    """Split light in spherical harmonics into the part above and the part below the horizon."""
+    """Split light in spherical harmonics into the part above and the part below the horizon.
+
+    Return the matrix (K, K) from the coefficients of a light to those of its part above the
+    horizon, and the coefficients (K,) of radiance 1 below the horizon and 0 above.
+    """
     directions = sphere(NODES)
     # Value of each harmonic in each direction, shape (NODES, K).
     values = Harmonics(degree).radiance(directions)
@@ -101,8 +105,10 @@ def above_table(
 ) -> Float[Tensor, "E K 3"]:
     """Compute the light that reaches an object on an infinite table.
 
-    It is the environment light from above, and from below the light that the table reflects.
-    The table reflects the environment light from above and the light of a distant lamp.
+    It is the environment light from above, and from below the light that the table reflects. The
+    table reflects the environment light from above and the light of a distant lamp. `lights` are
+    before the table is added. `lamps` are unit directions towards white lamps of irradiance 1, or
+    zero for no lamp, and the albedo is linear. The result is without the direct light of the lamp.
     """
     harmonics = Harmonics(degree_of(lights[0]))
     upper_part, below_horizon = _split_at_horizon(harmonics.degree)
@@ -127,7 +133,11 @@ def irradiance(
     lamp: Float[Tensor, " 3"],
     lights: Sequence[tuple[LocalBasis, Tensor]] = (),
 ) -> Float[Tensor, "3 size size"]:
-    """Compute an image of the irradiance of a table and a wall, with the shadow of an object."""
+    """Compute an image of the irradiance of a table and a wall, with the shadow of an object.
+
+    The object itself is invisible. `lamp` is the unit direction towards a white lamp of irradiance
+    1, or zero for no lamp. `lights` are local lights with their RGB coefficients.
+    """
     room_axes = _room_axes(camera)
     # Unit normals of the table and the wall in world axes.
     normals = torch.stack([room_axes[2], room_axes[0]])
@@ -180,7 +190,11 @@ def _room_axes(camera: Camera) -> Float[Tensor, "3 3"]:
 def _from_lamp(
     room: Room, seen: _SeenPoints, normals: Float[Tensor, "2 3"], lamp: Float[Tensor, " 3"]
 ) -> Float[Tensor, "S P"]:
-    """Compute the irradiance of points on a table and a wall from a white distant lamp."""
+    """Compute the irradiance of points on a table and a wall from a white distant lamp.
+
+    Row 0 of the normals is that of the table, row 1 that of the wall. The result is 0 in the shadow
+    of the object.
+    """
     # Surface of each point as a row of `normals`: 0 for the table, 1 for the wall, shape (S, P).
     point_to_surface = seen.is_on_wall.long()
     lit = (normals @ lamp).clamp(min=0)[point_to_surface]
@@ -203,7 +217,7 @@ def _from_local_lights(
 ) -> Float[Tensor, "S P 3"]:
     """Compute the irradiance of points on a table and a wall from projector and lamps.
 
-    The object casts shadows.
+    The object casts shadows. There are S points in each of P pixels.
     """
     # One list of all points, shape (S · P, 3).
     points = seen.points.flatten(0, 1)
@@ -229,8 +243,9 @@ def _blocked_sky(
 ) -> Float[Tensor, "P 3"]:
     """Compute how much irradiance an object takes from a table and a wall by blocking the sky.
 
-    From each point, rays are traced in D directions. The radiance of the directions in which a
-    ray hits the object is summed.
+    From each point, rays are traced in D directions. The radiance of the directions in which a ray
+    hits the object is summed. Directions are in world axes, D for points of the table (row 0) and D
+    for points of the wall. `radiance` is the irradiance that each contributes if it is not blocked.
     """
     points = seen.points[0]
     is_on_wall = seen.is_on_wall[0]
@@ -257,9 +272,10 @@ def project_along_light(
 ) -> Float[Tensor, "2 size size"]:
     """Compute which point of a projected pattern each pixel of an image shows.
 
-    A projector far away shines a pattern along parallel rays. A pixel shows a point of the
-    object, the table or the wall. The ray of the projector through this point tells which point
-    of the pattern lights it.
+    A projector far away shines a pattern along parallel rays. A pixel shows a point of the object,
+    the table or the wall. The ray of the projector through this point tells which point of the
+    pattern lights it. The coordinates are 0 on the ray through the origin, and their unit is half
+    of the width that the camera sees. `towards` is the unit vector towards the projector.
     """
     points = _find_shown_points(room, mesh, camera, image)
     # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
@@ -301,8 +317,12 @@ def _find_shown_points(
 
 def _passes_near_origin(
     points: Float[Tensor, "... 3"], directions: Tensor, radius: float
-) -> Float[Tensor, " ..."]:
-    """Find the rays that pass through a sphere around the origin."""
+) -> Bool[Tensor, " ..."]:
+    """Find the rays that pass through a sphere around the origin.
+
+    Starts are outside of the sphere. Directions are one for all rays, shape (3,), or D for each
+    start as columns, shape (3, D).
+    """
     # A ray comes nearest to the origin after the distance -along from its start.
     along = points @ directions
     squared = points.square().sum(-1)
@@ -318,8 +338,10 @@ def _passes_near_origin(
 def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     """Choose directions above a table (normal +z) and in front of a wall (normal +x).
 
-    The density of the D = `DIRECTIONS` directions is proportional to the cosine of the angle to
-    the normal (Malley's method).
+    The density of the D = `DIRECTIONS` directions is proportional to the cosine of the angle to the
+    normal (Malley's method). Return unit directions (2, D, 3), the K harmonics in them (2, D, K),
+    and the irradiance for a coefficient of 1 of each harmonic (2, K). Index 0 is the table, index 1
+    the wall.
     """
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
     # Distribute points evenly over the unit disk, along a spiral (Fibonacci lattice). Malley's
@@ -345,7 +367,10 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sky_in_room_axes(sky: Float[Tensor, "K 3"], azimuth: float) -> Float[Tensor, "K 3"]:
-    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x."""
+    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x.
+
+    The light is in world axes, and the azimuth of that normal in degrees.
+    """
     # The harmonic of band l and order m (from -l to l) has the index l (l + 1) + m. For m > 0,
     # the harmonics of orders m and -m depend on the azimuth φ as cos mφ and sin mφ. A rotation
     # about the vertical mixes only these two.
@@ -360,7 +385,10 @@ def _sky_in_room_axes(sky: Float[Tensor, "K 3"], azimuth: float) -> Float[Tensor
 def _find_seen_points(
     camera: Camera, image: ImageSettings, room: Room, normals: Float[Tensor, "2 3"]
 ) -> _SeenPoints:
-    """Find where the rays of a camera meet a table or a wall, if no object is in the way."""
+    """Find where the rays of a camera meet a table or a wall, if no object is in the way.
+
+    Each of the P = size² pixels has S = samples² rays.
+    """
     right, up = _sample_positions(camera, image)
     # Each ray passes through a point of the plane through the origin that faces the camera. The
     # rows of `axes` point right, up and towards the camera.
@@ -383,7 +411,8 @@ def _find_seen_points(
 def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Tensor]:
     """Compute where the samples of an image lie in the plane through the origin.
 
-    The plane faces the camera.
+    The plane faces the camera. Return the distances to the right and up in world units, each of
+    shape (S, P, 1) for S samples of each of P pixels.
     """
     count = image.size * image.samples
     # Distances of the samples of a row or column from the center of the image, in world units.

@@ -46,7 +46,8 @@ def vary(
 ) -> Scene:
     """Change objects, cameras, lighting and backgrounds of a scene at random.
 
-    All views of one example change in the same way.
+    All views of one example change in the same way. With `once`, the examples are rendered in one
+    lighting only, and directly, without matrices from light to image.
     """
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
@@ -139,7 +140,11 @@ def _draw_cameras(
 def _move_camera(
     camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
 ) -> Camera:
-    """Return a copy of a camera that is zoomed, shifted and turned around the object."""
+    """Return a copy of a camera that is zoomed, shifted and turned around the object.
+
+    The shift is that of the object to the right and up, as fractions of the image width. `scale`
+    enlarges the object. Angles are changes of polar angle and azimuth in degrees.
+    """
     width = camera.width / scale
     right, up = shift
     polar, azimuth = angles
@@ -212,7 +217,7 @@ def _draw_objects(
 def _draw_rotations(
     max_angle: float, count: int, draws: torch.Generator
 ) -> Float[np.ndarray, "count 3 3"]:
-    """Draw rotations about random axes by random angles."""
+    """Draw rotations about random axes by random angles. The largest angle is in degrees."""
     axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
     angles = max_angle * torch.rand(count, 1, generator=draws, dtype=torch.float64)
     # A rotation vector points along the axis, and its length is the angle.
@@ -254,7 +259,8 @@ class _DrawnLights:
     def coefficients(self) -> Float[Tensor, "E _ 3"]:
         """Combine environment, directional light, projector and lamps of each example.
 
-        Directional lights are white, and a surface that faces them has irradiance 1.
+        Directional lights are white, and a surface that faces them has irradiance 1. There are K
+        for the environment, then L for projector and lamps.
         """
         environment = self.environment
         is_directional = self.directions.any(1)
@@ -268,7 +274,10 @@ class _DrawnLights:
     def without_ground(
         self, is_on_table: Bool[Tensor, " E"], albedo: Float[Tensor, "E C size size"]
     ) -> "_DrawnLights":
-        """Return a copy in which the light from below is what a table reflects."""
+        """Return a copy in which the light from below is what a table reflects.
+
+        The table has the mean albedo of the image, which is linear.
+        """
         environment = self.environment.clone()
         environment[is_on_table] = above_table(
             environment[is_on_table],
@@ -323,7 +332,11 @@ def _light_backgrounds(
     draws: torch.Generator,
     is_on_table: Bool[Tensor, " E"],
 ) -> tuple[Tensor, Tensor | None]:
-    """Compute the background images of all examples from their albedo and the random lighting."""
+    """Compute the background images of all examples from their albedo and the random lighting.
+
+    Return the images, and the x and y of the point of a projected pattern that each pixel shows,
+    shape (2, E, size, size), or None without tables.
+    """
     # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
     background_irradiance = albedo.new_ones(3, 1, 1)
     if settings.lit_background:
@@ -400,7 +413,10 @@ def _draw_directional(
 def _draw_background_albedo(
     scene: Scene, settings: VariationSettings, draws: torch.Generator
 ) -> Float[Tensor, "E _ size size"]:
-    """Convert the background of each example to an albedo, and multiply it by a random color."""
+    """Convert the background of each example to an albedo, and multiply it by a random color.
+
+    The values of a background are taken as its albedo. The result is linear.
+    """
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]
     if settings.background_saturation:
@@ -411,7 +427,10 @@ def _draw_background_albedo(
 
 
 def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
-    """Compute the irradiance of a surface that faces the camera, in the environment light."""
+    """Compute the irradiance of a surface that faces the camera, in the environment light.
+
+    It is multiplied by the exposure. The first camera of each example counts.
+    """
     # The normal of the surface points to the camera.
     directions = [example.cameras[0].axes()[2] for example in scene.examples]
     normals = torch.from_numpy(np.stack(directions))
@@ -431,8 +450,10 @@ def _light_rooms(
 ) -> tuple[Tensor, Tensor]:
     """Light a table and a wall in some examples, and find where a projected pattern falls.
 
-    The pattern falls on table, wall and object along the directional light of
-    the example or, if it has none, along the direction of the view.
+    The pattern falls on table, wall and object along the directional light of the example or, if it
+    has none, along the direction of the view. Distances are in world units. Return the irradiance
+    of table and wall in the N examples with a table, shape (N, 3, size, size), and the x and y of
+    the point of the pattern that each pixel of all E examples shows, shape (2, E, size, size).
     """
     room_examples = torch.nonzero(is_on_table).squeeze(1).tolist()
     environments = lights.environment.cpu().double()
