@@ -166,7 +166,10 @@ def load_classifier(
 
 
 def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
-    """Load a classifier by name, without the normalization of light, and without any message."""
+    """Load a classifier by name, without the normalization of light, and without any message.
+
+    `path` is a file of weights. None stands for the weights of the source.
+    """
     source, colon, model = name.partition(":")
     if source + colon in SOURCES:
         arguments: list[Any] = [model, path] if colon else [path]
@@ -200,8 +203,9 @@ def build_classifier(
 ) -> Classifier:
     """Build a classifier with random weights.
 
-    A Python function of the user chooses weights and size itself, and a file
-    contains its weights. These classifiers are loaded as they are.
+    A Python function of the user chooses weights and size itself, and a file contains its weights.
+    These classifiers are loaded as they are. Only the network of a file takes the normalization;
+    all other sources have their own.
     """
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:

@@ -137,7 +137,10 @@ class NetworkCall:
         return f"{reason}: give the size of its images, or use a network that takes such images"
 
     def _require_no_probabilities(self, logits: Float[Tensor, "N C"]) -> None:
-        """Check that the network does not return probabilities instead of logits."""
+        """Check that the network does not return probabilities instead of logits.
+
+        It fails only if all outputs so far look like probabilities.
+        """
         if self.probability_rows is None or not len(logits):
             return
         if not are_probabilities(logits):
@@ -153,7 +156,11 @@ class NetworkCall:
 
 
 def are_probabilities(outputs: Float[Tensor, "N C"]) -> bool:
-    """Return whether outputs of a network are probabilities."""
+    """Return whether outputs of a network are probabilities.
+
+    They are in [0, 1], and each row sums to 1 up to rounding to three decimals. A single class does
+    not count.
+    """
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
     values = outputs.detach()
@@ -384,7 +391,10 @@ def as_images(name: str, images: object) -> Tensor:
 
 
 def require_unit_range(name: str, *extremes: Tensor) -> None:
-    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`."""
+    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`.
+
+    `extremes` are the lowest and the highest value, or nothing without images.
+    """
     if not extremes:
         return
     low, high = torch.stack(extremes).tolist()
@@ -611,7 +621,11 @@ def without_normalized_light(network: Any) -> Any:
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
-    """Return the index of a class."""
+    """Return the index of a class.
+
+    The name may be an index, also as text. `subject` starts the error, which suggests similar
+    names.
+    """
     require_kind("label", name, str | int, "the name of a class, or its index")
     text = composed(str(name))
     names = [*map(composed, classes)]
@@ -651,7 +665,11 @@ def load_python(name: str) -> Classifier:
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
-    """Call a Python function that the user wrote to load a network, and check its result."""
+    """Call a Python function that the user wrote to load a network, and check its result.
+
+    Return the network, the pixels per side of its images, and its classes in the order of the
+    logits. The name is "package.module:function".
+    """
     separator = ":" if ":" in name else "."
     module_name, _, function_name = name.rpartition(separator)
     current_folder = str(Path.cwd())

@@ -71,7 +71,11 @@ def is_network_file(name: str) -> bool:
 
 
 def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = False) -> Classifier:
-    """Load a classifier from a file that contains its network."""
+    """Load a classifier from a file that contains its network.
+
+    Without a size, that of the file counts or, if it tells none, 224. Without a normalization, the
+    network gets images in [0, 1].
+    """
     path = Path(name)
     require_file(path, "give the path of a file that contains a network")
     content = _read(path, trust_code)
@@ -254,7 +258,11 @@ class InBatches(Wrapper):
 
 
 def read_onnx(path: Path) -> Content:
-    """Read a file of ONNX with onnxruntime, on the CPU."""
+    """Read a file of ONNX with onnxruntime, on the CPU.
+
+    The network has no gradients. Its one input is images of float32, and its first output is the
+    logits.
+    """
     try:
         onnxruntime: Any = importlib.import_module("onnxruntime")
     except ImportError as error:

@@ -13,7 +13,10 @@ from augment.distributed import rank
 
 
 def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
-    """Log the size and the normalization of the images of a network, once for each text."""
+    """Log the size and the normalization of the images of a network, once for each text.
+
+    `assumed` are the arguments that neither the user nor the network gave.
+    """
     text = f"network {name}: images of {size} × {size} pixels, "
     text += normalization_of(network) or "values in [0, 1], not normalized before the network"
     if assumed:

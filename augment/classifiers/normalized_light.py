@@ -40,7 +40,10 @@ def normalize_light(
 
 
 def _balance(linear: Float[Tensor, "N 3 H W"], degree: float) -> Float[Tensor, "N 3 1 1"]:
-    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree."""
+    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree.
+
+    With degree 1 all channels get the same mean, and with 0 they stay as they are.
+    """
     channel_means = linear.mean((2, 3), keepdim=True)
     mean = channel_means.mean(1, keepdim=True)
     ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)

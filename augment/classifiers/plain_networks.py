@@ -82,7 +82,10 @@ def as_facts(
     size: int | None = None,
     normalization: Normalization = None,
 ) -> NetworkFacts:
-    """Check the classes, size and normalization that the user gives for a network."""
+    """Check the classes, size and normalization that the user gives for a network.
+
+    Classes may be a text file with a name in each line.
+    """
     if isinstance(classes, str | Path):
         require_file(classes, "give a text file with the name of a class in each line")
         lines = Path(classes).read_text(encoding="utf-8").splitlines()
@@ -97,9 +100,7 @@ def as_facts(
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
-    """Check that the user gives no classes, size or normalization for a network that defines
-    them.
-    """
+    """Check that the user gives no facts about a network that defines them itself."""
     for setting, value in vars(facts).items():
         if value is not None:
             raise InputError(
@@ -126,7 +127,12 @@ def as_classifier(
     normalize_light: NormalizeLight = None,
     dtype: torch.dtype = torch.float32,
 ) -> Classifier:
-    """Make a classifier of a plain network, and check it on gray images."""
+    """Make a classifier of a plain network, and check it on gray images.
+
+    Without a size, that of the network counts or, if it tells none, 224. Classes are "0", "1" and
+    so on by default. Mean and standard deviation are in units of `value_range`, the values of black
+    and white. A `Classifier` only gets `normalize_light`.
+    """
     if isinstance(network, Classifier):
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             raise InputError(
@@ -247,7 +253,10 @@ def _preprocessed(
 
 
 def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and the standard deviation of the channels red, green and blue."""
+    """Return the mean and the standard deviation of the channels red, green and blue.
+
+    None stands for mean 0 and standard deviation 1.
+    """
     if normalization is None:
         return (0.0,) * COLORS, (1.0,) * COLORS
     if normalization == IMAGENET:

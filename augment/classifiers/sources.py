@@ -69,10 +69,10 @@ def load_torchvision(
 ) -> Classifier:
     """Load a classifier of `torchvision.models`.
 
-    torchvision publishes several sets of weights for a model, each with an image
-    size, a mean and a standard deviation. They are taken from the set whose file
-    has the same name as `weights` or, if there is none, from the default set.
-    Values in `facts` take precedence.
+    torchvision publishes several sets of weights for a model, each with an image size, a mean and a
+    standard deviation. They are taken from the set whose file has the same name as `weights` or, if
+    there is none, from the default set. Values in `facts` take precedence. Without a file of
+    weights, the default set is downloaded and kept.
     """
     name = f"torchvision:{model}"
     require_architecture(model)
@@ -101,7 +101,10 @@ def build_torchvision(
     facts: NetworkFacts = NO_FACTS,
     published: "WeightsEnum | None" = None,
 ) -> Classifier:
-    """Build a classifier of `torchvision.models` with random weights."""
+    """Build a classifier of `torchvision.models` with random weights.
+
+    The size is, in this order, the given one, that in `facts` or that of the published weights.
+    """
     from torchvision.models import get_model
 
     published = published or published_weights(model, None)
@@ -141,8 +144,9 @@ def _facts_for_weights(
 ) -> NetworkFacts | None:
     """Return the facts that a file of weights tells: the number of classes, and a fixed size.
 
-    The size follows from the position embeddings of a transformer, one for each
-    patch of the image.
+    The size follows from the position embeddings of a transformer, one for each patch of the image.
+    `last_weight` is the name of the weight of the last layer, which has one row for each class.
+    None is returned if the weights tell nothing or belong to another network.
     """
     if last_weight not in state:  # The weights belong to another network. `fill` refuses them.
         return None
@@ -262,7 +266,10 @@ def build_squeezenet_caffe(size: int | None = None) -> Classifier:
 
 
 def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) -> Classifier:
-    """Load a network of timm."""
+    """Load a network of timm.
+
+    Without a file of weights, the default set with ImageNet's 1,000 classes is downloaded and kept.
+    """
     if weights:
         state = read_weights(weights)
         classifier = build_timm(model, None, facts)
@@ -332,7 +339,10 @@ def _import(package: str, name: str, install: str = "") -> Any:
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """Read the weights of a network without running code from the file."""
+    """Read the weights of a network without running code from the file.
+
+    Return the state dict on the CPU, without the prefixes of `DataParallel` and `torch.compile`.
+    """
     require_file(path, "give the path of a file of weights")
     try:
         if path.suffix == ".safetensors":
@@ -382,7 +392,10 @@ def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
 
 
 def advice_for_pickles(path: Path) -> str | None:
-    """Return advice for a user who gave a file with a whole network as a file of weights."""
+    """Return advice for a user who gave a file with a whole network as a file of weights.
+
+    Its subject is the file. None stands for a file without a network.
+    """
     if is_torchscript(path):
         return (
             "is a TorchScript file, which contains its own network: "
@@ -410,7 +423,10 @@ def is_torchscript(path: Path) -> bool:
 
 
 def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
-    """Load weights into the network of a classifier."""
+    """Load weights into the network of a classifier.
+
+    The classifier, whose `function` is `Normalized`, is changed in place and returned.
+    """
     try:
         _network(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
