@@ -6,7 +6,7 @@ L∞ ball around 0.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from augment.attacks.norm_ball import take_step
@@ -47,9 +47,12 @@ class Best:
         self,
         log_gain: Float[Tensor, "B 3 cells cells"],
         logits: Float[Tensor, "B classes"],
-        source: Float[Tensor, " B"],
+        source: Int[Tensor, " B"],
     ) -> None:
-        """Replace the best factors of each photograph if new ones have a larger logit gap."""
+        """Replace the best factors of each photograph if new ones have a larger logit gap.
+
+        `source` has the predicted classes of the unchanged photographs, and `log_gain` logarithms.
+        """
         gap = logit_gap(logits.detach().float(), source)
         is_better = gap > self.gap
         self.gap = torch.where(is_better, gap, self.gap)
@@ -61,13 +64,13 @@ def search_gain(
     model: nn.Module,
     albedo: Float[Tensor, "B 3 H W"],
     light: ProjectedLight,
-    source: Float[Tensor, " B"],
+    source: Int[Tensor, " B"],
     candidates: list[Tensor],
 ) -> Float[Tensor, "B 3 cells cells"]:
     """Choose the best of several random factors of projected light for each photograph.
 
-    The best factors are those that come closest to a change of the predicted
-    class, or change it most surely.
+    The best factors are those that come closest to a change of the predicted class, or change it
+    most surely. Photographs are linear, and candidates are logarithms, each for all photographs.
     """
     best = Best(candidates[0])
     for log_gain in candidates:
@@ -80,7 +83,7 @@ def descend_gain(
     model: nn.Module,
     albedo: Float[Tensor, "B 3 H W"],
     light: ProjectedLight,
-    source: Float[Tensor, " B"],
+    source: Int[Tensor, " B"],
     start: Float[Tensor, "B 3 cells cells"],
     radius: float,
     steps: int,
@@ -88,9 +91,9 @@ def descend_gain(
 ) -> Float[Tensor, "B 3 cells cells"]:
     """Search for projected light that changes the class of photographs, by gradient descent.
 
-    The light is a slide, which is multiplied by factors. Projected gradient
-    descent changes the factors, so that the probability of the class of the
-    unchanged photograph falls.
+    The light is a slide, which is multiplied by factors. Projected gradient descent changes the
+    factors, so that the probability of the class of the unchanged photograph falls. Photographs are
+    linear, and the factors are logarithms. `best` records the factors before each step.
     """
     if not steps or not radius:
         return start

@@ -279,14 +279,20 @@ class _PhotographAttack:
             self._record(light, unchanged_rows, slide, log_gain)
 
     def _light(self, rows: Int[Tensor, " A"], slide: int) -> ProjectedLight:
-        """Draw the random light of a projector on some photographs."""
+        """Draw the random light of a projector on some photographs.
+
+        `slide` is the index of the picture of the projector among those of each photograph.
+        """
         lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
         return lights.to(self.device)
 
     def _search_randomly(
         self, rows: Int[Tensor, " A"], slide: int
     ) -> Float[Tensor, "A 3 cells cells"]:
-        """Try random factors by which the slides on photographs are multiplied."""
+        """Try random factors by which the slides on photographs are multiplied.
+
+        Return logarithms of those that change the class most surely, or come closest to it.
+        """
         # Give each photograph a generator of its own, so that its factors do not depend on the
         # other photographs.
         generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
@@ -303,8 +309,9 @@ class _PhotographAttack:
         return search_gain(self.model, albedo, light, source, candidates).cpu()
 
     def _descend(self, rows: Int[Tensor, " A"], slide: int) -> Float[Tensor, "A 3 cells cells"]:
-        """Search for factors by which the slides on photographs are multiplied, along the
-        gradient.
+        """Search along the gradient for factors that multiply the slides on photographs.
+
+        Return logarithms of the best factors of all steps.
         """
         albedo = decode(self._load(rows), "srgb")
         light = self._light(rows, slide)
@@ -335,7 +342,10 @@ class _PhotographAttack:
         slide: int,
         log_gain: Float[Tensor, "A 3 cells cells"],
     ) -> None:
-        """Classify photographs in projected light, and record the predictions in the result."""
+        """Classify photographs in projected light, and record the predictions in the result.
+
+        `light` is the key of the results: "slide", "random" or "adversarial".
+        """
         relit = self._light(rows, slide).apply(self._load(rows), log_gain.to(self.device))
         predicted = self.model(relit).argmax(1)
         # Treat each photograph as an example of one view: the second axis has length 1.

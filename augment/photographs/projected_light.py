@@ -74,7 +74,11 @@ class ProjectedLight:
     def light(
         self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
     ) -> Float[Tensor, "B 3 H W"]:
-        """Compute the light that falls on each pixel: slide · gain · shading + ambient."""
+        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
+
+        Logarithms of gains are interpolated linearly between the centers of the cells. None stands
+        for no gain.
+        """
         slide = self.slide
         if log_gain is not None:
             size = slide.shape[-2:]
@@ -88,7 +92,10 @@ class ProjectedLight:
         photographs: Float[Tensor, "B 3 H W"],
         log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
     ) -> Float[Tensor, "B 3 H W"]:
-        """Compute images of photographs in the light of the projector."""
+        """Compute images of photographs in the light of the projector.
+
+        Photographs and images are sRGB, and gains are logarithms.
+        """
         return self.expose(decode(photographs, "srgb"), log_gain)
 
     def expose(
@@ -113,7 +120,10 @@ class ProjectedLight:
 def draw_shading(
     count: int, size: int, draws: torch.Generator
 ) -> Float[Tensor, "count 1 size size"]:
-    """Draw the shading of random smooth surfaces in light from random directions."""
+    """Draw the shading of random smooth surfaces in light from random directions.
+
+    It is the cosine between normal and light, or 0 if the surface faces away.
+    """
     # Three numbers in [0, 1] of each surface, shape (count, 1, 1) each: steepness, azimuth and
     # polar angle of the light, as fractions of their ranges.
     steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
@@ -139,7 +149,10 @@ def draw_projected_light(
     draws: torch.Generator,
     photographs: UInt8[Tensor, "N 3 H W"] | None = None,
 ) -> ProjectedLight:
-    """Draw the random light of a projector: slide, shading, ambient light and exposure."""
+    """Draw the random light of a projector: slide, shading, ambient light and exposure.
+
+    Slides show photographs only if some are given.
+    """
     slide = draw_slides(count, size, draws, photographs)
     shading = draw_shading(count, size, draws)
     # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.

@@ -44,8 +44,8 @@ def draw_slides(
 ) -> Float[Tensor, "count 3 size size"]:
     """Draw random slides, which are pictures that a projector shows.
 
-    A slide has a two-color pattern, Voronoi cells, a smooth field or a
-    photograph.
+    A slide has a two-color pattern, Voronoi cells, a smooth field or a photograph. Slides are
+    linear light on the CPU.
     """
     families: list[Callable[[int, int, torch.Generator], Tensor]]
     families = [draw_patterns, draw_cells, draw_fields]
@@ -66,8 +66,8 @@ def draw_slides(
 def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "count 3 size size"]:
     """Draw pictures of Voronoi cells, each cell in a random color.
 
-    The centers of the cells are random points. A pixel belongs to the cell
-    whose center is nearest.
+    The centers of the cells are random points. A pixel belongs to the cell whose center is nearest.
+    Pictures are linear light.
     """
     cell_counts = torch.randint(MIN_CELLS, MAX_CELLS + 1, (count,), generator=draws)
     # Draw `MAX_CELLS` centers for each picture, and move those that are not needed far away.
@@ -91,7 +91,10 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "
 def draw_fields(
     count: int, size: int, draws: torch.Generator
 ) -> Float[Tensor, "count 3 size size"]:
-    """Draw pictures of smooth random light, which differs between the three channels."""
+    """Draw pictures of smooth random light, which differs between the three channels.
+
+    Pictures are linear light.
+    """
     fields = []
     for _ in range(count):
         node_count = int(torch.randint(MIN_NODES, MAX_NODES + 1, (), generator=draws))
@@ -115,7 +118,7 @@ def draw_projected(
 ) -> Float[Tensor, "count 3 size size"]:
     """Choose photographs, and rotate, scale and saturate them at random.
 
-    Beyond its border, a photograph is mirrored.
+    Beyond its border, a photograph is mirrored. Pictures are linear light on the CPU.
     """
     # Index of the random photograph that each of the pictures shows, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)
