@@ -2,7 +2,7 @@
 
 import torch
 import torch.distributed as dist
-from jaxtyping import Float, Int
+from jaxtyping import Int, Shaped
 from torch import Tensor
 
 
@@ -17,14 +17,21 @@ def rank() -> int:
 
 
 def shard(total: int, rank: int, world_size: int) -> Tensor:
-    """Select the examples that one of several processes works on."""
+    """Select the examples that one of several processes works on.
+
+    Return every `world_size`-th index. With more processes than examples, several processes get the
+    same example.
+    """
     return torch.arange(rank % total, total, world_size)
 
 
 def all_gather_rows(
-    part: Float[Tensor, "A ..."], examples: Int[Tensor, " A"], total: int, world_size: int
-) -> Float[Tensor, "total ..."]:
-    """Collect the results for all examples from all processes."""
+    part: Shaped[Tensor, "A ..."], examples: Int[Tensor, " A"], total: int, world_size: int
+) -> Shaped[Tensor, "total ..."]:
+    """Collect the results for all examples from all processes.
+
+    `examples` has the index of each row of this process. Every process gets the same result.
+    """
     if world_size == 1:
         return part
     # Make a list with an entry for each process. `all_gather_object` replaces entry i by what

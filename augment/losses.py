@@ -31,7 +31,9 @@ def adversarial_cost(
 
     It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy. Without a target,
     the cost and its gradient round to 0 if the log-odds o of the source are large. Where they
-    exceed 50, o − 50 is therefore added.
+    exceed 50, o − 50 is therefore added. The attack lowers the probability of the source class and
+    raises that of the target class. `NO_CLASS` omits a term of an image, and a target of None omits
+    it for all images.
     """
     # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
     require_known(source.clamp(min=0), logits)
@@ -65,14 +67,15 @@ def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ...
 
 def logit_gap(
     logits: Float[Tensor, "... classes"],
-    source: Float[Tensor, " ..."],
-    target: Float[Tensor, " ..."] | None = None,
+    source: Int[Tensor, " ..."],
+    target: Int[Tensor, " ..."] | None = None,
 ) -> Float[Tensor, " ..."]:
     """Compute by how much logits reach the aim of an attack.
 
     With a target class, the logit gap is the logit of the target minus the largest other logit.
     Without one, it is the largest logit of the other classes minus the logit of the source class.
-    It is positive if the attack succeeds, and negative if it does not.
+    It is positive if the attack succeeds, and negative if it does not. A target of `NO_CLASS`
+    stands for no target of an image, and None for none of all images.
     """
     if target is None:
         target = torch.full_like(source, NO_CLASS)
@@ -86,12 +89,12 @@ def logit_gap(
 
 
 def complementary_label(label: int) -> int:
-    """Return the complementary label of a class."""
+    """Return the complementary label of a class. It says that images do not show the class."""
     return -1 - label
 
 
 def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "N classes"]) -> None:
-    """Check that every label has a logit."""
+    """Check that every label has a logit. Labels may be complementary."""
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
 
@@ -135,9 +138,10 @@ def ranking_loss(
 ) -> Tensor:
     """Compute the pairwise ranking loss of a class (RankNet, Burges et al. 2005).
 
-    It is low if the images of the class have higher log-odds than all other images. It is the
-    mean of log(1 + exp(n − p)) over all pairs of an image of the class, with log-odds p, and an
-    image of another class, with log-odds n. Up to a factor, it is a smooth upper bound of 1 − AUC.
+    It is low if the images of the class have higher log-odds than all other images. It is the mean
+    of log(1 + exp(n − p)) over all pairs of an image of the class, with log-odds p, and an image of
+    another class, with log-odds n. Up to a factor, it is a smooth upper bound of 1 − AUC. Labels
+    are classes, and the loss is 0 if there is no pair.
     """
     odds = log_odds(logits, label)
     is_of_class = labels == label

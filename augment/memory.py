@@ -27,7 +27,8 @@ def attack_bytes(
 ) -> int:
     """Estimate the memory that an attack on the light of a scene takes.
 
-    The linear operators from light to image are not counted.
+    The linear operators from light to image are not counted. `pixels_at_once` counts the pixels of
+    images that are rendered at the same time.
     """
     per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
     if camera_effects:

@@ -26,7 +26,11 @@ class BatchSize:
     images: int
 
     def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
-        """Call a function for one batch of images after the other."""
+        """Call a function for one batch of images after the other.
+
+        The function takes the slice of the images of a batch. If memory runs out, it is called
+        again with half of it.
+        """
         begin = 0
         while begin < total:
             part = slice(begin, begin + self.images)
@@ -55,9 +59,7 @@ def warn_once(images: int) -> None:
 
 @contextmanager
 def eval_mode(model: nn.Module) -> Iterator[None]:
-    """Set a model to eval mode in a `with` block, and restore the mode of each module
-    afterwards.
-    """
+    """Set a model to eval mode in a `with` block, and then restore the mode of each module."""
     training = [module for module in model.modules() if module.training]
     # `eval` of a large network takes as long as rendering an image, so call it only if needed.
     if training:

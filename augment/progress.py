@@ -25,10 +25,10 @@ def progress(
 ) -> Iterator[Item]:
     """Yield items, and show on a terminal how many of them are done.
 
-    A bar appears on the standard error stream after `PATIENCE` seconds, even if
-    no item is done by then, and is removed at the end. Nothing is written if the
-    stream is a file or a pipe. If there are several processes, only the first
-    one shows the bar.
+    A bar appears on the standard error stream after `PATIENCE` seconds, even if no item is done by
+    then, and is removed at the end. Nothing is written if the stream is a file or a pipe. If there
+    are several processes, only the first one shows the bar. `done` items were done before, and
+    `total` is needed only if `items` has no length.
     """
     is_shown = sys.stderr.isatty() and rank() == 0
     bar = tqdm(

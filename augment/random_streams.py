@@ -7,7 +7,11 @@ import torch
 
 
 def stream_seed(*key: int | str) -> int:
-    """Compute the seed of a sequence of random numbers from a key."""
+    """Compute the seed of a sequence of random numbers from a key.
+
+    A key tells what the numbers are for, such as the seed of a run, an epoch and "order". Different
+    keys give independent numbers.
+    """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)
     return int(state[0] >> 1)

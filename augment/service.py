@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
@@ -372,8 +372,9 @@ class AugmentationService:
     ) -> Renders:
         """Select the next images of a folder in place of renders, and classify some of them.
 
-        The images are shown in passes through the folder, each in another random order. A
-        selection may begin in one pass and end in another.
+        The images are shown in passes through the folder, each in another random order. A selection
+        may begin in one pass and end in another. `number` tells how many selections were made
+        before.
         """
         image_count = len(images)
         # Imagine all passes one after the other. These are the positions of the first and the
@@ -394,7 +395,7 @@ class AugmentationService:
         return Renders(selected, labels, diagnostics)
 
     def _random(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Int[Tensor, " A"]
     ) -> Renders:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
@@ -405,9 +406,13 @@ class AugmentationService:
         return Renders(images, self.labels, diagnostics, examples)
 
     def _classify(
-        self, model: nn.Module, images: Float[Tensor, "E 3 H W"], labels: Float[Tensor, " E"]
+        self, model: nn.Module, images: Float[Tensor, "E 3 H W"], labels: Int[Tensor, " E"]
     ) -> tuple[Tensor, dict[str, float]]:
-        """Classify up to `CLASSIFIED` of the images, evenly spaced, to estimate the error rate."""
+        """Classify up to `CLASSIFIED` of the images, evenly spaced, to estimate the error rate.
+
+        Return the mask of the images known to be misclassified, and the diagnostics
+        "attack_success" (their fraction) and "loss" (the mean).
+        """
         count = min(CLASSIFIED, len(labels))
         rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
         with frozen_eval_mode(model), self.phases("attack_classifier"):
@@ -422,7 +427,7 @@ class AugmentationService:
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
     def _adversarial(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Int[Tensor, " A"]
     ) -> Renders:
         """Attack all examples."""
         attack = self.settings.attack
@@ -480,9 +485,12 @@ class AugmentationService:
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(
-        self, part: Float[Tensor, "A ..."], shard: Int[Tensor, " A"]
-    ) -> Float[Tensor, "E ..."]:
-        """Collect what all processes have computed, each for some of the E examples."""
+        self, part: Shaped[Tensor, "A ..."], shard: Int[Tensor, " A"]
+    ) -> Shaped[Tensor, "E ..."]:
+        """Collect what all processes have computed, each for some of the E examples.
+
+        `shard` has the index of each of this process's examples among all E.
+        """
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
@@ -507,9 +515,9 @@ class AugmentationService:
     def _attack_start(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
         """Return the attack values at which the next attack starts.
 
-        With `warm_start`, they are the values at which the previous attack ended, projected to
-        the norm-balls, whose centers may have moved. With `init="random"`, they are random.
-        Otherwise they are those of the scene.
+        With `warm_start`, they are the values at which the previous attack ended, projected to the
+        norm-balls, whose centers may have moved. With `init="random"`, they are random. Otherwise
+        they are those of the scene. `number` tells how often the renders were made before.
         """
         if self._last_values is not None:
             return problem.project(self._last_values, problem.all_examples)
@@ -518,7 +526,7 @@ class AugmentationService:
         return problem.start
 
     def _random_values(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
-        """Draw random values of all attacked parameters."""
+        """Draw random values of all attacked parameters. `number` selects the random numbers."""
         settings = self.settings.random_light
         parts = []
         for parameter, start in problem.split_by_parameter(problem.start):
@@ -586,12 +594,12 @@ def select_examples_to_log(
     problem: AttackProblem,
     values: Float[Tensor, "E D"],
     success: Bool[Tensor, " E"],
-    labels: Float[Tensor, " E"],
+    labels: Int[Tensor, " E"],
 ) -> AttackExamples:
     """Select a few successfully attacked examples for a figure, and render and classify them.
 
-    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful
-    examples.
+    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful examples. The state of
+    the network is restored afterwards.
     """
     successful = torch.nonzero(success).squeeze(1)
     count = min(SHOWN_EXAMPLES, len(successful))
@@ -620,7 +628,11 @@ def select_examples_to_log(
 
 
 def _changes(problem: AttackProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
-    """Compute by how much an attack changed the light, the vertices and other conditions."""
+    """Compute by how much an attack changed the light, the vertices and other conditions.
+
+    A diagnostic such as "light_change" is the L2 norm of the change, averaged over the examples.
+    Unchanged conditions are left out.
+    """
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}

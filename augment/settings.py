@@ -675,7 +675,7 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
     """Compute the number of views of each mesh from the number of renders.
 
     The number of renders is meshes × views × backgrounds. For example, 2 meshes, 10 views and 5
-    backgrounds give 100 renders.
+    backgrounds give 100 renders. None stands for a number that follows from the other.
     """
     if not objects or not backgrounds:
         raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
@@ -730,7 +730,10 @@ NormalizeLight = bool | Mapping[str, Any] | NormalizedLightSettings | None
 
 
 def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | None:
-    """Convert a value of the argument `normalize_light` to settings."""
+    """Convert a value of the argument `normalize_light` to settings.
+
+    True stands for the defaults. False and None give None.
+    """
     if value is None or value is False:
         return None
     if value is True:
