@@ -1186,7 +1186,7 @@ class _Block(NamedTuple):
     """
 
     samples: slice
-    sample_to_pixel: Float[Tensor, " S"]
+    sample_to_pixel: Int[Tensor, " S"]
     transfer: Float[Tensor, "C K B"]
 
     def sum_by_pixel(self, rows: Float[Tensor, "S K"]) -> Float[Tensor, "K B"]:

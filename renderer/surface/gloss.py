@@ -185,6 +185,7 @@ class SampleGloss(NamedTuple):
         light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, the values
         of `renderer.surface.lobes.lobe_functions`. The first lobe is multiplied by the
         albedo, and None if no sample is metallic. The second has the color of the light.
+        The cosine is that between the normal and the direction to the camera.
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
         dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
@@ -217,7 +218,8 @@ class SampleGloss(NamedTuple):
         The coat is a transparent layer on a diffuse layer. The fraction is
         1 - s E(μ). E(μ) is the fraction that a coat with the specular factor s = 1
         reflects (`coat_albedo`). The result is differentiable with respect to the
-        cosine and to the gloss. Negative cosines count as 0.
+        cosine and to the gloss. Negative cosines μ, between the normal
+        and the beam, count as 0.
         """
         return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
@@ -250,7 +252,7 @@ class SampleGloss(NamedTuple):
         the metallic fraction m and the specular factor s. E is the fraction of
         light that the coat reflects (`coat_albedo`), and E_avg its mean
         (`coat_mean`). The result is differentiable with respect to the vectors and
-        the gloss.
+        the gloss. n is the normal, and v leads to the camera.
         """
         transmittance = self.coat_transmittance((normals * toward).sum(1))
         mean_transmittance = 1 - self.specular_factor * coat_mean(self.roughness)

@@ -394,7 +394,7 @@ def lobe_functions(
 
     The result is differentiable with respect to both tensors. The roughness is in
     [MIN_ROUGHNESS, 1]. The M functions with 0 ≤ m ≤ l are in ascending order of l and then
-    of m.
+    of m. The cosine is n·v = cos θ, between the normal and the direction to the camera.
     """
     function_count = (degree + 1) * (degree + 2) // 2
     table = _table_like(max(degree, COMMON_DEGREE), cosine.dtype, cosine.device)
