@@ -51,7 +51,8 @@ def nearest_in_box(
 ) -> Float[Tensor, "N ..."]:
     """Project each row of values onto a box, or onto the intersection of a box and a norm-ball.
 
-    The projection is the nearest point with respect to the Euclidean distance.
+    The projection is the nearest point with respect to the Euclidean distance. Centers of
+    `within` must lie in the box. None uses the box alone.
     """
     if within is None:
         return values.clamp(low, high)
@@ -101,5 +102,8 @@ def _nearest_in_box_and_sphere(
 
 
 def _squared_norm(offsets: Float[Tensor, "N ..."]) -> Tensor:
-    """Compute the squared L2 norm of each row of a batch."""
+    """Compute the squared L2 norm of each row of a batch.
+
+    All axes but the first one have size 1, so that the result broadcasts.
+    """
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

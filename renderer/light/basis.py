@@ -171,7 +171,10 @@ class Harmonics(Basis):
         return nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
-        """Compute the irradiance of N surfaces from each harmonic that changes it."""
+        """Compute the irradiance of N surfaces from each harmonic that changes it.
+
+        Column k is for a coefficient of 1 of the harmonic `nonzero[k]`.
+        """
         require_finite(normals=normals)
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
         values = evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
@@ -204,7 +207,8 @@ class Harmonics(Basis):
         """Replace lights by the nearest lights without negative radiance.
 
         The distance between lights is the Euclidean distance of their
-        coefficients. The mean radiance may change.
+        coefficients. The mean radiance may change. With `within`, one ball for each light,
+        centers must have no negative radiance.
         """
         from renderer.light.nonnegative import nearest_nonnegative
 
@@ -405,7 +409,7 @@ class SumBasis(Basis):
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
     def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
-        """Iterate over the bases in `parts`, with the slices of their coefficients."""
+        """Iterate over the bases in `parts`, each after the slice of its coefficients."""
         first = 0
         for part in self.parts:
             yield slice(first, first + part.size), part
@@ -457,7 +461,10 @@ def split_light(basis: Basis, coefficients: Float[Tensor, "size 3"]) -> SplitLig
 def with_local_lights(
     sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
 ) -> tuple[Basis, Tensor]:
-    """Combine environment light and local lights to one basis with its coefficients."""
+    """Combine environment light and local lights to one basis with its coefficients.
+
+    The environment light comes first.
+    """
     harmonics = Harmonics(degree_of(sky))
     if not lights:
         return harmonics, sky

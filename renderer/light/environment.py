@@ -63,7 +63,8 @@ def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ 3"]:
     The radiance may be negative, because a sum of few harmonics oscillates around
     bright places. `harmonics.project` computes the coefficients from the map
     again. At degree 6, the L2 norm of its error is at most 22.2 / height² times
-    the norm of the coefficients (3.4e-4 at a height of 256).
+    the norm of the coefficients (3.4e-4 at a height of 256). The map has twice as many
+    columns as rows.
     """
     directions, _ = equirectangular(height, 2 * height)
     return light_radiance(coefficients, directions)
@@ -72,7 +73,7 @@ def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ 3"]:
 def light_radiance(
     coefficients: Tensor, directions: Float[Tensor, "... 3"]
 ) -> Float[Tensor, "... 3"]:
-    """Compute the radiance of environment light that arrives from given directions."""
+    """Compute the radiance of environment light from directions (toward the light, any length)."""
     degree = math.isqrt(len(coefficients)) - 1
     blocks = directions.flatten(0, -2).split(BLOCK)
     radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
@@ -83,7 +84,7 @@ def negative_fraction(radiance: Float[Tensor, "H W 3"]) -> float:
     """Compute which fraction of the light of an environment map is negative.
 
     This is the integral of max(-radiance, 0) over the sphere and the channels,
-    divided by the integral of |radiance|.
+    divided by the integral of |radiance|. A black map has 0.
     """
     _, solid_angles = equirectangular(*radiance.shape[:2])
     power = radiance * solid_angles[..., None]
@@ -101,7 +102,8 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     an .hdr file are divided out. An alpha channel is dropped. A single gray
     channel is used for red, green and blue. If an .exr file has layers, the layer
     without a name is read. If all layers have names, the first layer with red,
-    green and blue is read.
+    green and blue is read. Radiance that is NaN, infinite or above 1e12 raises
+    `InputError`. (The sun has 1.6e9 cd/m².)
     """
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
@@ -126,7 +128,12 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
 
 
 def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
-    """Read an environment map that covers the whole sphere and has no negative radiance."""
+    """Read an environment map that covers the whole sphere and has no negative radiance.
+
+    Negative radiance becomes 0 if its magnitude is at most `NEGATIVE` times the largest
+    radiance. A map with more, with fewer than `FEWEST_ROWS` rows, or not about twice as
+    wide as high raises `InputError`.
+    """
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
@@ -185,7 +192,7 @@ def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
-    """Read an environment map from an .npy file."""
+    """Read the texels of an environment map and the names of its channels from an .npy file."""
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
@@ -197,7 +204,12 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:
-    """Read an environment map from an .hdr or .exr file."""
+    """Read an environment map from an .hdr or .exr file.
+
+    The results are the texels, the names of the channels, and the chromaticities of red,
+    green, blue and white, 8 numbers. A cropped, mirrored or rotated image raises
+    `InputError`.
+    """
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
     if not image.read():
@@ -228,7 +240,9 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
 
     The manual of Radiance (File Formats, "Picture Files") says that EXPOSURE and
     COLORCORR are cumulative factors of the pixels. Indented lines are of other
-    pictures. Without PRIMARIES, maps of others than Radiance are Rec. 709.
+    pictures. Without PRIMARIES, maps of others than Radiance are Rec. 709. The results are
+    factors of red, green and blue, and the chromaticities of red, green, blue and white, 8
+    numbers.
     """
     factors = np.ones(3)
     chromaticities: Sequence[float] = REC_709
@@ -251,8 +265,10 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
 
 
 def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[float]) -> np.ndarray:
-    """Convert radiance of any primaries to Rec. 709. A negative channel that this makes becomes
-    0.
+    """Convert radiance of any primaries to Rec. 709.
+
+    A negative channel that this makes becomes 0. Chromaticities are CIE x and y
+    of red, green, blue and white.
     """
     matrix = to_rec709(chromaticities, adapt=False)
     if matrix is None:
@@ -286,7 +302,10 @@ def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Find the red, green and blue channel of an image by the names of its channels."""
+    """Find the red, green and blue channel of an image by the names of its channels.
+
+    Names are "CHANNEL" or "LAYER.CHANNEL". A gray image has three equal indices.
+    """
     layers = []
     channels = []
     for name in names:

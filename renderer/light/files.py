@@ -89,7 +89,11 @@ def save_light(
 
 
 def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, Tensor]:
-    """Read a light from a .json file."""
+    """Read a light from a .json file.
+
+    A plain list of rows [r, g, b] holds SH coefficients. `kinds` are accepted classes, such
+    as `Lamps`.
+    """
     path = Path(path)
     require_file(path, "give the path of a .json file of coefficients")
     kind_of_name = {kind.name: kind for kind in kinds}

@@ -46,6 +46,8 @@ def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal. It multiplies the coefficients of degree l of the light by
     an amplitude. All degrees with a larger amplitude than `amplitude` are needed.
+    `amplitude` is a fraction of the amplitude of degree 0, and the result is at most
+    MAX_DEGREE.
     """
     amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
     # The amplitudes fall with the degree. If n degrees from 1 on exceed the limit, these
@@ -63,7 +65,7 @@ def window_without_ringing(
     factor for each coefficient that prevents this. The function tries no window,
     then the window for a highlight of the surface, and then the window for a
     highlight that is narrower by the factor NARROWER. It returns the first of
-    these with which the narrower highlight is negative nowhere.
+    these with which the narrower highlight is negative nowhere. The first factor is 1.
     """
     degree = math.isqrt(len(coefficients)) - 1
     # The square root, because the width of a highlight is α = roughness².
@@ -87,7 +89,8 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
 
     The factors (a window) change the highlight and the irradiance of a point
     light as little as possible. An error of the irradiance has IRRADIANCE_WEIGHT
-    times the weight of an error of the highlight.
+    times the weight of an error of the highlight. `width` is a factor for the width
+    α = roughness² of the highlight. The first factor is 1.
     """
     highlight = _amplitudes(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
     # The first harmonic of degree l has the index l².
@@ -105,7 +108,8 @@ def highlight_error(degree: int, roughness: float) -> float:
     The SH coefficients of the point light are cut off at a degree and multiplied
     by `highlight_window` for a highlight that is narrower by the factor NARROWER.
     The highlight is the specular lobe of a metal for a camera that looks along
-    the surface normal.
+    the surface normal. The error is the root mean square over all directions, as a fraction
+    of that of the highlight.
     """
     amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
     window = highlight_window(degree, roughness, NARROWER)
@@ -124,7 +128,8 @@ def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degree+1"]
 
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal. The lobe is symmetric about the normal, so the factor of
-    degree l is the integral of the lobe times the Legendre polynomial P_l.
+    degree l is the integral of the lobe times the Legendre polynomial P_l. Factors are
+    divided by that of degree 0, and at least MIN_AMPLITUDE.
     """
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     node_count = 2**9 + 4 * degree

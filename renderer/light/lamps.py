@@ -198,7 +198,7 @@ class Lamps(LocalBasis):
 
         There are several sets of points. The points of a set represent equal areas
         of the disc. They lie on Vogel's spiral (1979), which is rotated by another
-        angle in each set.
+        angle in each set. Positions and points are in world axes.
         """
         # Both index tensors have one row for each set and one column for each point.
         set_index, point_index = torch.meshgrid(
@@ -226,7 +226,11 @@ class Lamps(LocalBasis):
         normals: Float[Tensor, "... 3"],
         positions: Float[Tensor, "... 3"],
     ) -> Float[Tensor, " ..."]:
-        """Compute the irradiance of surface points from lamps with a coefficient of 1."""
+        """Compute the irradiance of surface points from lamps with a coefficient of 1.
+
+        It is 0 or negative if the surface faces away from the lamp, or if the point is
+        behind a disc.
+        """
         squared_distance = to_lamp.square().sum(-1)
         irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:
@@ -246,7 +250,7 @@ class Lamps(LocalBasis):
     def _mitsuba_disc(
         self, position: tuple[float, float, float], intensity: list[float]
     ) -> dict[str, Any]:
-        """Create the Mitsuba entry of a disc lamp."""
+        """Create the Mitsuba entry of a disc lamp with a radiant intensity along its axis."""
         x, y, z = position
         polar = math.degrees(math.atan2(math.hypot(x, y), z))
         azimuth = math.degrees(math.atan2(y, x))

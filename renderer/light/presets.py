@@ -146,7 +146,8 @@ def load_light(
 def probe(name: str) -> Float[Tensor, "49 3"]:
     """Return a published light probe, the measured light of a real place.
 
-    The published coefficients have y up and are rotated to z up.
+    The published coefficients have y up and are rotated to z up. Coefficients of degree 3
+    to 6 are 0.
     """
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
     coefficients = torch.zeros(COEFFICIENTS, 3)
@@ -172,7 +173,8 @@ def directional(
     """Approximate parallel light from one direction by spherical harmonics.
 
     At degree 6, the error of the irradiance is at most 0.043 times the irradiance
-    of a surface that faces the light.
+    of a surface that faces the light. Directions lead toward the light, and `color` is the
+    linear irradiance of a surface that faces it.
     """
     require_bounded(color=color)
     return basis(direction, degree)[..., None] * color
@@ -188,7 +190,9 @@ def perturb(
     """Draw random lights around a light.
 
     A uniform random number in [-amplitude, amplitude] is added to each
-    coefficient, as in the random mode of the paper (amplitude 0.5).
+    coefficient, as in the random mode of the paper (amplitude 0.5). With `radius`, the L2
+    norm to which a change is scaled, only coefficients that change the irradiance of a
+    diffuse surface are changed. None changes all and does not scale.
     """
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
@@ -203,13 +207,20 @@ def perturb(
 
 
 def mean_luminance(coefficients: Float[Tensor, "K 3"]) -> float:
-    """Compute √(4π) times the mean luminance of a light over all directions."""
+    """Compute √(4π) times the mean luminance of a light over all directions.
+
+    Only the first row counts.
+    """
     weights = torch.tensor(LUMINANCE, dtype=torch.float64)
     return float(coefficients[0].cpu().double() @ weights)
 
 
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
-    """Read an environment map, and scale it to the mean luminance of the grace probe."""
+    """Read an environment map, and scale it to the mean luminance of the grace probe.
+
+    `roughness` is that of the smoothest surface, whose highlights must not get dark rings,
+    or None.
+    """
     coefficients = project(read_panorama(path), degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]

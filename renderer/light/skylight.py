@@ -102,7 +102,11 @@ class _FittedSky(torch.autograd.Function):
     def forward(
         ctx: Any, zenith: Float[Tensor, " ..."], azimuth: Tensor, turbidity: Tensor, fit: Tensor
     ) -> Float[Tensor, "... 49 3"]:
-        """Compute the SH coefficients of the sky, and save their derivatives in `ctx`."""
+        """Compute the SH coefficients of the sky, and save their derivatives in `ctx`.
+
+        Angles are in radians. `fit` has the polynomials of the zenith angle (axis 0) and of
+        1 / turbidity (axis 1).
+        """
         # The zenith angle from 0 to π/2 is mapped to the domain [-1, 1] of the polynomials.
         zenith_values, zenith_slopes = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
         # 1 / turbidity from 1/10 to 1/2 is mapped to the domain [-1, 1], too.
@@ -142,7 +146,9 @@ def _library_fit() -> Tensor:
     """Load the polynomials of the sky that come with the library.
 
     Each SH coefficient of a sky with the sun at azimuth 0 is a sum of products of
-    two Chebyshev polynomials, one of the zenith angle and one of 1 / turbidity.
+    two Chebyshev polynomials, one of the zenith angle and one of 1 / turbidity. The axes
+    are: polynomial of the zenith angle, polynomial of 1 / turbidity, 28 SH coefficients
+    with order m ≥ 0, color.
     """
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 
@@ -154,7 +160,8 @@ def _as_parameters(
 
     The tensors get the dtype and the device of the first floating-point tensor
     among turbidity, zenith and azimuth. Without such a tensor, they are float64.
-    Angles are converted to radians before they are rounded to this dtype.
+    Angles are converted to radians before they are rounded to this dtype. Angles are given
+    in degrees. The results are in the order of the arguments.
     """
     value_by_name = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
     for name, value in value_by_name.items():
@@ -199,7 +206,11 @@ def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], exp
 def _chebyshev(
     x: Float[Tensor, " ..."], slope: Tensor | float, count: int
 ) -> tuple[Tensor, Tensor]:
-    """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p."""
+    """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p.
+
+    `slope` is the derivative of x with respect to p. Axis -1 of the results is for T_0 to
+    T_(count - 1).
+    """
     # The recurrence is T_(k + 1) = 2 x T_k - T_(k - 1). Its derivative follows from the
     # product rule.
     values = [torch.ones_like(x), x]
