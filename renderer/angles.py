@@ -13,7 +13,11 @@ ANGLES = ("polar", "azimuth", "fov")
 
 
 def angles_in_degrees(description: Mapping[str, Any], unit: str | None) -> dict[str, Any]:
-    """Convert the angles of a camera or of a projector from a file to degrees."""
+    """Convert the angles of a camera or of a projector from a file to degrees.
+
+    The angles are "polar", "azimuth" and "fov". `unit` is "degrees", or None for files of
+    earlier versions, whose angles are in radians.
+    """
     converted = dict(description)
     if unit == DEGREES:
         return converted

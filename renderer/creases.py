@@ -38,7 +38,9 @@ def normal_groups(
 
     A group whose face normals cancel would have no normal. It is divided at the
     creases, and if that does not help, into its corners. So the two sides of a leaf
-    with the same vertices are always in different groups.
+    with the same vertices are always in different groups. Normals from a file that are zero
+    or NaN are ignored, and `crease` is in degrees. The result is the index of the group of
+    each corner.
     """
     faces = faces.astype(np.int64, copy=False)
     # Positions may be NaN or infinite here. Renders refuse them later.

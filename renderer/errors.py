@@ -92,7 +92,7 @@ class InputError(ValueError):
 
 
 def single_line(error: Exception) -> str:
-    """Return the message of an error in one line."""
+    """Return the message of an error in one line, or the name of its class if it has none."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -142,7 +142,7 @@ def require_file(path: str | Path, advice: str) -> None:
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """Check that a number lies in a range."""
+    """Check that a number, if it is not None, lies in a range, which NaN never does."""
     if value is None:
         return
     try:
@@ -172,7 +172,10 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """Check that tensors hold floating-point numbers with magnitudes of at most MAX_MAGNITUDE."""
+    """Check that tensors hold floating-point numbers with magnitudes of at most MAX_MAGNITUDE.
+
+    Other types raise `InputError`, too.
+    """
     from torch import Tensor
 
     for name, tensor in tensors.items():
@@ -189,12 +192,12 @@ def require_bounded(**tensors: Tensor) -> None:
 
 
 def is_whole(value: object) -> bool:
-    """Return whether a value is a whole number of Python or NumPy."""
+    """Return whether a value is a whole number of Python or NumPy, but not True or False."""
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is one real number of Python, NumPy or torch."""
+    """Return whether a value is one real number of Python, NumPy or torch, and not a flag."""
     if getattr(value, "ndim", None) == 0:
         # The value is a tensor or an array of shape (), or a number of NumPy.
         value = value.item()  # type: ignore[attr-defined]

@@ -33,7 +33,11 @@ def tonemap(
     background: Float[Tensor, "*#batch channels #P"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 P"]:
-    """Convert the radiance of pixels to image values in front of a background."""
+    """Convert the radiance of pixels to image values in front of a background.
+
+    The radiance is already multiplied by the coverage, the covered fraction of a pixel.
+    Backgrounds are encoded image values.
+    """
     require_bounded(radiance=radiance)
     linear = radiance + background_term(coverage, background, encoding)
     return encode(clamp(linear), encoding)
@@ -46,7 +50,11 @@ def composite(
     background: Float[Tensor, "*#batch 3 size size"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 size size"]:
-    """Put the radiance of covered pixels in front of a background."""
+    """Put the radiance of covered pixels in front of a background.
+
+    The radiance is already multiplied by the coverage. `pixels` are row-major, and the
+    background has encoded values.
+    """
     batch_shape = radiance.shape[:-2]
     backgrounds = background.expand(*batch_shape, *background.shape[-3:])
     # The last axis is over the pixels of an image
@@ -61,7 +69,11 @@ def composite(
 def as_background(
     background: float | Tensor, size: int, like: Tensor
 ) -> Float[Tensor, "... 3 size size"]:
-    """Convert a gray value, a color or images to background images."""
+    """Convert a gray value, a color or images to background images.
+
+    Values outside [0, 1] raise `InputError`. The result gets the dtype and device of
+    `like`.
+    """
     values = as_tensor("background", background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
@@ -88,7 +100,7 @@ def clamp(values: Float[Tensor, " ..."], ceiling: Tensor | float = 1.0) -> Tenso
 
     With a gradient of 0 at the limit 0, an optimization could not increase a
     light of 0 in front of a black background. The gradient of `torch.clamp` at
-    its limits differs between versions of torch.
+    its limits differs between versions of torch. The ceiling gets no gradient.
     """
     return _Clamp.apply(values, ceiling)
 
@@ -116,7 +128,11 @@ class _Clamp(torch.autograd.Function):
 
 
 def encode(linear: Float[Tensor, " ..."], encoding: str) -> Tensor:
-    """Encode linear values as image values."""
+    """Encode linear values as image values.
+
+    "linear" returns them unchanged, and "srgb" applies the sRGB transfer function (IEC
+    61966-2-1).
+    """
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear

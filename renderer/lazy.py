@@ -20,7 +20,9 @@ def attach(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Create the module functions that import public names of a package on first use.
 
-    The public names are the names that the stub file `__init__.pyi` imports.
+    The public names are the names that the stub file `__init__.pyi` imports. The results
+    are values for `__getattr__`, `__dir__` and `__all__`, and `file` is the package's
+    `__file__`.
     """
     modules = _read_stub(f"{file}i")
     names = sorted(modules)

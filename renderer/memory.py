@@ -12,7 +12,10 @@ GIB = 2**30
 
 
 def require_memory(name: str, needed: int, device: torch.device) -> None:
-    """Check that enough memory is free, because Linux would otherwise kill the process."""
+    """Check that enough memory is free, because Linux would otherwise kill the process.
+
+    `name` is a plural such as "40 renders", and `needed` is in bytes.
+    """
     if not has_memory(needed, device):
         free = free_memory(device) or 0
         raise InputError(
@@ -22,13 +25,16 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
 
 
 def has_memory(needed: int, device: torch.device) -> bool:
-    """Return whether a number of bytes is free on a device."""
+    """Return whether a number of bytes is free on a device.
+
+    It is True, too, if the amount of free memory is unknown.
+    """
     free = free_memory(device)
     return free is None or needed <= free
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Return the free memory of a GPU, the machine or the container."""
+    """Return the free bytes of a GPU, the machine or the container, or None if unknown."""
     if device.type == "cuda":
         # torch reserves memory that it does not use yet. This memory is free for torch.
         reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

@@ -45,7 +45,9 @@ def reflectance(
     In the units of this project, a diffuse surface reflects the radiance
     albedo · irradiance, without the usual division by π. A specular surface
     therefore reflects π · BRDF · irradiance. The result is differentiable with
-    respect to all arguments.
+    respect to all arguments. The first axis is for SCHLICK, EDGE and DIELECTRIC. Normals
+    that face away count as a cosine of 0. The vectors are the normal n, v to the camera
+    (`toward`), and l to the light (`directions`).
     """
     # Unit half vectors h. `unit` takes vectors with their components along the first axis.
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
@@ -66,7 +68,9 @@ def distribution(
 ) -> Float[Tensor, " ..."]:
     """Compute π times the GGX distribution D of the normals of microfacets.
 
-    D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33.
+    D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33. `alpha_squared`
+    is the fourth power of the roughness. The cosine is n·h, between the normal and the half
+    vector.
     """
     return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
 
@@ -78,7 +82,9 @@ def masking_denominator(
 
     G₁(c) is 2 c / (c + √(α² + (1 - α²) c²)). The BRDF contains
     G₁(n·l) G₁(n·v) / (4 (n·l) (n·v)), in which the numerators 2 c cancel. So only
-    the denominators are needed, and the BRDF stays finite at grazing angles.
+    the denominators are needed, and the BRDF stays finite at grazing angles. Negative
+    cosines count as 0. The cosine c is that between the normal n and the direction l to the
+    light or v to the camera.
     """
     facing_cosine = cosine.clamp(min=0)
     return facing_cosine + (alpha_squared + (1 - alpha_squared) * facing_cosine**2).sqrt()

@@ -44,7 +44,8 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
     The derivative of the normal n with respect to a corner v of the face is
     ∂n/∂v = -h nᵀ / |h|². The vector h is the height of the triangle: it leads from
     the opposite edge to v and is perpendicular to this edge. (Section 3 of the
-    paper "Beyond Pixel Norm-Balls" prints the wrong sign.)
+    paper "Beyond Pixel Norm-Balls" prints the wrong sign.) Faces are counter-clockwise seen
+    from outside. A face without area has a normal and a gradient of zero.
     """
     return unit(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
@@ -59,7 +60,9 @@ def vertex_normals(
 
     The normal of a vertex is the mean of the normals of the faces around the
     vertex, weighted with the areas of the faces. At sharp edges, a vertex has
-    several normals, each of which belongs to some of these faces.
+    several normals, each of which belongs to some of these faces. Without `normal_ids` (see
+    `Mesh.normal_ids`), each vertex has one normal. A normal is zero for an index without
+    faces, and where face normals cancel.
     """
     # Each corner of a face gets the area vector of the
     # face, shape (3 components, 3 F corners). The F first
@@ -81,7 +84,7 @@ def plain_face_normals(
     """Compute the unit normals of faces with NumPy, without a gradient.
 
     Unlike `face_normals`, this function does not correct the rounding errors of
-    triangles with a very small angle.
+    triangles with a very small angle. A face without area has the normal zero.
     """
     doubled_vectors = doubled_area_vectors(vertices, faces)
     lengths = np.linalg.norm(doubled_vectors, axis=1, keepdims=True)
@@ -108,7 +111,8 @@ def area_vectors(
 ) -> Float64[Tensor, "3 F"]:
     """Compute a vector along the normal of each face, with a length in proportion to its area.
 
-    The vectors are differentiable with respect to the vertices.
+    The vectors are differentiable with respect to the vertices. The ratio of length to area
+    is a power of two that all faces share.
     """
     require_finite(vertices=vertices)
     return _AreaVectors.apply(vertices, faces)
@@ -188,7 +192,10 @@ def _sum_at_vertices(
     vertex_count: int,
     dtype: torch.dtype,
 ) -> Float[Tensor, "3 V"]:
-    """Add up the gradients of all face corners that lie at the same vertex."""
+    """Add up the gradients of all face corners that lie at the same vertex.
+
+    The columns are all first corners, then all second and all third corners.
+    """
     vertex_of_corner = faces.T.flatten()
     if vertex_count < SPARSE_VERTEX_RATIO * len(vertex_of_corner):
         zeros = corner_gradients.new_zeros(3, vertex_count)
@@ -214,7 +221,8 @@ def _power_of_two(edges: Tensor) -> Float[Tensor, ""]:
     """Find the smallest power of two above the magnitudes of all components of some edges.
 
     Edges that are divided by this power have components between -1 and 1, so
-    products of them do not overflow. The division has no rounding error.
+    products of them do not overflow. The division has no rounding error. The power is 1 if
+    there are no edges, or if all are zero.
     """
     if not edges.numel():
         return edges.new_ones(())
@@ -258,7 +266,10 @@ def _exact_cross(
 
 
 def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a - b, and the rounding error of this difference (Knuth 1969)."""
+    """Compute a - b, and the rounding error of this difference (Knuth 1969).
+
+    The error is the exact difference minus the rounded one.
+    """
     rounded = a - b
     # `negative_b` would be -b without rounding, and both errors would be 0.
     negative_b = rounded - a
@@ -271,7 +282,8 @@ def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Te
     """Compute a · b, and the rounding error of this product (Dekker 1971).
 
     The binary digits of each factor are split into an upper and a lower half.
-    Products of two halves have no rounding error.
+    Products of two halves have no rounding error. The error is the exact product minus the
+    rounded one.
     """
     rounded = a * b
     a_high, a_low = _halves(a)
@@ -283,7 +295,10 @@ def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Te
 
 
 def _halves(numbers: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
-    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971)."""
+    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971).
+
+    Upper and lower halves add up to exactly the given numbers.
+    """
     scaled = _SPLITTER * numbers
     # Both subtractions round away the lower half of the digits.
     high = scaled - (scaled - numbers)

@@ -54,7 +54,8 @@ class Photograph:
 
         The window shows what the camera would see if it were turned toward the
         point and stayed upright. Without perspective, the window is a square of the
-        photograph itself.
+        photograph itself. `center` is a column and a row, and `side` is in pixels. `z_axis`
+        has the components right, up and back of the camera that took the photograph.
         """
         focal_length = self.focal_length
         if focal_length is None:
@@ -112,7 +113,11 @@ class Window:
         encoding: str = "linear",
         beyond: int | None = None,
     ) -> Float[Tensor, "channels size size"]:
-        """Cut the window out of the photograph, and resample it."""
+        """Cut the window out of the photograph, and resample it.
+
+        The result is linear in [0, 1]. Pixels outside of the photograph have the value
+        `beyond`, from 0 to 255, or repeat its border for None.
+        """
         is_enlarged = self.side < size
         samples = 1 if is_enlarged else max(MIN_SAMPLES, math.ceil(self.side / size))
         rectangle = self._needed_rectangle()
@@ -141,7 +146,11 @@ class Window:
         return torch.cat(rows, dim=1).clamp(0, 1)
 
     def pixels(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Map points of the window to positions in the photograph."""
+        """Map points of the window to positions in the photograph.
+
+        Points are distances right of and above the window center in pixels. The results are
+        columns and rows.
+        """
         points = np.stack([x, y, np.ones_like(x)])
         columns, rows, weights = np.tensordot(self.homography, points, 1)
         return columns / weights, rows / weights
@@ -193,6 +202,9 @@ class _Rectangle:
         return pixels
 
     def normalized(self, points: Array) -> Array:
-        """Convert positions in the photograph to coordinates for torch's `grid_sample`."""
+        """Convert positions in the photograph to coordinates for torch's `grid_sample`.
+
+        Points are columns and rows. Coordinates (x, y) go from -1 to 1 in the rectangle.
+        """
         extent = [self.right - self.left, self.bottom - self.top]
         return 2 * (points - [self.left, self.top]) / extent - 1

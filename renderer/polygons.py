@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import mapbox_earcut
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 # Axes that remain if a polygon is projected along the axis x, y or z. A
 # polygon that is counter-clockwise seen from the positive axis stays so.
@@ -14,12 +14,14 @@ _TOLERANCE = 1e-6
 
 
 def triangulate(
-    corners: Float[np.ndarray, "C 3"], sizes: Float[np.ndarray, " P"]
+    corners: Float[np.ndarray, "C 3"], sizes: Int[np.ndarray, " P"]
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Divide polygons into triangles that cover the same area, also if the polygons are concave.
 
     All corners of a polygon are corners of its triangles, also corners on a
-    straight edge. Neighboring faces therefore still share their vertices.
+    straight edge. Neighboring faces therefore still share their vertices. The results are
+    the corners of the triangles, the ascending polygon of each triangle, and the number of
+    polygons that intersect themselves, whose area is unclear.
     """
     starts = np.cumsum(sizes) - sizes
     triangle_counts = sizes - 2

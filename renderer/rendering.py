@@ -226,7 +226,10 @@ def _white_ball() -> Mesh:
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Split a local light for `render` into its basis and its coefficients."""
+    """Split a local light for `render` into its basis and its coefficients.
+
+    A light without coefficients is white and at full power.
+    """
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
         raise InputError(f"lights has the entry {describe(pair)}: give {_LOCAL_LIGHTS}")
@@ -445,8 +448,12 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     return values
 
 
-def _recolored(mesh: Mesh, albedo: Float[Tensor, "F 3"], encoding: str) -> Mesh:
-    """Return a matte mesh with a given albedo, off which light bounces."""
+def _recolored(mesh: Mesh, albedo: Float[Tensor, "... 3"], encoding: str) -> Mesh:
+    """Return a matte mesh with a given albedo, off which light bounces.
+
+    The linear albedo has one row per face, or is the only texture. A texture is rounded
+    to 8 bits, which the mean over the patches of a surface evens out.
+    """
     colors = encode(albedo.detach().cpu().double(), encoding).numpy()
     if albedo.ndim == 3:
         texture = np.rint(255 * colors).astype(np.uint8)
@@ -464,9 +471,13 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, "F 3"], encoding: str) -> Mesh:
 
 
 def _sample_albedo(
-    mesh: Mesh, view: Fragments, albedo: Float[Tensor, "F 3"] | None, encoding: str
+    mesh: Mesh, view: Fragments, albedo: Float[Tensor, "... 3"] | None, encoding: str
 ) -> Float[Tensor, "S 3"]:
-    """Compute the linear albedo at the samples of an image that show a mesh."""
+    """Compute the linear albedo at the samples of an image that show a mesh.
+
+    `albedo` is linear, with one row per face, or the only texture. None uses the colors of
+    the mesh.
+    """
     if albedo is None:
         return surface_albedo(mesh, view, encoding)
     if albedo.shape == mesh.faces.shape:

@@ -149,7 +149,9 @@ def setting(
     """Create a field of a settings class.
 
     If the value is a list, its items are checked against the range and the choices. None is
-    permitted if the annotation of the field permits None.
+    permitted if the annotation of the field permits None. A function as default is called
+    for each instance, and REQUIRED means that there is none. `above` and `below` exclude
+    the limit. `is_text` makes the command line read 1.10 as text.
     """
     facts = Facts(
         about,
@@ -205,6 +207,7 @@ def facts_of(kind: type, name: str) -> Facts:
     """Return the explanation, unit, range and choices of a field.
 
     If a subclass only changes the default of a field, the facts of the parent class apply.
+    They are empty if no class created the field with `setting`.
     """
     for base in kind.__mro__:
         fields_of_base: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})
@@ -220,7 +223,10 @@ def field_types(kind: type) -> dict[str, Any]:
 
 
 def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) -> Kind:
-    """Create an instance of a settings class from a mapping."""
+    """Create an instance of a settings class from a mapping.
+
+    `argument` is the name of the mapping, with which errors begin.
+    """
     known_fields = fields(cast(Any, kind))
     names = [known.name for known in known_fields]
     for name in values:
@@ -401,7 +407,11 @@ class ImageSettings(Settings):
 
 
 def samples_per_side(samples: int | None, silhouettes: bool) -> int:
-    """Choose the number of samples along one side of a pixel."""
+    """Choose the number of samples along one side of a pixel: the user's, or 2, or 8.
+
+    It is 8 with `silhouettes`, because the documented accuracy of these gradients needs
+    more samples.
+    """
     if samples is not None:
         return samples
     return SILHOUETTE_SAMPLES if silhouettes else ImageSettings.samples

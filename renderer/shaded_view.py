@@ -115,7 +115,9 @@ class ShadedView:
         """Compute the radiance of the pixels that the shape covers.
 
         If `settings.silhouettes` and `is_moved` are True, gradients include how
-        silhouettes and surfaces move in the image.
+        silhouettes and surfaces move in the image. Uncovered pixels into which silhouettes
+        may move then follow the covered ones. The background is encoded, shape (3, size²)
+        or (1, size²).
         """
         if self.settings.silhouettes and self.is_moved:
             linear_background = decode(background, self.settings.encoding).expand(3, -1)
@@ -125,7 +127,10 @@ class ShadedView:
         return PixelRadiance(self.fragments.pixels, coverage, pixel_radiance)
 
     def _environment_radiance(self, fragments: Fragments) -> Float[Tensor, "3 P"] | None:
-        """Compute the radiance of pixels under environment light, without shadows and bounces."""
+        """Compute the radiance of pixels under environment light, without shadows and bounces.
+
+        It is None without environment light.
+        """
         environment = self.light.environment
         if environment is None:
             return None
@@ -135,7 +140,11 @@ class ShadedView:
         return glossy_radiance(*arguments, self._sample_gloss)
 
     def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
-        """Compute the radiance that shadows and bounces add to the P covered pixels."""
+        """Compute the radiance that shadows and bounces add to the P covered pixels.
+
+        It is negative in shadows, and None without environment light or without both
+        effects.
+        """
         environment = self.light.environment
         if environment is None or self.indirect is None:
             return None
@@ -161,7 +170,11 @@ class ShadedView:
     def _radiance_with_silhouettes(
         self, camera: Camera, background: Float[Tensor, "3 size²"]
     ) -> PixelRadiance:
-        """Compute radiance whose gradients include the movement of silhouettes and surfaces."""
+        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
+
+        The background is linear. Uncovered pixels into which silhouettes may move follow
+        the covered ones.
+        """
         fragments = self.fragments
         # Each sample becomes a pixel of a finer
         # image, so that it is shaded alone.

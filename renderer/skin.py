@@ -47,7 +47,7 @@ class Skin:
 
         A joint also rotates its children. The rotation of a child is applied
         before the rotation of its parent. The result is differentiable with
-        respect to the rotations.
+        respect to the rotations. Rotations and displacements are in the axes of the mesh.
         """
         # Subtracting the identity from the matrix of a joint gives a
         # matrix that maps a point (x, y, z, 1) to its displacement.
@@ -62,7 +62,11 @@ class Skin:
         return carried @ displacement_matrix
 
     def _joint_matrices(self, rotations: Float[Tensor, "J 3 3"]) -> list[Tensor]:
-        """Compute the affine matrix with which each joint moves points."""
+        """Compute the affine matrix with which each joint moves points.
+
+        A row (x, y, z, 1) times the (4, 3) matrix of a joint is the point that it and all
+        joints above it have moved.
+        """
         matrices: list[Tensor] = []
         pivots = torch.from_numpy(self.pivots).to(rotations)
         for parent, pivot, rotation in zip(self.parents, pivots, rotations, strict=True):
@@ -82,7 +86,10 @@ class Skin:
         return matrices
 
     def transformed(self, matrix: Float[np.ndarray, "4 4"]) -> Skin:
-        """Return the skin of a mesh after an affine transformation of the mesh."""
+        """Return the skin of a mesh after an affine transformation of the mesh.
+
+        The product of the matrix and a column (x, y, z, 1) is the new point.
+        """
         linear_part = matrix[:3, :3]
         pivots = self.pivots @ linear_part.T + matrix[:3, 3]
         carried = (self.carried @ matrix.T).astype(np.float32)

@@ -32,7 +32,8 @@ def as_tensor(name: str, value: object) -> Tensor:
 
     A floating-point tensor is returned unchanged. A floating-point NumPy array
     keeps its precision. Integers, numbers and lists become float32. Lists of
-    tensors are stacked and stay differentiable.
+    tensors are stacked and stay differentiable. Strings, None, complex numbers and lists of
+    unequal lengths raise `InputError`.
     """
     if isinstance(value, Tensor):
         if value.is_floating_point():
@@ -63,7 +64,10 @@ def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
 
 
 def as_integers(name: str, value: object) -> Tensor:
-    """Convert an argument, such as labels or indices, to an int64 tensor."""
+    """Convert an argument, such as labels or indices, to an int64 tensor.
+
+    Empty values may have any type.
+    """
     if isinstance(value, Tensor):
         is_real = not value.is_complex() and value.dtype != torch.bool
         has_integers = is_real and not value.is_floating_point()
@@ -79,7 +83,7 @@ def as_integers(name: str, value: object) -> Tensor:
 
 
 def _as_numbers(value: object) -> np.ndarray | None:
-    """Convert a value to an array of real numbers that torch can read."""
+    """Convert a value to a contiguous array of real numbers that torch can read, or to None."""
     # NumPy calls methods of the value, such as
     # `__array__`. They can raise any exception.
     try:
@@ -97,7 +101,11 @@ def _as_numbers(value: object) -> np.ndarray | None:
 
 
 def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
-    """Convert an argument to a NumPy array of real numbers."""
+    """Convert an argument to a NumPy array of real numbers.
+
+    `kinds` are letters of `dtype.kind`: "iu" allows only integers. An array is returned
+    unchanged.
+    """
     array = _as_numbers(value.detach().cpu() if isinstance(value, Tensor) else value)
     if array is None or (array.dtype.kind not in kinds and array.size):
         noun = "numbers" if "f" in kinds else "whole numbers"
@@ -131,7 +139,11 @@ def as_folder(name: str, value: object) -> Path:
 
 
 def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
-    """Convert an argument to a list, and check the type of its items."""
+    """Convert an argument to a list, and check the type of its items.
+
+    Strings, mappings and sets are no lists. `expected` completes the error, such as "a list
+    of cameras".
+    """
     # The types Tensor and np.ndarray are iterable,
     # but a value of shape () has no items.
     is_scalar = isinstance(value, Tensor | np.ndarray) and not value.ndim
@@ -152,7 +164,7 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
 
 
 def require_whole(name: str, value: object) -> None:
-    """Check that an argument is a whole number."""
+    """Check that an argument is a whole number, which True and 1.0 are not."""
     require_kind(name, value, Integral, "a whole number")
     if isinstance(value, bool):
         raise InputError(f"{name} is {value}: give a whole number", name)

@@ -12,7 +12,7 @@ def unit_vectors(vectors: Float[Tensor, "3 ..."]) -> tuple[Tensor, Tensor]:
     """Compute the unit vectors and the lengths of vectors.
 
     No square overflows or underflows. The three components are along the first
-    axis, because adding rows is faster than adding columns.
+    axis, because adding rows is faster than adding columns. A zero vector stays zero.
     """
     largest = vectors.abs().amax(0)
     # The largest component of each scaled vector is 1 or -1.
@@ -26,7 +26,7 @@ def unit(vectors: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
     """Divide vectors by their lengths.
 
     The result can be differentiated once with respect to the vectors, but has no
-    second derivatives.
+    second derivatives. A zero vector and its gradient are zero.
     """
     return _Unit.apply(vectors)
 
@@ -56,7 +56,8 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
     """Compute two unit vectors that are orthogonal to a unit vector (x, y, z) and to each other.
 
     The source of the formula is Duff et al. 2017, "Building an orthonormal
-    basis, revisited".
+    basis, revisited". `sign` is 1 or -1. For z = -sign, the formula divides by 0. Nearby
+    vectors with the same sign have nearby results, each as components [x, y, z].
     """
     a = -1 / (sign + z)
     b = x * y * a
@@ -66,7 +67,7 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
 
 
 def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
-    """Convert rotation vectors to rotation matrices."""
+    """Convert rotation vectors, the axis times the angle in degrees, to rotation matrices."""
     radians = torch.deg2rad(vectors)
     axes = torch.eye(3).to(radians).expand(*radians.shape, 3)
     # Row i is the cross product of the rotation
