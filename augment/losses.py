@@ -93,7 +93,7 @@ def complementary_label(label: int) -> int:
     return -1 - label
 
 
-def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "N classes"]) -> None:
+def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "_ classes"]) -> None:
     """Check that every label has a logit. Labels may be complementary."""
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 

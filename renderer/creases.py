@@ -9,7 +9,7 @@ Shapes use these letters: a mesh has V vertices and F faces.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from renderer.normals import CANCELLATION, doubled_area_vectors
 
@@ -25,7 +25,7 @@ MAX_FACES_AT_EDGE = 8
 
 
 def normal_groups(
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Num[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     file_normals: Float[np.ndarray, "F 3 3"] | None = None,
     crease: float = CREASE,

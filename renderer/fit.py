@@ -620,7 +620,7 @@ class _Target(NamedTuple):
 
     def render_linear(
         self, camera: Camera, light: Float[Tensor, "49 3"]
-    ) -> Float[Tensor, "3 size²"]:
+    ) -> Float[Tensor, "3 pixels"]:
         """Render the mesh in front of the gray background, and decode the image to linear
         values.
         """

@@ -86,7 +86,7 @@ def as_background(
 
 
 def background_term(
-    coverage: Float[Tensor, "... 1 P"],
+    coverage: Float[Tensor, " ..."],
     background: Float[Tensor, "... _ _"],
     encoding: str = "linear",
 ) -> Float[Tensor, "... _ P"]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int, Num
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -93,8 +93,8 @@ def plain_face_normals(
 
 
 def doubled_area_vectors(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "F 3"]:
+    vertices: Num[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Num[np.ndarray, "F 3"]:
     """Compute a vector along the normal of each face, whose length is twice the face area."""
     # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
@@ -187,7 +187,7 @@ class _AreaVectors(torch.autograd.Function):
 
 
 def _sum_at_vertices(
-    corner_gradients: Float[Tensor, "3 3*F"],
+    corner_gradients: Float[Tensor, "3 D"],
     faces: Int[Tensor, "F 3"],
     vertex_count: int,
     dtype: torch.dtype,

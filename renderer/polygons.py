@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import mapbox_earcut
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int, Num
 
 # Axes that remain if a polygon is projected along the axis x, y or z. A
 # polygon that is counter-clockwise seen from the positive axis stays so.
@@ -14,7 +14,7 @@ _TOLERANCE = 1e-6
 
 
 def triangulate(
-    corners: Float[np.ndarray, "C 3"], sizes: Int[np.ndarray, " P"]
+    corners: Num[np.ndarray, "C 3"], sizes: Int[np.ndarray, " P"]
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Divide polygons into triangles that cover the same area, also if the polygons are concave.
 

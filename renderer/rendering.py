@@ -448,7 +448,7 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     return values
 
 
-def _recolored(mesh: Mesh, albedo: Float[Tensor, "... 3"], encoding: str) -> Mesh:
+def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh:
     """Return a matte mesh with a given albedo, off which light bounces.
 
     The linear albedo has one row per face, or is the only texture. A texture is rounded
@@ -471,7 +471,7 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, "... 3"], encoding: str) -> Mes
 
 
 def _sample_albedo(
-    mesh: Mesh, view: Fragments, albedo: Float[Tensor, "... 3"] | None, encoding: str
+    mesh: Mesh, view: Fragments, albedo: Float[Tensor, " ..."] | None, encoding: str
 ) -> Float[Tensor, "S 3"]:
     """Compute the linear albedo at the samples of an image that show a mesh.
 

@@ -168,7 +168,7 @@ class ShadedView:
         return reduce(torch.add, given_summands)
 
     def _radiance_with_silhouettes(
-        self, camera: Camera, background: Float[Tensor, "3 size²"]
+        self, camera: Camera, background: Float[Tensor, "3 pixels"]
     ) -> PixelRadiance:
         """Compute radiance whose gradients include the movement of silhouettes and surfaces.
 

@@ -333,7 +333,7 @@ class Descent:
         )
 
     def _score(
-        self, images: Float[Tensor, "N V 3 H W"], criterion: Criterion, batch_size: BatchSize
+        self, images: Float[Tensor, "N V _ H W"], criterion: Criterion, batch_size: BatchSize
     ) -> tuple[Score, Tensor]:
         """Compute the costs, logit gaps and predictions of N examples, batch by batch.
 
@@ -349,9 +349,9 @@ class Descent:
 
     def _score_batch(
         self,
-        all_images: Float[Tensor, "_ 3 H W"],
+        all_images: Float[Tensor, "_ _ H W"],
         criterion: Criterion,
-        all_gradients: Float[Tensor, "_ 3 H W"],
+        all_gradients: Float[Tensor, "_ _ H W"],
         batch_rows: slice,
     ) -> Score:
         """Compute the cost, logit gap and prediction of each image of a batch.
@@ -442,7 +442,7 @@ class Descent:
 
     @torch.no_grad()
     def _is_robust_to_noise(
-        self, images: Float[Tensor, "A V 3 H W"], examples: Int[Tensor, " A"], criterion: Criterion
+        self, images: Float[Tensor, "A V _ H W"], examples: Int[Tensor, " A"], criterion: Criterion
     ) -> Bool[Tensor, " A"]:
         """Return a mask of the examples whose logit gaps change little with sensor noise.
 

@@ -86,7 +86,7 @@ class ExpectationOverTransformations:
         self._draws = draws
 
     def __call__(
-        self, model: nn.Module, images: Float[Tensor, "N 3 H W"], logits: Float[Tensor, "N C"]
+        self, model: nn.Module, images: Float[Tensor, "N _ H W"], logits: Float[Tensor, "N C"]
     ) -> Float[Tensor, "N C"]:
         """Average the log-probabilities of images and of their random transformations.
 

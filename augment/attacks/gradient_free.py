@@ -107,7 +107,7 @@ class GradientFree(Descent):
         return torch.cat(image_groups), Score.of_examples(scores, view_count)
 
     def _score_images(
-        self, images: Float[Tensor, "A V 3 H W"], criterion: Criterion, batch_size: BatchSize
+        self, images: Float[Tensor, "A V _ H W"], criterion: Criterion, batch_size: BatchSize
     ) -> list[Score]:
         """Classify images batch by batch."""
         all_images = images.flatten(0, 1)
@@ -115,7 +115,7 @@ class GradientFree(Descent):
         return list(batch_size.map(score_part, len(all_images)))
 
     def _score_part(
-        self, all_images: Float[Tensor, "N 3 H W"], criterion: Criterion, rows: slice
+        self, all_images: Float[Tensor, "N _ H W"], criterion: Criterion, rows: slice
     ) -> Score:
         """Compute the cost, the logit gap and the prediction of each image of a batch."""
         batch = all_images[rows]

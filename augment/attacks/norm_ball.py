@@ -18,7 +18,9 @@ from renderer.light.ball import Ball, nearest_in_box
 Domain = Callable[..., Tensor]
 
 
-def unconstrained(values: Float[Tensor, "A D"], within: Ball | None = None) -> Float[Tensor, "A D"]:
+def unconstrained(
+    values: Float[Tensor, " ..."], within: Ball | None = None
+) -> Float[Tensor, " ..."]:
     """Project values onto a ball. Without a ball, return them unchanged.
 
     This is the projection of attacks whose values are all feasible.
@@ -28,7 +30,7 @@ def unconstrained(values: Float[Tensor, "A D"], within: Ball | None = None) -> F
 
 def take_step(
     settings: StepSettings,
-    values: Float[Tensor, "A D"],
+    values: Float[Tensor, " ..."],
     gradient: Tensor,
     center: Tensor,
     domain: Domain = unconstrained,
@@ -45,7 +47,9 @@ def take_step(
     return project(settings, moved, center, domain)
 
 
-def scale_gradient(settings: StepSettings, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+def scale_gradient(
+    settings: StepSettings, gradient: Float[Tensor, " ..."]
+) -> Float[Tensor, " ..."]:
     """Compute the step that gradient descent subtracts from the values.
 
     The step is the gradient ("raw"), its sign ("sign") or its direction ("unit"), times the step
@@ -66,10 +70,10 @@ def scale_gradient(settings: StepSettings, gradient: Float[Tensor, "A D"]) -> Fl
 
 def project(
     settings: StepSettings,
-    values: Float[Tensor, "A D"],
-    center: Float[Tensor, "A D"],
+    values: Float[Tensor, " ..."],
+    center: Float[Tensor, " ..."],
     domain: Domain = unconstrained,
-) -> Float[Tensor, "A D"]:
+) -> Float[Tensor, " ..."]:
     """Find the nearest values that are feasible and lie in the norm-ball.
 
     A radius of None means no ball. `domain` projects onto the feasible values, which contain the
@@ -81,10 +85,10 @@ def project(
 
 def sample(
     settings: StepSettings,
-    center: Float[Tensor, "A D"],
+    center: Float[Tensor, " ..."],
     generator: torch.Generator,
     used: Bool[Tensor, "A D"] | None = None,
-) -> Float[Tensor, "A D"]:
+) -> Float[Tensor, " ..."]:
     """Draw a vector of values uniformly from the norm-ball around each center.
 
     Values outside of the mask `used` are those of the center. None draws all values.

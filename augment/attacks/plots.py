@@ -21,7 +21,7 @@ AFTER_COLOR = "#e45756"
 
 def draw_attack(
     before: Float[Tensor, "3 size size"],
-    ball: Float[Tensor, "3 size size"],
+    ball: Float[Tensor, "_ _ _"],
     after: Float[Tensor, "3 size size"],
     probabilities_before: Float[Tensor, " C"],
     probabilities_after: Float[Tensor, " C"],

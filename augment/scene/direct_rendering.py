@@ -125,7 +125,7 @@ class FrozenTransport:
         return added * torch.where(old_sums > 0, ratios, 1).to(light)
 
 
-def _sum_by_pixel(fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> Float[Tensor, "3 size²"]:
+def _sum_by_pixel(fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> Float[Tensor, "3 pixels"]:
     """Sum the albedo of the samples in each pixel of an image."""
     # Row-major index of the pixel in which each sample lies, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
@@ -203,7 +203,7 @@ class DirectRenderer:
         camera: Camera,
         light: Float[Tensor, "K 3"],
         changed: Conditions,
-        background: Float[Tensor, "_ size²"],
+        background: Float[Tensor, "_ pixels"],
     ) -> PixelRadiance:
         """Render a view of an object with changed shape, colors, gloss or lamps.
 

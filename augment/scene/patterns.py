@@ -30,7 +30,7 @@ MAX_SATURATION = 3.0
 
 
 def stripes(
-    points: Float[Tensor, "2 ..."], shift: Tensor | float, bright: float = 0.5
+    points: Float[Tensor, " ..."], shift: Tensor | float, bright: float = 0.5
 ) -> Bool[Tensor, " ..."]:
     """Find the points on the bright parts of vertical stripes with period 1.
 
@@ -92,10 +92,10 @@ def turned(
 
 
 def two_colors(
-    weight: Float[Tensor, "N 1 H W"],
-    first: Float[Tensor, "N 3 1 1"],
-    second: Float[Tensor, "N 3 1 1"],
-) -> Float[Tensor, "N 3 H W"]:
+    weight: Float[Tensor, " ..."],
+    first: Float[Tensor, " ..."],
+    second: Float[Tensor, " ..."],
+) -> Float[Tensor, " ..."]:
     """Blend two colors in each of N images, with a weight for each pixel."""
     return second + weight * (first - second)
 
@@ -159,7 +159,7 @@ def draw_patterns(
 
 def draw_photograph_patterns(
     photographs: Float[Tensor, "N 3 H W"],
-    points: Float[Tensor, "2 N size size"],
+    points: Float[Tensor, "2 _ size size"],
     draws: torch.Generator,
 ) -> Float[Tensor, "N 3 size size"]:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.

@@ -101,7 +101,7 @@ def _split_at_horizon(degree: int) -> tuple[Tensor, Tensor]:
 
 
 def above_table(
-    lights: Float[Tensor, "E K 3"], lamps: Float[Tensor, "E 3"], albedo: Float[Tensor, "E 3"]
+    lights: Float[Tensor, "E K 3"], lamps: Float[Tensor, "E 3"], albedo: Float[Tensor, "E _"]
 ) -> Float[Tensor, "E K 3"]:
     """Compute the light that reaches an object on an infinite table.
 

@@ -47,7 +47,7 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
-def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "C size size"]:
+def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "_ size size"]:
     """Create a gray image from a value in [0, 1] or its text, or read the square of an image."""
     advice = "give gray values in [0, 1] or image files"
     # `float` would accept True as 1.

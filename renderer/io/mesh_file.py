@@ -10,7 +10,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from renderer.errors import MAX_MAGNITUDE
 from renderer.image import decode, encode
@@ -179,7 +179,7 @@ def words_per_line(text: bytes) -> np.ndarray:
 
 def triangles_of(
     file: MeshFile,
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Num[np.ndarray, "V 3"],
     indices: Int[np.ndarray, " C"],
     sizes: Int[np.ndarray, " P"],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +203,7 @@ def triangles_of(
 
 
 def colored_mesh(
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Num[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     colors: np.ndarray,
     uvs: Float[np.ndarray, "F 3 2"] | None = None,

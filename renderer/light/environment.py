@@ -57,7 +57,7 @@ _OTHER_NAMES = {"a", "alpha", "z", "zback", "depth", "mist", "id", "indexob", "i
 _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
-def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ 3"]:
+def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ _"]:
     """Compute the environment map of a light that is given by SH coefficients.
 
     The radiance may be negative, because a sum of few harmonics oscillates around
@@ -72,7 +72,7 @@ def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ 3"]:
 
 def light_radiance(
     coefficients: Tensor, directions: Float[Tensor, "... 3"]
-) -> Float[Tensor, "... 3"]:
+) -> Float[Tensor, " ..."]:
     """Compute the radiance of environment light from directions (toward the light, any length)."""
     degree = math.isqrt(len(coefficients)) - 1
     blocks = directions.flatten(0, -2).split(BLOCK)

@@ -572,7 +572,7 @@ def project(
     return basis(directions, degree).T @ (weights[:, None] * values)
 
 
-def _project_map(radiance: Float[Tensor, "height width channels"], degree: int) -> Tensor:
+def _project_map(radiance: Float[Tensor, " ..."], degree: int) -> Tensor:
     """Compute the SH coefficients of an environment map with the midpoint rule, in float64."""
     if radiance.ndim != 3:
         shape = tuple(radiance.shape)

@@ -123,7 +123,7 @@ def highlight_error(degree: int, roughness: float) -> float:
     return math.sqrt(relative_squared_error)
 
 
-def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degree+1"]:
+def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
     """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
 
     The highlight is the specular lobe of a metal for a camera that looks along

@@ -61,7 +61,7 @@ def nonnegative_window(degree: int) -> Tensor:
 
 
 def best_window(
-    spectrum: Float[np.ndarray, " degree+1"], weight: Float[np.ndarray, " degree+1"]
+    spectrum: Float[np.ndarray, " degrees"], weight: Float[np.ndarray, " degrees"]
 ) -> Tensor:
     """Compute the factors that make a lobe non-negative and change the lobe least.
 
@@ -113,9 +113,9 @@ def irradiance_weights(degree: int) -> Tensor:
 
 def _best_factors(
     cosines: Float[np.ndarray, " N"],
-    weight: Float[np.ndarray, " degree+1"],
-    spectrum: Float[np.ndarray, " degree+1"],
-) -> Float[np.ndarray, " degree+1"]:
+    weight: Float[np.ndarray, " degrees"],
+    spectrum: Float[np.ndarray, " degrees"],
+) -> Float[np.ndarray, " degrees"]:
     """Compute the factors that make a lobe non-negative at N angles and change it least.
 
     The lobe is Σ_l (2l + 1) s_l w_l P_l(cos θ) with the factors w_l. Its error is

@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int, Num
 from scipy.sparse import csr_array
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -297,7 +297,7 @@ class TransferOperator:
     def _gradient_of_images(
         self,
         image_gradient: Float[Tensor, "... 3 size size"],
-        is_unclamped: Bool[Tensor, "... 3 D"],
+        is_unclamped: Float[Tensor, "... 3 D"],
         clamped_values: Float[Tensor, "... 3 D"],
     ) -> Float[Tensor, "... coefficients 3"]:
         """Convert the gradient of a loss from the images of `_images` to the lights.
@@ -504,7 +504,7 @@ class TransferOperator:
         """Groups of equal pixels as in `distinct`, with row-major indices of image pixels."""
         return None if self.distinct is None else self.distinct.at(self.pixels)
 
-    def _select_distinct(self, values: Float[Tensor, "... P"]) -> Float[Tensor, "... D"]:
+    def _select_distinct(self, values: Num[Tensor, "... P"]) -> Num[Tensor, "... D"]:
         """Select the values of the D distinct pixels from those of the P covered pixels."""
         if self.distinct is None:
             return values
@@ -1067,7 +1067,7 @@ def _copy_from_faces(
     return transfer[None]
 
 
-def _row_starts(counts: Int[Tensor, " N"]) -> Int[Tensor, " N+1"]:
+def _row_starts(counts: Int[Tensor, " N"]) -> Int[Tensor, " starts"]:
     """Compute where each row begins in a list of the entries of all rows.
 
     For example, rows with 2 and 3 entries give 0, 2, 5.
@@ -1080,7 +1080,7 @@ def _row_starts(counts: Int[Tensor, " N"]) -> Int[Tensor, " N+1"]:
 def _weighted_row_sums(
     weights: Float[Tensor, " E"],
     entry_to_value: Int[Tensor, " E"],
-    entry_starts: Int[Tensor, " N+1"],
+    entry_starts: Int[Tensor, " starts"],
     values: Float[Tensor, "M K"],
 ) -> Float[Tensor, "N K"]:
     """Compute N weighted sums of rows of a matrix.
@@ -1125,7 +1125,7 @@ def _sample_weights(
 
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
-) -> Float[Tensor, "3 K P"]:
+) -> Float[Tensor, "_ K P"]:
     """Compute the transfer matrix of a glossy surface under an open sky, without shadows.
 
     An albedo of shape (S, 1) means that all colors share a channel. The result then has two

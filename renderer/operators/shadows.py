@@ -363,7 +363,7 @@ def build_transport(
 
 def _radiosity(
     patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
-) -> Float[Tensor, "N K 3"]:
+) -> Float[Tensor, "N K _"]:
     """Compute the radiance that N patches send after `settings.bounces` bounces (radiosity).
 
     After one bounce, patch i with albedo ρ_i sends the radiance

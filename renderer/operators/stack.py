@@ -298,7 +298,7 @@ class ScatterLayers(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        canvas: Float[Tensor, "N 3 size²"],
+        canvas: Float[Tensor, "N 3 pixels"],
         targets: Sequence[tuple[Rows, Tensor]],
         *layers: Tensor,
     ) -> Tensor:
@@ -318,7 +318,7 @@ class ScatterLayers(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Float[Tensor, "N 3 size²"]) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Float[Tensor, "N 3 pixels"]) -> tuple[Tensor | None, ...]:
         """Compute the gradients with respect to the new values of the overwritten pixels."""
         gradients = []
         for rows, pixels in ctx.targets:

@@ -198,7 +198,7 @@ class SampleGloss(NamedTuple):
         return self.metallic * schlick, white + self.metallic * edge
 
     def reflect_uniform_light(
-        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"]
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"]
     ) -> tuple[Tensor | None, Tensor]:
         """Compute the specular radiance of S samples under uniform light of irradiance 1.
 
@@ -243,7 +243,7 @@ class SampleGloss(NamedTuple):
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 
     def diffuse_factor(
-        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"]
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"]
     ) -> Float[Tensor, " S"]:
         """Compute the factor by which metal and coat reduce the diffuse radiance at S samples.
 
@@ -259,7 +259,7 @@ class SampleGloss(NamedTuple):
         return (1 - self.metallic) * transmittance / mean_transmittance
 
     def specular_transfer(
-        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "S 3"], degree: int
+        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"], degree: int
     ) -> tuple[Tensor | None, Tensor, ViewFrame]:
         """Compute the specular radiance of S samples from each spherical harmonic.
 

@@ -388,7 +388,7 @@ def _axis_permutation(degree: int) -> Tensor:
 
 
 def lobe_functions(
-    cosine: Float[Tensor, " S"], roughness: Float[Tensor, " S"], degree: int, terms: Sequence[int]
+    cosine: Float[Tensor, " S"], roughness: Float[Tensor, " _"], degree: int, terms: Sequence[int]
 ) -> Float[Tensor, "T M S"]:
     """Evaluate the lobe functions π c_lm (see the module) at the S samples.
 

@@ -142,7 +142,7 @@ def glossy_radiance(
 
 def _lobe_radiance(
     normals: Float[Tensor, "S 3"],
-    to_camera: Float[Tensor, "S 3"],
+    to_camera: Float[Tensor, "_ 3"],
     light: Float[Tensor, "K 3"],
     albedo: Float[Tensor, "S 3"],
     gloss: SampleGloss,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -231,7 +231,7 @@ class Fragments:
             vars(copied)[_WEIGHTS] = self.barycentric[samples]
         return copied
 
-    def image_of_samples(self, values: Float[Tensor, " S"], empty: float) -> Float[Tensor, "_ _"]:
+    def image_of_samples(self, values: Num[Tensor, " S"], empty: float) -> Num[Tensor, "_ _"]:
         """Arrange values at samples as an image with one pixel per sample.
 
         Samples that show no mesh get the value `empty`. Row 0 is at the top.

@@ -83,7 +83,7 @@ class _TriangleRows(NamedTuple):
 
 def _keys(
     points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
-) -> Int[np.ndarray, " R²"]:
+) -> Int[np.ndarray, " _"]:
     """Compute the smallest key of each sample of one view.
 
     Each face has one key at a sample that it covers: its depth, and in the low
@@ -106,7 +106,7 @@ def _keys(
 
 
 def _draw(
-    keys: Int[np.ndarray, " R²"],
+    keys: Int[np.ndarray, " _"],
     triangles: Int[np.ndarray, "2 3 T"],
     depths: Float[np.ndarray, "3 T"],
     rows: _TriangleRows,

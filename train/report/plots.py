@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 from PIL import Image
 
 from renderer.io.images import open_image
@@ -200,7 +200,7 @@ def _percent(estimate: Estimate) -> str:
 
 def _draw_fractions(
     axes: "Axes",
-    positions: Float[np.ndarray, " radii"],
+    positions: Int[np.ndarray, " radii"],
     values: Sequence[Estimate],
     name: str,
     color: str,

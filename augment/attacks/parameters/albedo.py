@@ -28,7 +28,7 @@ class Albedo(MeshParameter):
         super().__init__(scene, settings, [item.own_faces for item in scene.objects])
 
     def apply(
-        self, values: Float[Tensor, "A 3*F"], conditions: Conditions, examples: Int[Tensor, " A"]
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
         """Return a copy of the conditions with a color offset for each face.
 

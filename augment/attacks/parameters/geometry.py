@@ -33,7 +33,7 @@ class Geometry(MeshParameter):
         super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
     def apply(
-        self, values: Float[Tensor, "A 3*N"], conditions: Conditions, examples: Int[Tensor, " A"]
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Conditions:
         """Return a copy of the conditions with displaced vertices.
 

@@ -41,14 +41,14 @@ class LightParameter(Parameter):
         super().__init__(settings, start=initial_light.flatten(1))
 
     def apply(
-        self, values: Float[Tensor, "A 3*K"], conditions: Conditions, examples: Tensor
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
     ) -> Conditions:
         """Return a copy of the conditions with other coefficients of this light."""
         return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
 
     def project_feasible(
-        self, values: Float[Tensor, "A 3*K"], within: Ball | None = None
-    ) -> Float[Tensor, "A 3*K"]:
+        self, values: Float[Tensor, "A D"], within: Ball | None = None
+    ) -> Float[Tensor, "A D"]:
         """Find the nearest coefficients whose radiance is not negative."""
         if not self._nonnegative:
             return super().project_feasible(values, within)

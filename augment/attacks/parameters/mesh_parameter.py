@@ -38,7 +38,7 @@ class MeshParameter(Parameter):
         super().__init__(settings, start=start, used_mask=used_mask)
 
     def offsets(
-        self, values: Float[Tensor, "A 3*N"], examples: Int[Tensor, " A"]
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A N 3"]:
         """Reshape the attack values to one vector for each vertex or face.
 

@@ -206,9 +206,7 @@ class _MovableObject:
             moved = moved + lift * moved.new_tensor([0, 0, 1])
         return torch.where(self.object_mask[:, None], moved, bent)
 
-    def _bend(
-        self, vertices: Float[Tensor, "N 3"], joint_rotations: Float[Tensor, " 3*J"]
-    ) -> Tensor:
+    def _bend(self, vertices: Float[Tensor, "N 3"], joint_rotations: Float[Tensor, " D"]) -> Tensor:
         """Rotate the J joints, and return all vertices after that, shape (N, 3).
 
         The rotation vectors of the joints are in degrees, one after the other.

@@ -37,7 +37,7 @@ class Positions(Parameter):
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
     def apply(
-        self, values: Float[Tensor, "A 3*L"], conditions: Conditions, examples: Tensor
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
     ) -> Conditions:
         """Return a copy of the conditions with moved lamps.
 

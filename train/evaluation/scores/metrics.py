@@ -19,7 +19,7 @@ from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from renderer.short_repr import ShortRepr
 from train.evaluation.scores.predictions import Prediction
@@ -670,7 +670,7 @@ def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def class_means(
-    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Int[np.ndarray, "... n"]
+    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Num[np.ndarray, "... n"]
 ) -> Float[np.ndarray, "K ..."]:
     """Compute the fraction of hits in each class, and average it over the classes.
 
@@ -686,8 +686,8 @@ def class_means(
 
 
 def auc_and_recalls(
-    positives: Float[np.ndarray, " n"],
-    negatives: Float[np.ndarray, " m"],
+    positives: Num[np.ndarray, " n"],
+    negatives: Num[np.ndarray, " m"],
     positive_counts: Int[np.ndarray, "... n"] | None = None,
     negative_counts: Int[np.ndarray, "... m"] | None = None,
 ) -> Float[np.ndarray, "4 ..."]:
@@ -728,7 +728,7 @@ def auc_and_recalls(
 
 
 def thresholds(
-    negatives: Float[np.ndarray, " m"],
+    negatives: Num[np.ndarray, " m"],
     counts: Int[np.ndarray, "... m"],
     rates: Sequence[str] = RATES,
 ) -> list[np.ndarray]:
