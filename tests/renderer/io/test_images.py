@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import PIL
 import pytest
 from PIL import Image, ImageCms
 
@@ -282,7 +283,13 @@ def tiff(content: bytes, bits: int, photometric: int, extra: int | None = None) 
     [
         (struct.pack("<4H", 0, 0x4000, 0x8000, 0xFFFF), 16, 0, None, [255, 191, 127, 0]),
         (bytes.fromhex("000400800fff"), 12, 1, None, [0, 64, 128, 255]),
-        (bytes([0, 0, 64, 128, 128, 128, 255, 255]), 8, 1, 1, [255, 191, 255, 255]),
+        pytest.param(
+            *(bytes([0, 0, 64, 128, 128, 128, 255, 255]), 8, 1, 1, [255, 191, 255, 255]),
+            marks=pytest.mark.skipif(
+                int(PIL.__version__.split(".")[0]) < 13,
+                reason="this release of Pillow refuses gray images with premultiplied alpha",
+            ),
+        ),
     ],
     ids=["white is 0", "12 bits", "premultiplied alpha"],
 )
