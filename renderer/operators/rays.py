@@ -315,7 +315,7 @@ def _dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> F
 
 
 def directions_of_pixel(samples: int) -> Float[Tensor, "D 3"]:
-    """Compute the directions of the rays of a pixel, which its samples divide among themselves."""
+    """Compute the directions of the rays that the samples² samples of a pixel divide."""
     return sphere(max(DIRECTIONS, DIRECTIONS_PER_SAMPLE * samples**2))
 
 
