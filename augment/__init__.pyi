@@ -5,10 +5,10 @@ from augment.attacks.adversary import Adversary as Adversary
 from augment.attacks.adversary import reload as reload
 from augment.attacks.attack import AttackResult as AttackResult
 from augment.attacks.attack import attack as attack
-from augment.attacks.attack_files import save as save
 from augment.attacks.checks import check as check
 from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
+from augment.attacks.files import save as save
 from augment.classifiers import Classifier as Classifier
 from augment.classifiers import load_classifier as load_classifier
 from augment.parameter_settings import MaterialSettings as MaterialSettings
@@ -16,9 +16,9 @@ from augment.parameter_settings import ParameterSettings as ParameterSettings
 from augment.parameter_settings import PoseSettings as PoseSettings
 from augment.parameter_settings import SkylightSettings as SkylightSettings
 from augment.parameter_settings import StepSettings as StepSettings
-from augment.photographs.photograph_attack import PhotographAttackResult as PhotographAttackResult
-from augment.photographs.photograph_attack import attack_photographs as attack_photographs
-from augment.photographs.projected_light import relight_photographs as relight_photographs
+from augment.photographs import PhotographAttackResult as PhotographAttackResult
+from augment.photographs import attack_photographs as attack_photographs
+from augment.projected_light import relight_photographs as relight_photographs
 from augment.scene.build import build_scene as build_scene
 from augment.scene.conditions import Conditions as Conditions
 from augment.scene.conditions import Example as Example

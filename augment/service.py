@@ -18,8 +18,8 @@ from torch.utils.data import Dataset
 
 from augment import distributed
 from augment.attacks.attack import fooled_in_views, logits_of, warn_of_changed_light
-from augment.attacks.descent import Criterion, DescentResult
 from augment.attacks.eot import preprocessed_model
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers.adapter import NetworkCall

@@ -34,7 +34,7 @@ import torch
 from PIL import Image
 
 from augment.classifiers import Classifier
-from augment.photographs.projected_light import relight_photographs
+from augment.projected_light import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square
 from train.command_settings import LabSettings

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings
 from augment.attacks import animation
 from augment.attacks.adversary import Adversary
-from augment.attacks.descent import Criterion, DescentResult
 from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise, preprocessed_model
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem

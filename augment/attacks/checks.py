@@ -23,8 +23,8 @@ from augment.attacks.attack import (
     predictions,
     require_result,
 )
-from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
+from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem

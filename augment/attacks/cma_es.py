@@ -23,8 +23,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.attacks.descent import Criterion, DescentResult, State
 from augment.attacks.gradient_free import GradientFree
+from augment.attacks.loop import Criterion, DescentResult, State
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 

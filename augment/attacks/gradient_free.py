@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.attacks.descent import Criterion, Descent, DescentResult, Evaluation, Score, State
+from augment.attacks.loop import Criterion, Descent, DescentResult, Evaluation, Score, State
 from augment.losses import adversarial_cost
 from augment.model_passes import BatchSize
 from augment.random_streams import generator

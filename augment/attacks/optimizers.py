@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
 from augment.attacks.cma_es import CMAES
-from augment.attacks.descent import Criterion, Descent, DescentResult
 from augment.attacks.eot import ExpectationOverTransformations
+from augment.attacks.loop import Criterion, Descent, DescentResult
 from augment.attacks.random_search import RandomSearch
 from augment.progress import Phases, progress
 from augment.random_streams import generator

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from augment.attacks.descent import Decision, Evaluation, State
 from augment.attacks.gradient_free import GradientFree
+from augment.attacks.loop import Decision, Evaluation, State
 
 # Random search multiplies the length of its random changes by GROWTH after an
 # accepted candidate and by SHRINKAGE after a rejected one. Four rejections undo

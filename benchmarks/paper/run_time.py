@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 
 from augment import AttackSettings, Classifier
-from augment.attacks.descent import Criterion
+from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import build_problem
 from augment.scene.objects import SceneObject

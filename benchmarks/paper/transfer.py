@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.attacks.descent import Criterion
+from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.random_streams import generator

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.model_passes import warn_once
 

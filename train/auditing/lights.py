@@ -20,8 +20,8 @@ from torch import Tensor
 from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.checks import success_by_radius
-from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
+from augment.attacks.loop import Criterion
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
 from augment.parameter_settings import SkylightSettings, StepSettings

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from augment.attacks.search import EXPOSURES
+from augment.attacks.find_scene import EXPOSURES
 from augment.classifiers import Classifier
 from augment.progress import progress
 from augment.scene.conditions import Conditions

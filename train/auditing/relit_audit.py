@@ -11,7 +11,7 @@ from pathlib import Path
 
 from augment.attack_settings import RelightingSettings
 from augment.classifiers import Classifier
-from augment.photographs.photograph_attack import ADVERSARIAL, RANDOM, SLIDE
+from augment.photographs import ADVERSARIAL, RANDOM, SLIDE
 from train.command_settings import AuditSettings
 from train.evaluation.relit import (
     MODELED,

@@ -26,7 +26,6 @@ from augment.attacks.attack import (
     logits_of,
     predictions,
 )
-from augment.attacks.attack_files import require_renderers, save
 from augment.attacks.checks import (
     check,
     require_transferable,
@@ -34,9 +33,10 @@ from augment.attacks.checks import (
     transfer,
     warnings,
 )
-from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.search import find_scene
+from augment.attacks.files import require_renderers, save
+from augment.attacks.find_scene import find_scene
+from augment.attacks.loop import Criterion
 from augment.classifiers import Classifier
 from augment.losses import NO_CLASS
 from augment.random_streams import generator

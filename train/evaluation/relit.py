@@ -17,7 +17,7 @@ from torch import Tensor
 
 from augment.attack_settings import RelightingSettings
 from augment.classifiers import Classifier
-from augment.photographs.photograph_attack import (
+from augment.photographs import (
     ADVERSARIAL,
     RANDOM,
     SLIDE,

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from augment.attacks import adversary
-from augment.attacks.attack_files import LINES
+from augment.attacks.files import LINES
 from renderer.errors import InputError
 from train.data import photographs
 from train.evaluation.relit import RELIT

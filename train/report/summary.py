@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from augment.attacks.attack_files import LINES
+from augment.attacks.files import LINES
 from augment.settings import MODES
 from renderer.errors import InputError, single_line
 from train import console

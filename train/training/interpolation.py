@@ -13,8 +13,8 @@ from torch import Tensor
 
 from augment.losses import kl_divergence
 from augment.model_passes import eval_mode
-from augment.photographs.projected_light import relight_photographs
 from augment.progress import progress
+from augment.projected_light import relight_photographs
 from augment.random_streams import stream_seed
 from renderer.image import to_unit
 from train import console

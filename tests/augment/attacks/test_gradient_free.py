@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import AttackSettings
-from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.norm_ball import project
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem

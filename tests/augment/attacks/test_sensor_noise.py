@@ -10,8 +10,8 @@ from torch import Tensor
 
 import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
-from augment.attacks.descent import Criterion
 from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise
+from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.losses import NO_CLASS
 from augment.service import Renders

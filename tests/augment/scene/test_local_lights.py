@@ -167,7 +167,7 @@ def test_an_attacked_pattern_is_written_as_an_image(joint_attack):
 def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
     """Mitsuba samples the lights, its discs cast soft shadows, and our outlines are coarse."""
     pytest.importorskip("mitsuba")
-    from augment.attacks.attack_files import render_again
+    from augment.attacks.files import render_again
 
     done, _, folder = joint_attack
     image = render_again(folder, ["mitsuba"], choose("numpy"))["mitsuba"]

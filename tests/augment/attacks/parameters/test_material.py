@@ -12,7 +12,7 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
-from augment.attacks.attack_files import render_again
+from augment.attacks.files import render_again
 from augment.attacks.parameters.material import Material
 from augment.attacks.problem import AttackProblem
 from augment.parameter_settings import MATERIAL_PARTS

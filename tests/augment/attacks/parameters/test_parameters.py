@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks import norm_ball
-from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight

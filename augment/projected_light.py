@@ -19,9 +19,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from augment.photographs.slides import draw_slides, interpolate_smoothly
 from augment.random_streams import generator
 from augment.scene.patterns import luminance
+from augment.scene.slides import draw_slides, interpolate_smoothly
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed

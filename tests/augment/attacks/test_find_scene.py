@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.search import LIGHT_GRAY, _candidates, find_scene
+from augment.attacks.find_scene import LIGHT_GRAY, _candidates, find_scene
 from augment.random_streams import generator
 from augment.settings import SceneSettings
 

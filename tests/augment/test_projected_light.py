@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from augment.photographs.projected_light import (
+from augment.projected_light import (
     ProjectedLight,
     draw_projected_light,
     draw_shading,
     relight_photographs,
 )
-from augment.photographs.slides import draw_cells, draw_slides
 from augment.random_streams import generator
+from augment.scene.slides import draw_cells, draw_slides
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, encode
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from augment.attacks.norm_ball import take_step
 from augment.losses import adversarial_cost, logit_gap
 from augment.parameter_settings import StepSettings
-from augment.photographs.projected_light import ProjectedLight
+from augment.projected_light import ProjectedLight
 
 # Total length of all steps of an attack, in units of the radius of the norm-ball. It is more than
 # the diameter, so that the steps can cross the ball from any start (Madry et al. 2018).

@@ -13,8 +13,8 @@ import trimesh
 import augment
 from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.attack import AttackResult
-from augment.attacks.attack_files import LINES, SIDE, _captions, figure
 from augment.attacks.checks import warnings
+from augment.attacks.files import LINES, SIDE, _captions, figure
 from renderer.io.meshes import load_mesh
 from renderer.io.tiles import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map

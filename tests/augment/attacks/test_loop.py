@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.norm_ball import project, sample, scale_gradient
 from augment.attacks.optimizers import descend
 from augment.parameter_settings import STEPS, StepSettings

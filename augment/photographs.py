@@ -15,8 +15,9 @@ from torch import Tensor
 
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.attack import fooled_in_views
-from augment.attacks.descent import Criterion
 from augment.attacks.eot import Quantized
+from augment.attacks.gain import Best, descend_gain, draw_log_gain, search_gain
+from augment.attacks.loop import Criterion
 from augment.classifiers.adapter import Classifier
 from augment.classifiers.plain_networks import (
     UNIT_RANGE,
@@ -26,13 +27,12 @@ from augment.classifiers.plain_networks import (
     gradient_flags_kept,
 )
 from augment.model_passes import frozen_eval_mode
-from augment.photographs.gain import Best, descend_gain, draw_log_gain, search_gain
-from augment.photographs.projected_light import (
+from augment.progress import progress
+from augment.projected_light import (
     ProjectedLight,
     draw_projected_light,
     require_photographs,
 )
-from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, require_choice
 from renderer.image import decode, to_bytes, to_unit

@@ -8,9 +8,9 @@ import torch
 from torch import nn
 
 from augment.attack_settings import RelightingSettings
-from augment.photographs.gain import descend_gain
-from augment.photographs.photograph_attack import ADVERSARIAL, LIGHTS, RANDOM, attack_photographs
-from augment.photographs.projected_light import draw_projected_light
+from augment.attacks.gain import descend_gain
+from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, attack_photographs
+from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.errors import InputError
 from renderer.image import decode, to_unit
