@@ -50,7 +50,8 @@ from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.solids import solid
 from renderer.visibility.rasterizer import choose

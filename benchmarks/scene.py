@@ -25,7 +25,8 @@ from renderer.light.harmonics import basis
 from renderer.light.presets import probe
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.visibility.fragments import Fragments, build_fragments

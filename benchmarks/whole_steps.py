@@ -19,7 +19,8 @@ from benchmarks.scene import BACKGROUND, CAMERA, View, coefficients
 from renderer.camera import orbit_cameras
 from renderer.light.basis import DEGREE
 from renderer.mesh import Mesh
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.operators.stack import TransferOperators
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizer import Rasterizer

@@ -30,7 +30,8 @@ from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh, require_mesh
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.operators.rays import Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import TransferOperators

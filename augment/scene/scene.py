@@ -25,7 +25,7 @@ from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.memory import require_memory
 from renderer.mesh import Mesh
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.operators.stack import OperatorStack, ScatterLayers
 from renderer.settings import ImageSettings
 from renderer.validation import as_integers, as_list, as_tensor, require_kind

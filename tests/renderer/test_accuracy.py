@@ -34,7 +34,7 @@ from renderer.light.harmonics import basis
 from renderer.light.presets import ambient
 from renderer.mesh import Mesh, normalize
 from renderer.operators import rays
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo

@@ -13,7 +13,7 @@ from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.surface.shading import (

@@ -23,7 +23,7 @@ from renderer.light.environment import write_map
 from renderer.mesh import Mesh, normalize
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.operators import rays
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.solids import solid
 from renderer.visibility.rasterizer import choose

@@ -23,10 +23,8 @@ from renderer.mitsuba_scene import (
     render_mitsuba_scene,
     write_mitsuba_scene,
 )
-from renderer.operators.apply import (
-    TransferOperator,
-    build_operators,
-)
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.vectors import unit_vectors

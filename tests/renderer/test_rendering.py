@@ -17,7 +17,7 @@ from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.light.projector import Projector
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.rendering import light_sphere
 from renderer.settings import ENCODINGS, NORMALS, ImageSettings
 from renderer.visibility.rasterizer import choose

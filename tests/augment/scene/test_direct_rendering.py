@@ -12,7 +12,7 @@ from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 from renderer.image import decode, encode
 from renderer.mesh import Mesh
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS
 from renderer.solids import solid
 from renderer.visibility.rasterizer import choose

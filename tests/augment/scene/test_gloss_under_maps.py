@@ -15,7 +15,7 @@ from renderer.light.environment import read_map, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.presets import mean_luminance, probe
 from renderer.mesh import Mesh, normalize
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
 from renderer.solids import solid

@@ -21,7 +21,7 @@ from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.operators import lamp_paths
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.visibility.rasterizer import choose
 
 SIZE = 16

@@ -31,7 +31,7 @@ from renderer.light.environment import to_map, write_map
 from renderer.light.highlights import required_degree
 from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizer import choose
 

@@ -20,7 +20,8 @@ from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.operators import lamp_paths
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.operators.lamp_paths import local_radiance, unoccluded
 from renderer.operators.rays import Rays, Surface
 from renderer.settings import ImageSettings

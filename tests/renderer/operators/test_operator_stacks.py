@@ -16,7 +16,7 @@ from renderer.errors import InputError
 from renderer.light.basis import HARMONICS, Basis, SumBasis
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.operators.stack import TransferOperators
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss

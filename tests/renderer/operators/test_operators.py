@@ -17,7 +17,8 @@ from renderer.light.harmonics import nonzero_coefficients
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh
 from renderer.operators import distinct_pixels, lamp_paths
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.visibility.rasterizer import choose

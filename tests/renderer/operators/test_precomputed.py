@@ -24,7 +24,8 @@ from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizer import choose

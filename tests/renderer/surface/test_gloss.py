@@ -38,7 +38,8 @@ from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
-from renderer.operators.apply import TransferOperator, build_operators
+from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
 from renderer.operators.lamp_paths import local_radiance
 from renderer.operators.rays import Rays
 from renderer.rendering import precompute_transfer, render

@@ -31,7 +31,7 @@ from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import ZENITH, coefficients
-from renderer.operators.apply import build_operators
+from renderer.operators.build import build_operators
 from renderer.settings import TURBIDITY
 
 EPS = torch.finfo(torch.float64).eps
