@@ -9,8 +9,7 @@ from augment.attacks.checks import check as check
 from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
 from augment.attacks.files import save as save
-from augment.classifiers import Classifier as Classifier
-from augment.classifiers import load_classifier as load_classifier
+from augment.network import Classifier as Classifier
 from augment.parameter_settings import MaterialSettings as MaterialSettings
 from augment.parameter_settings import ParameterSettings as ParameterSettings
 from augment.parameter_settings import PoseSettings as PoseSettings
@@ -39,5 +38,6 @@ from augment.settings import SceneSettings as SceneSettings
 from augment.settings import SpecularLayerSettings as SpecularLayerSettings
 from augment.settings import TrainingAttackSettings as TrainingAttackSettings
 from augment.settings import VariationSettings as VariationSettings
+from augment.sources import load_classifier as load_classifier
 
 __version__: str

@@ -18,15 +18,15 @@ from augment.attacks.attack import fooled_in_views
 from augment.attacks.eot import Quantized
 from augment.attacks.gain import Best, descend_gain, draw_log_gain, search_gain
 from augment.attacks.loop import Criterion
-from augment.classifiers.adapter import Classifier
-from augment.classifiers.plain_networks import (
+from augment.model_passes import frozen_eval_mode
+from augment.network import Classifier
+from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
     as_classifier,
     device_of,
     gradient_flags_kept,
 )
-from augment.model_passes import frozen_eval_mode
 from augment.progress import progress
 from augment.projected_light import (
     ProjectedLight,

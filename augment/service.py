@@ -22,9 +22,9 @@ from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.classifiers.adapter import NetworkCall
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known
 from augment.model_passes import frozen_eval_mode
+from augment.network import NetworkCall
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.scene.build import MeshSource, build_scene

@@ -33,7 +33,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from augment.projected_light import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 import norm_balls as nb
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from benchmarks.many_objects import ScoredGroup, mean_with_interval
 from renderer.image import to_unit
 from train.data.photographs import find_unlabeled, load_photographs

@@ -36,7 +36,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.classifiers import Classifier, build_classifier
+from augment.network import Classifier
+from augment.sources import build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.command_settings import LabSettings

@@ -15,10 +15,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.classifiers import build_classifier
-from augment.classifiers.adapter import Normalized, call_python
-from augment.classifiers.sources import require_architecture
 from augment.model_passes import eval_mode
+from augment.network import Normalized
+from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from train.settings import WIDERESNET
 

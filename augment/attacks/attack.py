@@ -23,17 +23,11 @@ from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.classifiers.adapter import Classifier, class_index
-from augment.classifiers.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    gradient_flags_kept,
-)
-from augment.classifiers.remembered import remembering
 from augment.losses import logit_gap
 from augment.model_passes import BatchSize, eval_mode
+from augment.network import Classifier, class_index, remembering
 from augment.parameter_settings import StepSettings
+from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.conditions import Conditions

@@ -28,14 +28,9 @@ from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.classifiers import Classifier
-from augment.classifiers.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    gradient_flags_kept,
-)
+from augment.network import Classifier
 from augment.parameter_settings import StepSettings
+from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject

@@ -13,7 +13,7 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.attack import logits_of, source_labels
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import build_problem
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from augment.progress import progress
 from augment.scene.scene import Scene
 from augment.settings import SceneSettings

@@ -23,7 +23,7 @@ from augment.attacks.checks import success_by_radius
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Criterion
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator

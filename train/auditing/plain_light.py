@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from augment.attacks.find_scene import EXPOSURES
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from augment.progress import progress
 from augment.scene.conditions import Conditions
 from renderer.light.presets import UNIFORM, load_light

@@ -7,7 +7,7 @@ needs no training. Hardening trains the network on renders in unusual lighting.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from train.evaluation.scores.metrics import metric_title
 from train.evaluation.tables import Table, describe_intervals, format_interval
 from train.report.comparison import ALL, Evaluation, Evaluations, difference, mean_metric

@@ -37,8 +37,8 @@ from augment.attacks.eot import preprocessed_model
 from augment.attacks.files import require_renderers, save
 from augment.attacks.find_scene import find_scene
 from augment.attacks.loop import Criterion
-from augment.classifiers import Classifier
 from augment.losses import NO_CLASS
+from augment.network import Classifier
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.objects import SceneObject, add_table, load_object

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from augment.classifiers import Classifier
-from augment.classifiers.plain_networks import as_facts, require_no_facts
+from augment.network import Classifier
+from augment.plain_networks import as_facts, require_no_facts
 from train.command_settings import EvaluateSettings
 from train.data.photographs import class_folders
 from train.evaluation.scores.scoring import format_overall, format_scores

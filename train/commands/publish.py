@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from renderer.errors import InputError
 from train.command_settings import PublishSettings
 from train.evaluation.scores import scoring

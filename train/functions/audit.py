@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.classifiers import Classifier
-from augment.classifiers.plain_networks import (
+from augment.network import Classifier
+from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
     as_classifier,

@@ -7,9 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.classifiers import Classifier
-from augment.classifiers.adapter import Label, OperatingPoint
-from augment.classifiers.plain_networks import (
+from augment.network import Classifier, Label, OperatingPoint
+from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
     as_classifier,

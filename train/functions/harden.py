@@ -11,9 +11,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from augment.classifiers import Classifier
-from augment.classifiers.adapter import unwrapped
-from augment.classifiers.plain_networks import (
+from augment.network import Classifier, unwrapped
+from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
     as_classifier,

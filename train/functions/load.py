@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from renderer.errors import InputError
 from renderer.validation import require_kind
 from train.evaluation.scores.metrics import METRICS, read_metric

@@ -13,12 +13,11 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
-from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
-from augment.classifiers.adapter import unwrapped, with_normalized_light
-from augment.classifiers.files import is_network_file
-from augment.classifiers.inputs import say_inputs_of
-from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
+from augment.files import is_network_file
+from augment.network import Classifier, OperatingPoint, unwrapped, with_normalized_light
+from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
 from augment.settings import NormalizeLight
+from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
 from renderer.validation import as_path, require_kind

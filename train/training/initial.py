@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from augment.classifiers import Classifier, load_source
-from augment.classifiers.adapter import without_normalized_light
-from augment.classifiers.files import is_network_file
-from augment.classifiers.plain_networks import as_facts, require_no_facts
+from augment.files import is_network_file
+from augment.network import Classifier, without_normalized_light
+from augment.plain_networks import as_facts, require_no_facts
+from augment.sources import load_source
 from renderer.errors import InputError
 from renderer.validation import as_path
 from train import console

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import nearest
 from augment.model_passes import eval_mode
+from augment.network import nearest
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 

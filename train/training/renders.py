@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from augment import distributed
-from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
+from augment.network import class_index
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene

@@ -17,13 +17,13 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from augment import distributed
-from augment.classifiers.adapter import (
+from augment.network import (
     light_settings,
     unwrapped,
     with_normalized_light,
     without_normalized_light,
 )
-from augment.classifiers.inputs import say_inputs
+from augment.plain_networks import say_inputs
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.attacks.attack import AttackResult
 from augment.attacks.checks import check
-from augment.classifiers import Classifier
+from augment.network import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe

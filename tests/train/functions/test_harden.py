@@ -12,7 +12,7 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
-from augment.classifiers.adapter import OperatingPoint
+from augment.network import OperatingPoint
 from tests.runs import completed_run
 from train.__main__ import main
 

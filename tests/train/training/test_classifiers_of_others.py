@@ -11,10 +11,10 @@ from PIL import Image
 from torch import Tensor, nn
 from torchvision.models import get_model
 
-from augment.classifiers import load_classifier
-from augment.classifiers.inputs import _say_once
-from augment.classifiers.normalized_light import normalize_light
+from augment.plain_networks import _say_once
 from augment.settings import NormalizedLightSettings
+from augment.sources import load_classifier
+from augment.transforms import normalize_light
 from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command

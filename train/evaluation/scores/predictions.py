@@ -14,9 +14,9 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from augment.classifiers.adapter import Label, NetworkCall, as_class_names
 from augment.losses import log_odds
 from augment.model_passes import eval_mode
+from augment.network import Label, NetworkCall, as_class_names
 from augment.progress import progress
 from renderer.errors import InputError, require_range, single_line
 from renderer.image import to_unit

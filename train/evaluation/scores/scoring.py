@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from augment.classifiers.adapter import Label, OperatingPoint
+from augment.network import Label, OperatingPoint
 from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.io.files import atomic_write, remove_unfinished

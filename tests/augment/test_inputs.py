@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 import norm_balls as nb
-from augment.classifiers import inputs
-from augment.classifiers.plain_networks import as_classifier
+from augment import plain_networks
+from augment.plain_networks import as_classifier
 
 IMAGENET = "mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
 ASSUMED = "size and normalization are assumed"
@@ -17,7 +17,7 @@ ASSUMED = "size and normalization are assumed"
 @pytest.fixture
 def said(caplog):
     """Function that returns the lines about images so far."""
-    inputs._say_once.cache_clear()
+    plain_networks._say_once.cache_clear()
     return lambda: [record.message for record in caplog.records if "pixels" in record.message]
 
 

@@ -6,22 +6,19 @@ to find out the number of its classes.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import (
-    AnyFunction,
-    Classifier,
-    NetworkCall,
-    Normalized,
-    as_class_names,
-)
-from augment.classifiers.inputs import normalization_of, say_inputs
+from augment.distributed import rank
+from augment.network import AnyFunction, Classifier, NetworkCall, Normalized, as_class_names
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_device, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
@@ -295,3 +292,46 @@ def _count_outputs(
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
     call = NetworkCall(argument)
     return call(network, images.contiguous()).shape[1]
+
+
+def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
+    """Log the size and the normalization of the images of a network, once for each text.
+
+    `assumed` are the arguments that neither the user nor the network gave.
+    """
+    text = f"network {name}: images of {size} × {size} pixels, "
+    text += normalization_of(network) or "values in [0, 1], not normalized before the network"
+    if assumed:
+        are = " and ".join(assumed) + (" is assumed" if len(assumed) == 1 else " are assumed")
+        text += f"; {are}: give {'it' if len(assumed) == 1 else 'them'} if the network needs others"
+    if rank() == 0:
+        _say_once(text)
+
+
+def say_inputs_of(classifier: Classifier) -> None:
+    """Log the size and the normalization of the images of a classifier."""
+    say_inputs(classifier.name, classifier.function, classifier.size, classifier.assumed)
+
+
+@cache
+def _say_once(text: str) -> None:
+    """Log a text, which is shown without any settings of `logging`."""
+    logging.getLogger(__name__).warning(text)
+
+
+def normalization_of(network: Any) -> str:
+    """Describe the first mean and standard deviation of three channels in a network, if any."""
+    for module in network.modules() if isinstance(network, nn.Module) else ():
+        mean, std = (_channels(getattr(module, name, None)) for name in ("mean", "std"))
+        if mean and std:
+            order = " of blue, green and red" if getattr(module, "bgr", False) else ""
+            return f"normalized by mean {mean} and std {std}{order}"
+    return ""
+
+
+def _channels(value: Any) -> str:
+    """Write three numbers, such as "(0.485, 0.456, 0.406)". Any other value gives ""."""
+    if not isinstance(value, Tensor | list | tuple):
+        return ""
+    numbers = torch.as_tensor(value).flatten().tolist()
+    return f"({', '.join(f'{number:.3g}' for number in numbers)})" if len(numbers) == 3 else ""

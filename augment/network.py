@@ -1,18 +1,15 @@
 """The class `Classifier`: a network that takes rendered images, with the names of its classes.
 
-The network may be the user's own. A function of a Python module then returns it.
+A classifier shows its network batches of images in evaluation mode, and checks its outputs.
 """
 
 from __future__ import annotations
 
 import difflib
-import importlib
-import sys
-import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from hashlib import blake2b
 from typing import Any, Self
 
 import numpy as np
@@ -21,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
-from augment.classifiers.normalized_light import normalize_light
 from augment.losses import log_odds
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
+from augment.transforms import normalize_light
 from renderer.errors import (
     InputError,
     composed,
@@ -659,58 +656,48 @@ def nearest(name: str, choices: Sequence[str]) -> str:
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
-def load_python(name: str) -> Classifier:
-    """Load a classifier by a Python function that the user wrote."""
-    return Classifier(*call_python(name), f"python:{name}")
+class Remembered(Wrapper):
+    """Call a function from images to scores only once for each different image.
 
+    An attack shows the same image to a classifier several times: before, during
+    and after the search. This is expensive if the function is slow or paid for.
+    The scores have no gradients.
 
-def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
-    """Call a Python function that the user wrote to load a network, and check its result.
-
-    Return the network, the pixels per side of its images, and its classes in the order of the
-    logits. The name is "package.module:function".
+    Attributes:
+        scores: Scores of the C classes for each image so far, shape (C,), by the
+            hash of the image.
     """
-    separator = ":" if ":" in name else "."
-    module_name, _, function_name = name.rpartition(separator)
-    current_folder = str(Path.cwd())
-    if current_folder not in sys.path:
-        sys.path.insert(0, current_folder)
-    try:
-        module = importlib.import_module(module_name)
-        if not hasattr(module, function_name):
-            choices = nearest(function_name, [*vars(module)])
-            raise InputError(
-                f"name=python:{name}: {module.__file__} has no function {function_name}: "
-                f"did you mean {choices}?",
-                "name",
-            )
-        network, size, classes = getattr(module, function_name)()
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:  # The user's code may raise any exception.
-        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
-            raise InputError(
-                f"name=python:{name}: there is no module {module_name} in {current_folder}: "
-                f"start the command in the folder of {module_name}.py",
-                "name",
-            ) from error
-        last_call = traceback.extract_tb(error.__traceback__)[-1]
-        kind = type(error).__name__
-        place = f"line {last_call.lineno} of {last_call.filename}"
-        reason = single_line(error)  # type: ignore[arg-type]
-        raise InputError(
-            f"name=python:{name} fails ({kind}: {reason}, in {place}): "
-            "use python:package.module:function, which returns (module, size, classes)",
-            "name",
-        ) from error
-    # A single string is not a list of names, although Python counts it as a sequence of strings.
-    is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
-    has_names = is_list and all(type(item) is str for item in classes)
-    if not (callable(network) and type(size) is int and has_names):
-        kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
-        raise InputError(
-            f"name=python:{name} returns ({kinds}): "
-            "return (torch.nn.Module, pixels per side, class names)",
-            "name",
-        )
-    return network, size, classes
+
+    def __init__(self, network: Callable[[Tensor], Tensor]):
+        super().__init__(network)
+        self.scores: dict[bytes, Tensor] = {}
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the scores (N, C) of images (N, 3, H, W)."""
+        keys = [_digest(image) for image in images.detach().cpu()]
+        # Index of each new image in the batch, by its hash. Equal images have one entry.
+        new_images = {}
+        for index, key in enumerate(keys):
+            if key not in self.scores:
+                new_images[key] = index
+        if new_images:
+            indices = torch.tensor(list(new_images.values()), device=images.device)
+            scores = self.network(images.detach()[indices])
+            self.scores.update(zip(new_images, scores.detach(), strict=True))
+        return torch.stack([self.scores[key] for key in keys]).to(images)
+
+
+def _digest(image: Tensor) -> bytes:
+    """Return a hash of the dtype and the values of an image (3, H, W)."""
+    content = image.numpy().tobytes()
+    return blake2b(content, digest_size=16, key=str(image.dtype).encode()).digest()
+
+
+def remembering(classifier: Classifier) -> Classifier:
+    """Return a copy of a classifier that classifies each different image only once."""
+    if isinstance(classifier.function, Remembered):
+        return classifier
+    function = Remembered(classifier.function)
+    remembered = Classifier(function, classifier.size, classifier.classes, classifier.name)
+    remembered.operating_points = classifier.operating_points
+    return remembered

@@ -1,34 +1,38 @@
-"""Classifiers from files that contain a whole network: TorchScript, `torch.export` and ONNX.
+"""Networks and weights from files: state dicts, TorchScript, `torch.export` and ONNX.
 
+Files of weights are read without running code from them, and are compared with the network.
 TorchScript and `torch.export` are programs: they can overwrite files, and loading them can run any
 code. They are loaded only if the user trusts them. ONNX is data.
 """
 
+import argparse
 import importlib
 import io
 import json
+import pickle
+import textwrap
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
+import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import ArrayFunction, Classifier, Wrapper
-from augment.classifiers.inputs import normalization_of
-from augment.classifiers.plain_networks import (
+from augment.network import ArrayFunction, Classifier, Normalized, Wrapper
+from augment.plain_networks import (
     NO_FACTS,
     USUAL_SIZE,
     NetworkFacts,
     as_classifier,
     assumed_facts,
+    normalization_of,
     own_size,
 )
-from augment.classifiers.sources import advice_for_pickles, is_torchscript
 from renderer.errors import InputError, require_file, single_line
 
 EXPORTED = ".pt2"
@@ -41,6 +45,11 @@ SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
 CODE_MEMBERS = ("custom_obj_", "opaque_obj_")
 # Part of the names of their compiled members.
 COMPILED = "/aotinductor/"
+# Keys under which training scripts store the weights of a network in a checkpoint.
+_WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
+# Prefixes that `DataParallel`, `torch.compile` and other wrappers of a network add to the names of
+# its weights.
+_PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
 @dataclass(frozen=True)
@@ -280,3 +289,104 @@ def read_onnx(path: Path) -> Content:
         return session.run(None, {images.name: batch.astype(np.float32)})[0]
 
     return Content(ArrayFunction(logits), sizes)
+
+
+def read_weights(path: Path) -> Mapping[str, Tensor]:
+    """Read the weights of a network without running code from the file.
+
+    Return the state dict on the CPU, without the prefixes of `DataParallel` and `torch.compile`.
+    """
+    require_file(path, "give the path of a file of weights")
+    try:
+        if path.suffix == ".safetensors":
+            return _without_prefixes(safetensors.torch.load_file(path))
+        # Permit this class, because the training scripts of torchvision store their arguments.
+        with torch.serialization.safe_globals([argparse.Namespace]):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        return _without_prefixes(_state_dict(content))
+    # torch and safetensors raise many kinds of errors for damaged files.
+    except Exception as error:
+        if (advice := advice_for_pickles(path)) is not None:
+            raise InputError(
+                f"weights={path} cannot be loaded, because it {advice}", "weights"
+            ) from error
+        reason = textwrap.shorten(str(error), 200)
+        if isinstance(error, pickle.UnpicklingError):
+            reason = "it is not a file of weights, or contains other objects"
+        raise InputError(
+            f"weights={path} cannot be read ({reason}): save a network's state_dict() alone",
+            "weights",
+        ) from error
+
+
+def _state_dict(content: Any) -> Mapping[str, Tensor]:
+    """Find the state dict in the content of a file of weights."""
+    # A mapping that has not only tensors is a checkpoint. Look under the usual keys.
+    while isinstance(content, Mapping) and not all(
+        isinstance(value, Tensor) for value in content.values()
+    ):
+        inner_mappings = [
+            content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)
+        ]
+        if not inner_mappings:
+            raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
+        content = inner_mappings[0]
+    if not isinstance(content, Mapping):
+        raise TypeError(f"it contains a value of type {type(content).__name__}")
+    return content
+
+
+def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """Remove prefixes such as "module." from the names of weights, if all names have them."""
+    for prefix in _PREFIXES:
+        if state and all(key.startswith(prefix) for key in state):
+            return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})
+    return state
+
+
+def advice_for_pickles(path: Path) -> str | None:
+    """Return advice for a user who gave a file with a whole network as a file of weights.
+
+    Its subject is the file. None stands for a file without a network.
+    """
+    if is_torchscript(path):
+        return (
+            "is a TorchScript file, which contains its own network: "
+            f"set classifier={path} trust=true"
+        )
+    try:
+        names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    except Exception:  # `torch.save` did not write the file.
+        return None
+    if not any(name.startswith("torch.nn.modules.") for name in names):
+        return None
+    return (
+        "contains a pickled module, which runs code when it is loaded: if you made the file, save "
+        f'its weights with the two lines network = torch.load("{path}", weights_only=False) and '
+        'torch.save(network.state_dict(), "weights.pth")'
+    )
+
+
+def is_torchscript(path: Path) -> bool:
+    """Return whether a file is an archive of TorchScript, which contains constants.pkl."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+
+
+def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
+    """Load weights into the network of a classifier.
+
+    The classifier, whose `function` is `Normalized`, is changed in place and returned.
+    """
+    try:
+        cast(Normalized, classifier.function).network.load_state_dict(state)
+    except (RuntimeError, ValueError) as error:
+        reason = textwrap.shorten(str(error), 300)
+        raise InputError(
+            f"weights={source} do not fit {classifier.name} ({reason}): "
+            "use weights of that network",
+            "weights",
+        ) from error
+    return classifier

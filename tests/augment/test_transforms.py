@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Classifier, NormalizedLight
-from augment.classifiers.normalized_light import normalize_light
-from augment.classifiers.plain_networks import as_classifier
+from augment.network import Classifier, NormalizedLight
+from augment.plain_networks import as_classifier
 from augment.settings import NormalizedLightSettings
+from augment.transforms import normalize_light
 from renderer import InputError
 
 SIZE = 12

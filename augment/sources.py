@@ -1,37 +1,39 @@
-"""Load ImageNet classifiers of torchvision, timm, EfficientNet-Lite and Caffe's SqueezeNet.
+"""Networks by name: of torchvision, timm, EfficientNet-Lite, Caffe, a file or a Python function.
 
 For each source, one function builds a network with random weights, and another also loads weights.
-
-Files of weights are read without running code from them. Names and shapes of the weights are
-compared with those of the network.
 """
 
-import argparse
 import importlib
 import math
-import pickle
 import re
-import textwrap
-import zipfile
-from collections.abc import Mapping, Sequence
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import safetensors.torch
-import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Classifier, Normalized, nearest
-from augment.classifiers.plain_networks import (
+from augment.files import SUFFIXES, build_file, fill, load_file, read_weights
+from augment.network import Classifier, Normalized, nearest
+from augment.plain_networks import (
     NO_FACTS,
     NetworkFacts,
+    Normalization,
+    as_facts,
     assumed_facts,
     index_names,
     mean_and_std,
     own_size,
+    require_no_facts,
+    say_inputs_of,
 )
-from renderer.errors import InputError, require_file, single_line
+from augment.progress import progress_message
+from augment.settings import NormalizeLight
+from renderer.errors import InputError, single_line
+from renderer.validation import as_path, require_flag, require_kind
 
 if TYPE_CHECKING:
     # Importing torchvision takes a second. Functions import it when they need it.
@@ -40,17 +42,14 @@ if TYPE_CHECKING:
 # Networks of torchvision that were trained with another normalization than that of ImageNet. They
 # convert their images if the argument `transform_input` is True.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
+# A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
+PYTHON = "python:"
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
 # Mean of the channels blue, green and red that Caffe's networks subtract, from 0 to 255.
 _CAFFE_MEAN = (104, 117, 123)
-# Keys under which training scripts store the weights of a network in a checkpoint.
-_WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
 # Ends of the names of position embeddings in the transformers of torchvision and timm.
 POSITIONS = ("pos_embedding", "pos_embed")
-# Prefixes that `DataParallel`, `torch.compile` and other wrappers of a network add to the names of
-# its weights.
-_PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
 def imagenet_classes() -> tuple[str, ...]:
@@ -338,102 +337,229 @@ def _import(package: str, name: str, install: str = "") -> Any:
         raise InputError(message, "name") from error
 
 
-def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """Read the weights of a network without running code from the file.
+def load_python(name: str) -> Classifier:
+    """Load a classifier by a Python function that the user wrote."""
+    return Classifier(*call_python(name), f"python:{name}")
 
-    Return the state dict on the CPU, without the prefixes of `DataParallel` and `torch.compile`.
+
+def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
+    """Call a Python function that the user wrote to load a network, and check its result.
+
+    Return the network, the pixels per side of its images, and its classes in the order of the
+    logits. The name is "package.module:function".
     """
-    require_file(path, "give the path of a file of weights")
+    separator = ":" if ":" in name else "."
+    module_name, _, function_name = name.rpartition(separator)
+    current_folder = str(Path.cwd())
+    if current_folder not in sys.path:
+        sys.path.insert(0, current_folder)
     try:
-        if path.suffix == ".safetensors":
-            return _without_prefixes(safetensors.torch.load_file(path))
-        # Permit this class, because the training scripts of torchvision store their arguments.
-        with torch.serialization.safe_globals([argparse.Namespace]):
-            content = torch.load(path, map_location="cpu", weights_only=True)
-        return _without_prefixes(_state_dict(content))
-    # torch and safetensors raise many kinds of errors for damaged files.
-    except Exception as error:
-        if (advice := advice_for_pickles(path)) is not None:
+        module = importlib.import_module(module_name)
+        if not hasattr(module, function_name):
+            choices = nearest(function_name, [*vars(module)])
             raise InputError(
-                f"weights={path} cannot be loaded, because it {advice}", "weights"
+                f"name=python:{name}: {module.__file__} has no function {function_name}: "
+                f"did you mean {choices}?",
+                "name",
+            )
+        network, size, classes = getattr(module, function_name)()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # The user's code may raise any exception.
+        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
+            raise InputError(
+                f"name=python:{name}: there is no module {module_name} in {current_folder}: "
+                f"start the command in the folder of {module_name}.py",
+                "name",
             ) from error
-        reason = textwrap.shorten(str(error), 200)
-        if isinstance(error, pickle.UnpicklingError):
-            reason = "it is not a file of weights, or contains other objects"
+        last_call = traceback.extract_tb(error.__traceback__)[-1]
+        kind = type(error).__name__
+        place = f"line {last_call.lineno} of {last_call.filename}"
+        reason = single_line(error)  # type: ignore[arg-type]
         raise InputError(
-            f"weights={path} cannot be read ({reason}): save a network's state_dict() alone",
-            "weights",
+            f"name=python:{name} fails ({kind}: {reason}, in {place}): "
+            "use python:package.module:function, which returns (module, size, classes)",
+            "name",
         ) from error
-
-
-def _state_dict(content: Any) -> Mapping[str, Tensor]:
-    """Find the state dict in the content of a file of weights."""
-    # A mapping that has not only tensors is a checkpoint. Look under the usual keys.
-    while isinstance(content, Mapping) and not all(
-        isinstance(value, Tensor) for value in content.values()
-    ):
-        inner_mappings = [
-            content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)
-        ]
-        if not inner_mappings:
-            raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
-        content = inner_mappings[0]
-    if not isinstance(content, Mapping):
-        raise TypeError(f"it contains a value of type {type(content).__name__}")
-    return content
-
-
-def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Remove prefixes such as "module." from the names of weights, if all names have them."""
-    for prefix in _PREFIXES:
-        if state and all(key.startswith(prefix) for key in state):
-            return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})
-    return state
-
-
-def advice_for_pickles(path: Path) -> str | None:
-    """Return advice for a user who gave a file with a whole network as a file of weights.
-
-    Its subject is the file. None stands for a file without a network.
-    """
-    if is_torchscript(path):
-        return (
-            "is a TorchScript file, which contains its own network: "
-            f"set classifier={path} trust=true"
+    # A single string is not a list of names, although Python counts it as a sequence of strings.
+    is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
+    has_names = is_list and all(type(item) is str for item in classes)
+    if not (callable(network) and type(size) is int and has_names):
+        kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
+        raise InputError(
+            f"name=python:{name} returns ({kinds}): "
+            "return (torch.nn.Module, pixels per side, class names)",
+            "name",
         )
-    try:
-        names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-    except Exception:  # `torch.save` did not write the file.
-        return None
-    if not any(name.startswith("torch.nn.modules.") for name in names):
-        return None
-    return (
-        "contains a pickled module, which runs code when it is loaded: if you made the file, save "
-        f'its weights with the two lines network = torch.load("{path}", weights_only=False) and '
-        'torch.save(network.state_dict(), "weights.pth")'
-    )
+    return network, size, classes
 
 
-def is_torchscript(path: Path) -> bool:
-    """Return whether a file is an archive of TorchScript, which contains constants.pkl."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+class Source(NamedTuple):
+    """Functions that make the classifiers of one source, such as torchvision.
 
+    A source with several models has a name with a colon at the end, such as
+    "torchvision:". Its functions take the name of the model as their first
+    argument.
 
-def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
-    """Load weights into the network of a classifier.
-
-    The classifier, whose `function` is `Normalized`, is changed in place and returned.
+    Attributes:
+        load: Function that makes a classifier with weights. It takes a file of
+            weights (None for the published weights) and, if `takes_facts` is
+            True, `NetworkFacts`.
+        build: Function that makes a classifier with random weights. It takes the
+            pixels per side of the images and, if `takes_facts` is True,
+            `NetworkFacts`.
+        takes_facts: Whether the user may choose classes, image size and
+            normalization (the `NetworkFacts`).
     """
-    try:
-        _network(classifier).load_state_dict(state)
-    except (RuntimeError, ValueError) as error:
-        reason = textwrap.shorten(str(error), 300)
+
+    load: Callable[..., Classifier]
+    build: Any
+    takes_facts: bool = False
+
+
+def _efficientnet_lite(version: int) -> Source:
+    """Return the functions that load or build a classifier EfficientNet-Lite."""
+    load = partial(load_efficientnet_lite, version)
+    build = partial(build_efficientnet_lite, version)
+    return Source(load, build)
+
+
+def _load_python(name: str, weights: Path | None) -> Classifier:
+    """Load a classifier by a Python function that the user wrote."""
+    if weights is not None:
         raise InputError(
-            f"weights={source} do not fit {classifier.name} ({reason}): "
-            "use weights of that network",
+            f"weights={weights} cannot be combined with python:{name}, a function that "
+            "loads the weights itself: leave weights out",
             "weights",
-        ) from error
-    return classifier
+        )
+    return load_python(name)
+
+
+# Sources by their names. The module `train.networks` adds "run:", for networks that this project
+# trains.
+SOURCES = {
+    "efficientnet_lite0": _efficientnet_lite(0),
+    "efficientnet_lite1": _efficientnet_lite(1),
+    "efficientnet_lite2": _efficientnet_lite(2),
+    SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
+    "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
+    "timm:": Source(load_timm, build_timm, takes_facts=True),
+    # A function of the user chooses the size itself, so the size is not used.
+    PYTHON: Source(_load_python, lambda model, size: load_python(model)),
+}
+
+
+def load_classifier(
+    name: str,
+    weights: str | Path | None = None,
+    classes: Sequence[str] | str | Path | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    normalize_light: NormalizeLight = None,
+    trust_code: bool = False,
+) -> Classifier:
+    """Load a classifier by name, on the CPU.
+
+    The size and the normalization of its images are logged once, with what of
+    them is assumed.
+
+    Files of weights (safetensors, state dicts) and of ONNX may come from
+    strangers. Files of TorchScript and of `torch.export` are programs that can
+    run any code, and so are the functions that `python:` names.
+
+    Args:
+        name: `efficientnet_lite0`, `efficientnet_lite1`, `efficientnet_lite2`,
+            `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME`,
+            `python:package.module:function`, or the path of a file of
+            TorchScript, `torch.export` (.pt2) or ONNX (.onnx). The commands
+            also take `run:FOLDER`, which is `nb.load_run(FOLDER)` in Python.
+        weights: File of weights. None for the weights that the source contains
+            or downloads. The number of classes is read from the file.
+        classes: Names of the classes in the order of the outputs, or a text
+            file with a name in each line. None for the names that the source
+            knows or, if it knows none, for "0", "1" and so on.
+        size: Pixels per side of the images. None for the size of the source.
+        normalization: "imagenet", or mean and standard deviation of the
+            channels red, green and blue, in units of [0, 1]. None for the
+            normalization of the source.
+        normalize_light: How the light of each image is normalized first: True
+            for the defaults, or a mapping with fields of
+            `NormalizedLightSettings`. This is independent of `normalization`.
+        trust_code: Whether `name` may be a file of TorchScript or
+            `torch.export`. Set it only if you made the file or trust its author.
+
+    Returns:
+        The classifier.
+
+    Raises:
+        InputError: If the name is unknown or is a program that is not trusted,
+            if the weights are missing, damaged or of another network, if the
+            classes are not as many as the network has, or if a package is not
+            installed.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> nb.load_classifier("torchvision:squeezenet1_1", "absent.pt")
+        Traceback (most recent call last):
+        renderer.errors.InputError: absent.pt does not exist: give the path of a file of weights
+    """
+    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    path = None if weights is None else as_path("weights", weights)
+    facts = as_facts(classes, size, normalization)
+    require_flag("trust_code", trust_code)
+    classifier = load_source(name, path, facts, trust_code)
+    say_inputs_of(classifier)
+    return classifier.normalizing_light(normalize_light)
+
+
+def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
+    """Load a classifier by name, without the normalization of light, and without any message.
+
+    `path` is a file of weights. None stands for the weights of the source.
+    """
+    source, colon, model = name.partition(":")
+    if source + colon in SOURCES:
+        arguments: list[Any] = [model, path] if colon else [path]
+        load = SOURCES[source + colon].load
+        if SOURCES[source + colon].takes_facts:
+            arguments.append(facts)
+        else:
+            require_no_facts(name, facts)
+        with progress_message(f"loading {name}"):
+            return load(*arguments)
+    if Path(name).suffix.lower() in SUFFIXES:
+        if path is not None:
+            raise InputError(
+                f"weights={path} cannot be combined with {name}, a file that contains weights: "
+                "leave weights out",
+                "weights",
+            )
+        with progress_message(f"loading {name}"):
+            return load_file(name, facts, trust_code)
+    choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
+    choices.append(f"a file ({', '.join(SUFFIXES)})")
+    raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
+
+
+def build_classifier(
+    name: str,
+    size: int,
+    classes: Sequence[str] | None = None,
+    normalization: Normalization = None,
+    trust_code: bool = False,
+) -> Classifier:
+    """Build a classifier with random weights.
+
+    A Python function of the user chooses weights and size itself, and a file contains its weights.
+    These classifiers are loaded as they are. Only the network of a file takes the normalization;
+    all other sources have their own.
+    """
+    source, colon, model = name.partition(":")
+    if source + colon not in SOURCES:
+        facts = as_facts(classes, normalization=normalization)
+        return build_file(name, size, facts, trust_code)
+    known = SOURCES[source + colon]
+    arguments: list[Any] = [model, size] if colon else [size]
+    if known.takes_facts:
+        arguments.append(as_facts(classes))
+    return known.build(*arguments)

@@ -22,9 +22,8 @@ from torchvision.models import (
     squeezenet1_1,
 )
 
-from augment.classifiers import Classifier, load_classifier
-from augment.classifiers.adapter import Normalized
-from augment.classifiers.sources import imagenet_classes, published_weights
+from augment.network import Classifier, Normalized
+from augment.sources import imagenet_classes, load_classifier, published_weights
 from renderer.errors import InputError
 
 DATA = Path(__file__).parents[4] / "shared" / "data"

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from augment.classifiers import load_classifier
+from augment.sources import load_classifier
 from renderer.errors import InputError
 
 SIZE = 8

@@ -10,7 +10,7 @@ from torchvision.transforms import Normalize
 
 import augment
 import renderer
-from augment.classifiers.plain_networks import as_classifier
+from augment.plain_networks import as_classifier
 from renderer import InputError
 
 MEAN = (0.485, 0.456, 0.406)
