@@ -38,8 +38,8 @@ from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility.rasterizer import choose
-from train.runs.saved_networks import load_run
-from train.system.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
+from train.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
+from train.saved_networks import load_run
 
 NETWORK = "pretrained/none"
 MESH_COUNT = 2

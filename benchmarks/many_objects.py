@@ -39,7 +39,6 @@ from benchmarks.splits import Method, adapt_texture_or_material, load, log_evalu
 from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
-from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import (
     Jackknife,
     Units,
@@ -49,6 +48,7 @@ from train.evaluation.scores.metrics import (
     weighted_means,
 )
 from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
+from train.laboratory.laboratory import write_laboratory
 
 TEST = "test"
 SAME = "objects trained on"

@@ -25,7 +25,7 @@ from benchmarks.many_objects import ScoredGroup, mean_with_interval
 from renderer.image import to_unit
 from train.data.photographs import find_unlabeled, load_photographs
 from train.evaluation.tables import Estimate, format_interval
-from train.runs.saved_networks import load_network
+from train.saved_networks import load_network
 
 # Photographs per pass.
 BATCH = 32

@@ -43,7 +43,7 @@ from renderer.light.environment import read_map
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.data.sets import Split, held_out_rows, load_npz
-from train.evaluation.laboratory.laboratory import write_laboratory
+from train.device import MixedPrecision, choose_precision
 from train.evaluation.scores.metrics import METRICS, Pooled, metric_title
 from train.evaluation.scores.predictions import (
     PREDICTIONS,
@@ -52,11 +52,11 @@ from train.evaluation.scores.predictions import (
     write_predictions,
 )
 from train.evaluation.tables import Estimate, Table, format_interval
+from train.hashing import content_hash
+from train.laboratory.laboratory import write_laboratory
 from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary, summarize
-from train.runs.saved_networks import is_classifier, load_network, load_run
-from train.system.device import MixedPrecision, choose_precision
-from train.system.hashing import content_hash
+from train.saved_networks import is_classifier, load_network, load_run
 from train.training.loop import evaluate
 
 ROOT = Path(__file__).parent.parent

@@ -47,12 +47,12 @@ from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, record, with_median
+from train import checkpoints, run_folder
 from train.__main__ import main as train_command
+from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
-from train.runs import checkpoint
-from train.runs.run_log import read_metrics
+from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
-from train.system.device import MixedPrecision
 
 # Images in an epoch of CIFAR-100: nine tenths of its training set.
 EPOCH_IMAGES = 45_000
@@ -315,9 +315,9 @@ def train_certain_network(run: Path, options: argparse.Namespace) -> Path:
     train(run, options, "augment=none")
     with np.load(options.data, allow_pickle=False) as archive:
         label = archive["classes"].tolist().index(options.label)
-    state = checkpoint.load(run / checkpoint.BEST)
+    state = checkpoints.load(run / run_folder.BEST)
     make_certain(state["model"]["head.weight"], state["model"]["head.bias"], label)
-    checkpoint.save(run / checkpoint.BEST, state)
+    checkpoints.save(run / run_folder.BEST, state)
     return run
 
 

@@ -4,7 +4,7 @@ A point has two coordinates in the projected image: x to the right and y down, b
 Tensors of points have these coordinates on their first axis, shape (2, ...). A shape gives each
 point a weight (...): 1 in the first color, 0 in the second. `draw_patterns` draws the patterns of
 the training. The laboratory uses the same shapes in other sizes
-(train/evaluation/laboratory/lab_patterns.py).
+(train/laboratory/lab_patterns.py).
 """
 
 import math

@@ -15,7 +15,7 @@ from torchvision.models import squeezenet1_1
 from augment.settings import NormalizedLightSettings
 from augment.transforms import normalize_light
 from benchmarks import splits
-from train.evaluation.laboratory import lab_patterns as patterns
+from train.laboratory import lab_patterns as patterns
 
 # Patterns, lights and meshes of training.
 TRAINING = {

@@ -27,10 +27,10 @@ from hypothesis import strategies as st
 
 from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
+from train import checkpoints, run_folder
 from train.command import USER_ERROR
 from train.data.sets import load_folder, load_npz
-from train.runs import checkpoint
-from train.system.hashing import content_hash
+from train.hashing import content_hash
 
 from .conftest import MAX_SECONDS, RENDERER, TRAINING, run_here
 
@@ -186,7 +186,7 @@ def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
 def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
     """Replace one value of a checkpoint, and give it the right hash."""
     state = torch.load(io.BytesIO(good), weights_only=True)
-    state.pop(checkpoint.HASH)
+    state.pop(checkpoints.HASH)
     node = state
     key = draw(st.sampled_from(sorted(state)))
     while isinstance(node[key], Mapping) and node[key] and draw(st.integers(0, 3)):
@@ -198,7 +198,7 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
     else:
         node[key] = draw(st.sampled_from(VALUES))
     content = io.BytesIO()
-    torch.save({**state, checkpoint.HASH: content_hash(state)}, content)
+    torch.save({**state, checkpoints.HASH: content_hash(state)}, content)
     return content.getvalue()
 
 
@@ -421,7 +421,7 @@ FORGED: list[
     (
         "finished/last.pt",
         "code, and none before it",
-        lambda path: (pickled_code(path), path.with_name(checkpoint.PREVIOUS).unlink()),
+        lambda path: (pickled_code(path), path.with_name(run_folder.PREVIOUS).unlink()),
     ),
     ("published/model.safetensors", "10 TB", safetensors(a=LARGE)),
     (

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from train import checkpoints, run_folder
 from train.command import USER_ERROR
-from train.runs import checkpoint
-from train.runs.run_log import METRICS, read_metrics
-from train.system.hashing import content_hash
+from train.hashing import content_hash
+from train.run_folder import METRICS, read_metrics
 
 from .conftest import MAX_SECONDS, TRAINING, Process, end, run_here, start_command
 
@@ -59,8 +59,8 @@ def contents(run: Path) -> dict[str, Any]:
     Checkpoints are represented by hashes of their entries.
     """
     result: dict[str, Any] = {METRICS: without_seconds(read_metrics(run))}
-    for name in (checkpoint.LAST, checkpoint.BEST):
-        for part, value in checkpoint.load(run / name).items():
+    for name in (run_folder.LAST, run_folder.BEST):
+        for part, value in checkpoints.load(run / name).items():
             result[f"{name}: {part}"] = content_hash(without_seconds(value))
     result["half-written"] = sorted(path.name for path in run.glob("**/*.tmp"))
     for folder in ("renders", "photographs"):
@@ -192,11 +192,11 @@ def empty(content: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        (checkpoint.LAST, flip),
-        (checkpoint.LAST, cut),
-        (checkpoint.LAST, empty),
-        (checkpoint.LAST, None),
-        (checkpoint.PREVIOUS, flip),
+        (run_folder.LAST, flip),
+        (run_folder.LAST, cut),
+        (run_folder.LAST, empty),
+        (run_folder.LAST, None),
+        (run_folder.PREVIOUS, flip),
         (METRICS, cut),
         (METRICS, None),
     ],
@@ -210,7 +210,7 @@ def test_a_run_with_a_damaged_or_missing_file_reports_it_and_ends_the_same(
     if damage:
         (run / file).write_bytes(damage(content))
     output = assert_resumed(run)
-    if file == checkpoint.LAST:
-        assert f"{checkpoint.LAST} " in output
+    if file == run_folder.LAST:
+        assert f"{run_folder.LAST} " in output
     else:
         assert "resumed" in output

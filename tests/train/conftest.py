@@ -13,7 +13,7 @@ from PIL import Image
 from tests.helpers import save_colored_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.runs.run_config import write_config
+from train.run_config import write_config
 from train.settings import ExperimentSettings
 
 TINY = [

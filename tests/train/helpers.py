@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from PIL import Image
 
+from train.checkpoints import save
 from train.networks import WideResNet, describe
-from train.runs.checkpoint import BEST, save
+from train.run_folder import BEST
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
 

@@ -19,11 +19,10 @@ from train import command, console
 from train.command import USER_ERROR, Command
 from train.command_settings import LightSettings
 from train.commands.experiment import logged_to
+from train.hashing import content_hash
 from train.help import HelpText
-from train.runs.checkpoint import LAST
-from train.runs.run_lock import locked
+from train.run_folder import LAST, locked
 from train.system import user_errors as errors
-from train.system.hashing import content_hash
 from train.system.user_errors import user_message, writable_folder
 from train.system.verbosity import take_flag
 

@@ -19,8 +19,8 @@ from augment.attacks.adversary import write_adversary
 from renderer.light.files import read_light
 from renderer.light.projector import Projector
 from train.__main__ import main
-from train.runs.run_config import read_config
-from train.runs.saved_networks import load_run
+from train.run_config import read_config
+from train.saved_networks import load_run
 
 EARLIER = Path(__file__).with_name("earlier_files")
 EXAMPLE = EARLIER / "attack" / "0_solid_orange_0" / "example_000"

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
+from train.checkpoints import save
 from train.networks import Dropout, WideResNet, build_network, describe
-from train.runs.checkpoint import BEST, save
-from train.runs.saved_networks import PUBLISHED, load_network, load_run, load_selected, publish
+from train.run_folder import BEST, PUBLISHED
+from train.saved_networks import load_network, load_run, load_selected, publish
 from train.training.initial import Initial
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"

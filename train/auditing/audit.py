@@ -50,16 +50,16 @@ from train.class_names import class_name, class_of_meshes, require_others, with_
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabeled
-from train.evaluation.laboratory.laboratory import write_laboratory
+from train.device import choose_device
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
+from train.laboratory.laboratory import write_laboratory
 from train.report.report_page import PAGE
 from train.report.results import RESULTS, require_replaceable
-from train.runs.run_config import CONFIG, read_config, read_json, require_same, write_config
-from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import load_chosen, load_network
+from train.run_config import CONFIG, read_config, require_same, write_config
+from train.run_folder import read_json, sole_writer
+from train.saved_networks import load_chosen, load_network
 from train.settings import published, read_objects, simplified, solid_name
-from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 
 # Number of views of the meshes that are rendered in environment lighting.

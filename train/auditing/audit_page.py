@@ -50,7 +50,8 @@ from train.report.first_screen import (
 )
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
-from train.runs.run_config import CONFIG, read_config, read_json
+from train.run_config import CONFIG, read_config
+from train.run_folder import read_json
 
 # Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {

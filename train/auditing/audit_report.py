@@ -14,7 +14,7 @@ from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.evaluation.scores.metrics import METRICS, read_metric
 from train.evaluation.scores.scoring import SUMMARY
 from train.evaluation.tables import Estimate
-from train.runs.run_config import read_json
+from train.run_folder import read_json
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from train.report import plots
 from train.report.first_screen import FirstScreen, ShownMetric
 from train.report.plots import Picture
 from train.report.report_page import write_page
-from train.runs.run_config import CONFIG, read_config
+from train.run_config import CONFIG, read_config
 from train.settings import published
 
 # Name of the subfolder for these results in the folder of results of a network.

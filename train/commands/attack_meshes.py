@@ -50,6 +50,7 @@ from train.class_names import class_name, class_of_meshes
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.commands import attack_photographs
+from train.device import choose_device, choose_rasterizer
 from train.evaluation.tables import Table
 from train.report.attack_tables import (
     FIGURE,
@@ -62,11 +63,10 @@ from train.report.attack_tables import (
     write_transfers,
 )
 from train.report.results import remove_attack, require_replaceable
-from train.runs.run_config import write_config
-from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import load_chosen, load_network
+from train.run_config import write_config
+from train.run_folder import sole_writer
+from train.saved_networks import load_chosen, load_network
 from train.settings import read_object, read_objects
-from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, keys_of, writable_folder
 from train.system.verbosity import is_verbose, shortened
 

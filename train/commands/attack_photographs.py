@@ -5,13 +5,13 @@ from pathlib import Path
 from renderer.errors import InputError
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings
+from train.device import choose_device
 from train.evaluation.relit import MODELED, RELIT, attack_folder
 from train.report.results import remove_attack, require_replaceable
-from train.runs.run_config import write_config
-from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import load_chosen
+from train.run_config import write_config
+from train.run_folder import sole_writer
+from train.saved_networks import load_chosen
 from train.settings import published
-from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import shortened
 

@@ -19,17 +19,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment import distributed
 from augment.settings import MODES
-from train import console
+from train import checkpoints, console
 from train.command import compose, program, read_settings
+from train.processes import Interrupted, broadcast, process_group
 from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import report_of
 from train.report.results import remove_run, require_new_run
 from train.report.summary import is_finished, summarize
-from train.runs import checkpoint
-from train.runs.run_config import CONFIG, format_command, require_same_run, resume_config
-from train.runs.run_lock import sole_writer
+from train.run_config import CONFIG, format_command, require_same_run, resume_config
+from train.run_folder import sole_writer
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
-from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import is_verbose
 from train.training.initial import with_label
@@ -148,7 +147,7 @@ def _train_in(
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
-            if any(map(checkpoint.exists, settings_of_runs)):
+            if any(map(checkpoints.exists, settings_of_runs)):
                 words = [*resuming, f"run={resumed_folder or folder}", "train.resume=true"]
                 advice = f"to go on: {shlex.join(words)}"
             console.info("%s%s", cause, advice)

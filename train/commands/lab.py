@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from train.command_settings import LabSettings
-from train.evaluation.laboratory.laboratory import write_laboratory
+from train.laboratory.laboratory import write_laboratory
 from train.report.results import require_replaceable
 from train.settings import label_names
 

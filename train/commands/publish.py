@@ -12,7 +12,8 @@ from train.evaluation.scores.predictions import Predictor
 from train.networks import PYTHON
 from train.report.results import require_replaceable
 from train.report.summary import summarize, trained_labels
-from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
+from train.run_folder import PUBLISHED
+from train.saved_networks import load_run, load_selected, publish
 from train.settings import mapped, published
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import shortened

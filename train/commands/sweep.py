@@ -21,16 +21,15 @@ from omegaconf import DictConfig
 
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train import console
+from train import checkpoints, console
 from train.command import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
 from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import PAGE, report_of
 from train.report.results import require_new_run, require_replaceable
 from train.report.summary import is_finished, summarize
-from train.runs import checkpoint
-from train.runs.run_config import format_command, require_same_run
-from train.runs.run_lock import FAILURE, locked, state
+from train.run_config import format_command, require_same_run
+from train.run_folder import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system.user_errors import user_message, writable_folder
@@ -96,7 +95,7 @@ def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
 
 def _is_new(folder: Path, settings: ExperimentSettings, overwrite: bool) -> bool:
     """Return whether a run of a sweep is new: its folder holds no run that goes on there."""
-    if is_finished(folder) or checkpoint.exists(folder):
+    if is_finished(folder) or checkpoints.exists(folder):
         require_same_run(folder, settings, finished=True)
         return False
     require_new_run(folder, "sweep", overwrite, resume=True)
@@ -186,7 +185,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
     `overrides` are escaped as Hydra escapes them.
     """
     settings = with_label(read_settings(ExperimentSettings, config))
-    settings.train.resume = checkpoint.exists(folder)
+    settings.train.resume = checkpoints.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
     (run,) = load_runs({folder: settings}, command)
     run.fit()

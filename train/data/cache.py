@@ -17,7 +17,7 @@ from torch import Tensor
 
 from renderer.io.files import atomic_write
 from train import console
-from train.system.hashing import content_hash
+from train.hashing import content_hash
 
 # Each file of the cache begins with a SHA-256 checksum, which has 32 bytes.
 CHECKSUM_BYTES = 32

@@ -30,7 +30,7 @@ from renderer.visibility.rasterizer import choose
 from train import console
 from train.data.cache import TensorCache, source_key
 from train.data.sets import DataSet, Split
-from train.system.hashing import content_hash
+from train.hashing import content_hash
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)

@@ -24,7 +24,7 @@ from train.data.photographs import (
     load_photographs,
     unsupported_files,
 )
-from train.system.hashing import content_hash
+from train.hashing import content_hash
 
 # Folders with these names hold splits of a data set. All other folders hold the
 # images of a class.

@@ -31,7 +31,7 @@ from renderer.short_repr import ShortRepr
 from train.data.photographs import Photograph, find_unlabeled, load_photographs
 from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
-from train.runs.run_config import read_json
+from train.run_folder import read_json
 
 # Name of the file with the predictions for all photographs.
 RELIT = "relit.json"

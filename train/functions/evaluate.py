@@ -20,13 +20,13 @@ from renderer.errors import InputError
 from renderer.validation import as_folder
 from train.command_settings import require_calibration
 from train.data.photographs import class_folders, require_outside
+from train.device import MixedPrecision, choose_precision
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import Scores
 from train.report.results import require_replaceable
-from train.runs.run_lock import sole_writer
+from train.run_folder import sole_writer
 from train.settings import label_names, published
-from train.system.device import MixedPrecision, choose_precision
 from train.system.user_errors import keyed, writable_folder
 
 # Largest number of classes that are positive because they have a sub-folder. The scores of each

@@ -30,7 +30,7 @@ from train.command import read_settings
 from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
 from train.report.report_page import report_of
 from train.report.results import require_new_run
-from train.runs.run_lock import sole_writer
+from train.run_folder import sole_writer
 from train.settings import (
     OTHER,
     DataSettings,

@@ -9,7 +9,8 @@ from renderer.errors import InputError
 from renderer.validation import require_kind
 from train.evaluation.scores.metrics import METRICS, read_metric
 from train.evaluation.tables import Estimate
-from train.runs.saved_networks import PUBLISHED, load_run, load_selected
+from train.run_folder import PUBLISHED
+from train.saved_networks import load_run, load_selected
 from train.settings import published
 
 # Folder of the published networks, in the installation or in a clone.

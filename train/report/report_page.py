@@ -19,7 +19,6 @@ from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.class_names import in_words
-from train.evaluation.laboratory.kept_aside import can_be_generated
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import (
@@ -30,6 +29,7 @@ from train.evaluation.tables import (
     fraction,
     join_words,
 )
+from train.laboratory.kept_aside import can_be_generated
 from train.report import comparison as compare
 from train.report import plots, summary
 from train.report.first_screen import (
@@ -43,9 +43,9 @@ from train.report.first_screen import (
 )
 from train.report.plots import Picture
 from train.report.summary import Methods, RunSummary, Scored, ScoredRun
+from train.run_config import CONFIG, read_config
+from train.run_folder import RENDERS
 from train.runs.epoch_metrics import attack_success
-from train.runs.run_config import CONFIG, read_config
-from train.runs.run_log import RENDERS
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, published
 from train.system.user_errors import user_message
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from augment.attacks import adversary
 from augment.attacks.files import LINES
 from renderer.errors import InputError
+from train import checkpoints, run_folder
 from train.data import photographs
 from train.evaluation.relit import RELIT
 from train.evaluation.scores.predictions import PREDICTIONS
@@ -16,18 +17,15 @@ from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
 from train.report.attack_tables import FIGURE, TABLE, TRANSFERS
 from train.report.report_page import PAGE
 from train.report.summary import is_finished
-from train.runs import checkpoint
-from train.runs.run_config import CONFIG, read_config
-from train.runs.run_lock import FAILURE
-from train.runs.run_log import BEFORE, METRICS, RENDERS
-from train.runs.saved_networks import PUBLISHED, WEIGHTS
+from train.run_config import CONFIG, read_config
+from train.run_folder import BEFORE, FAILURE, METRICS, PUBLISHED, RENDERS, WEIGHTS
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
 # Files that each command writes to its output folder, as patterns of `Path.glob`.
 # A command refuses a folder with one of these files.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 # `remove_run` removes them in this order.
-OF_RUN = (METRICS, checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, WEIGHTS)
+OF_RUN = (METRICS, run_folder.LAST, run_folder.PREVIOUS, run_folder.BEST, WEIGHTS)
 OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE)
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
 OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
@@ -79,14 +77,14 @@ def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> No
     such a folder. The files of a run that ended before its first checkpoint may
     be replaced, because they are not results.
     """
-    if checkpoint.exists(folder):
+    if checkpoints.exists(folder):
         return
     # Names of the files that an unfinished run without a checkpoint has written.
     own: tuple[str, ...] = ()
     if _is_of_training(folder) and not is_finished(folder):
         own = (CONFIG, METRICS)
         if resume:
-            own += (checkpoint.BEST,)
+            own += (run_folder.BEST,)
     require_replaceable(folder, key, overwrite, own)
 
 

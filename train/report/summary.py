@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from augment.attacks.files import LINES
 from augment.settings import MODES
 from renderer.errors import InputError, single_line
-from train import console
+from train import console, run_config, run_folder
 from train.evaluation.scores.metrics import (
     METRICS,
     AreaUnderCurve,
@@ -24,10 +24,9 @@ from train.evaluation.scores.metrics import (
 )
 from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.evaluation.tables import Estimate, Table, describe_intervals, format_interval
-from train.runs import checkpoint, run_config, run_lock, run_log
-from train.runs.run_config import CONFIG, read_config, read_json
-from train.runs.run_log import BEFORE, PHASES, read_metrics
-from train.runs.saved_networks import PUBLISHED, load_selected
+from train.run_config import CONFIG, read_config
+from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
+from train.saved_networks import load_selected
 from train.settings import UNLABELLED, label_names, published
 
 # Methods are named by numbers instead of by their settings if there are more than this.
@@ -205,7 +204,7 @@ def summarize(folder: Path) -> RunSummary:
         raise
     except Exception as error:
         # An entry that is missing or of a wrong type raises errors of many types.
-        files = f"{CONFIG}, {run_log.METRICS} or a {SUMMARY}"
+        files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {single_line(error)}"
         raise InputError(
             f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run",
@@ -722,7 +721,7 @@ def _add(found: Findings, path: Path) -> None:
         found.runs.append(summarize(path))
     else:
         epochs = [line for line in read_metrics(path) if "epoch" in line]
-        found.unfinished.append(Unfinished(path, run_lock.state(path), epochs))
+        found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
 
 
 def _walk(folder: Path) -> Iterator[Path]:
@@ -731,7 +730,7 @@ def _walk(folder: Path) -> Iterator[Path]:
     Sub-folders with the scores of a run are left out, because the run includes
     these scores.
     """
-    files_of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
+    files_of_run = {run_folder.METRICS, run_folder.FAILURE, run_folder.LAST, run_folder.BEST}
     files_of_others = {LINES, SUMMARY, PUBLISHED}
     for root, subfolders, file_names in os.walk(folder):
         path = Path(root)

@@ -5,7 +5,7 @@ from statistics import fmean
 
 from tqdm import tqdm
 
-from train.runs.run_log import PHASES
+from train.run_folder import PHASES
 
 # Measurements of the attack on the training renders. A round is a part of the training
 # with the same renders. If an epoch has several rounds, the log has these measurements

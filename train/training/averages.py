@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
-from train.system.device import MixedPrecision
+from train.device import MixedPrecision
 
 
 class MovingAverage(AveragedModel):

@@ -6,8 +6,8 @@ from train import console
 from train.data.cache import TensorCache, cache_folder
 from train.data.rendered_shapes import load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled
+from train.processes import main_process_first
 from train.settings import MIN_SIZE, ExperimentSettings
-from train.system.processes import main_process_first
 from train.system.user_errors import keyed, keys_of
 from train.training.initial import Initial
 

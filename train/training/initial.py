@@ -24,8 +24,10 @@ from train.class_names import (
 )
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
+from train.device import MixedPrecision
+from train.hashing import content_hash
 from train.networks import CLASSIFIER, PYTHON, describe
-from train.runs.saved_networks import (
+from train.saved_networks import (
     NORMALIZE_LIGHT,
     RUN,
     checks_architecture,
@@ -35,8 +37,6 @@ from train.runs.saved_networks import (
     plain_weights,
 )
 from train.settings import WIDERESNET, ExperimentSettings, label_names
-from train.system.device import MixedPrecision
-from train.system.hashing import content_hash
 from train.system.user_errors import keyed
 
 # Entries in the description of a network. They must be equal in two networks if the

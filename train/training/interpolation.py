@@ -19,7 +19,7 @@ from augment.random_streams import stream_seed
 from renderer.image import to_unit
 from train import console
 from train.data.sets import Split
-from train.system.device import MixedPrecision
+from train.device import MixedPrecision
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
 # 1 the weights after it.

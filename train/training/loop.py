@@ -27,22 +27,22 @@ from augment.service import AugmentationService, Renders
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
 from renderer.memory import require_memory
-from train import console
+from train import checkpoints, console, run_folder
+from train.checkpoints import random_state, restore_random_state
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
-from train.runs import checkpoint
-from train.runs.checkpoint import random_state, restore_random_state
+from train.device import GraphedModel, MixedPrecision, compiles
+from train.processes import SignalHandler, all_reduce_sum, wrap_ddp
+from train.run_folder import PHASES
 from train.runs.epoch_metrics import epoch_metrics, format_epoch
-from train.runs.run_log import PHASES, RunLog
 from train.settings import RELIGHT, TrainSettings
-from train.system.device import GraphedModel, MixedPrecision, compiles
-from train.system.processes import SignalHandler, all_reduce_sum, wrap_ddp
 from train.system.user_errors import keyed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
 from train.training.recipe import build_optimizer, learning_rate, set_training_mode
 from train.training.relit_batches import RelitBatches
+from train.training.run_log import RunLog
 from train.training.shared_teacher import share_layers
 
 # Number of images in a pass of the validation.
@@ -489,9 +489,9 @@ class Trainer:
                 return
             start = time.perf_counter()
             if best:
-                checkpoint.save(self.folder / checkpoint.BEST, best)
-            previous = self.folder / checkpoint.PREVIOUS
-            checkpoint.save(self.folder / checkpoint.LAST, state, previous)
+                checkpoints.save(self.folder / run_folder.BEST, best)
+            previous = self.folder / run_folder.PREVIOUS
+            checkpoints.save(self.folder / run_folder.LAST, state, previous)
             self._saved_at = time.perf_counter()
             self._saving_took = self._saved_at - start
 
@@ -570,7 +570,7 @@ class Trainer:
 
     def resume(self) -> None:
         """Restore the newest undamaged checkpoint in the folder of the run."""
-        state, problem = checkpoint.load_newest(self.folder)
+        state, problem = checkpoints.load_newest(self.folder)
         try:
             self._require_own_architecture(state)
             self.load_state_dict(state)
@@ -578,14 +578,14 @@ class Trainer:
             reason = single_line(error)
             raise InputError(
                 f"this run cannot continue from the checkpoint in {self.folder} ({reason}): "
-                f"restore {checkpoint.LAST}, or start in another folder",
+                f"restore {run_folder.LAST}, or start in another folder",
             ) from error
         self._require_own_best()
         if problem:
             console.warning("%s: continuing from the checkpoint before it", problem)
             # last.pt is damaged. It is removed, since it would otherwise replace the
             # undamaged previous.pt when the next checkpoint is written.
-            (self.folder / checkpoint.LAST).unlink(missing_ok=True)
+            (self.folder / run_folder.LAST).unlink(missing_ok=True)
         steps = self._epoch_state.step if self._epoch_state else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
 
@@ -598,9 +598,9 @@ class Trainer:
         if not self.epoch:
             # best.pt is written at the end of the first epoch.
             return
-        path = self.folder / checkpoint.BEST
+        path = self.folder / run_folder.BEST
         try:
-            best = checkpoint.load(path)
+            best = checkpoints.load(path)
             self._require_own_architecture(best)
             own = self._description()
             # Earlier versions stored "mode" as "arm".
@@ -616,7 +616,7 @@ class Trainer:
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(
                 f"{path} is not the best network of this run ({single_line(error)}): "
-                f"restore {checkpoint.BEST}, or start in another folder",
+                f"restore {run_folder.BEST}, or start in another folder",
             ) from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:

@@ -17,9 +17,9 @@ from train import console
 from train.class_names import require_others
 from train.data.photographs import find_photographs, load_photographs
 from train.data.sets import DataSet
+from train.device import choose_rasterizer
+from train.processes import main_process_first
 from train.settings import OTHER, ExperimentSettings, label_names
-from train.system.device import choose_rasterizer
-from train.system.processes import main_process_first
 from train.system.user_errors import keyed, keys_of
 
 

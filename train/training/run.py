@@ -28,30 +28,29 @@ from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
-from train import console
+from train import checkpoints, console, run_folder
 from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
-from train.evaluation.laboratory.kept_aside import kept_aside_settings
-from train.evaluation.laboratory.laboratory import is_laboratory, write_laboratory
-from train.evaluation.scores.metrics import METRICS
-from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
-from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
-from train.networks import CLASSIFIER, PYTHON, build_network, describe
-from train.report.results import remove_run
-from train.runs import checkpoint
-from train.runs.run_config import CONFIG, require_same_run, write_config
-from train.runs.run_log import BEFORE, RunLog
-from train.runs.saved_networks import NORMALIZE_LIGHT, WEIGHTS, export
-from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings, label_names
-from train.system.device import (
+from train.device import (
     MixedPrecision,
     choose_device,
     choose_precision,
     choose_threads,
     set_deterministic,
 )
+from train.evaluation.scores.metrics import METRICS
+from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
+from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
+from train.laboratory.kept_aside import kept_aside_settings
+from train.laboratory.laboratory import is_laboratory, write_laboratory
+from train.networks import CLASSIFIER, PYTHON, build_network, describe
+from train.report.results import remove_run
+from train.run_config import CONFIG, require_same_run, write_config
+from train.run_folder import BEFORE, WEIGHTS
+from train.saved_networks import NORMALIZE_LIGHT, export
+from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings, label_names
 from train.system.user_errors import keyed, keys_of
 from train.training.data import load_data
 from train.training.initial import (
@@ -70,6 +69,7 @@ from train.training.interpolation import (
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.renders import build_service
+from train.training.run_log import RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
 # channels are estimated from this number of images.
@@ -228,7 +228,7 @@ class Run:
         """
         resumes = self.settings.train.resume
         overwrites = self.settings.overwrite and not resumes
-        if overwrites or not checkpoint.exists(self.folder):
+        if overwrites or not checkpoints.exists(self.folder):
             return None
         if not resumes:
             raise InputError(
@@ -370,7 +370,7 @@ class Run:
         test = self.data.test.to(trainer.device)
         last = evaluate(trainer.selected, test)["accuracy"]
         selected = last
-        best = checkpoint.load(self.folder / checkpoint.BEST)
+        best = checkpoints.load(self.folder / run_folder.BEST)
         if self.settings.train.interpolate:
             best = self._interpolate(best)
         if best["epoch"] != trainer.epoch or INTERPOLATION in best:
@@ -412,7 +412,7 @@ class Run:
         )
         interpolated = best | {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
-            checkpoint.save(self.folder / checkpoint.BEST, interpolated)
+            checkpoints.save(self.folder / run_folder.BEST, interpolated)
         return interpolated
 
     def _agreement(self, initial_predictions: Int[Tensor, " N"]) -> float:

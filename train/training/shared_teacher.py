@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.model_passes import eval_mode
+from train.device import PRECISIONS, MixedPrecision
 from train.settings import ALL_BUT_LAST, TrainSettings
-from train.system.device import PRECISIONS, MixedPrecision
 from train.training.recipe import last_layer
 
 

@@ -26,7 +26,7 @@ from renderer.io.files import (
 from renderer.io.images import write_image
 from renderer.light.environment import write_map
 from renderer.light.projector import Projector
-from train.runs import checkpoint
+from train import checkpoints
 
 DRAWS = torch.Generator().manual_seed(0)
 LIGHT = 0.1 * torch.rand(49, 3, generator=DRAWS)
@@ -43,7 +43,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "mesh.glb": lambda path: renderer.export_mesh(renderer.solid("orange"), path),
     "image.png": lambda path: write_image(path, Image.fromarray(PIXELS)),
     "numbers.npy": lambda path: write_numbers(path, np.ones(4096)),
-    "last.pt": lambda path: checkpoint.save(path, {"model": {"weight": torch.rand(4096)}}),
+    "last.pt": lambda path: checkpoints.save(path, {"model": {"weight": torch.rand(4096)}}),
 }
 
 

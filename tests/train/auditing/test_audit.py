@@ -25,7 +25,7 @@ from train.auditing.frames import frames_of
 from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
 from train.auditing.plain_light import find_plain_views
 from train.command_settings import AuditSettings
-from train.evaluation.laboratory import lab_patterns as patterns
+from train.laboratory import lab_patterns as patterns
 
 CLASSES = ("orange", "other")
 

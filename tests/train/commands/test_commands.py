@@ -30,8 +30,8 @@ from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
 from train.report.summary import trained_labels
-from train.runs.run_lock import LOCK, sole_writer
-from train.runs.saved_networks import load_run
+from train.run_folder import LOCK, sole_writer
+from train.saved_networks import load_run
 
 EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from renderer.settings import facts_of, field_types
 from train.command import Command
-from train.runs.run_config import format_command
+from train.run_config import format_command
 from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]

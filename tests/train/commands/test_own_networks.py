@@ -30,7 +30,7 @@ from tests.train.own_networks import (
 from train.__main__ import main as train_command
 from train.auditing import audit
 from train.networks import build_network
-from train.runs.saved_networks import load_run
+from train.saved_networks import load_run
 from train.training.initial import load_initial, with_label
 from train.training.run import _network_shape
 

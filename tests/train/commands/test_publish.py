@@ -9,13 +9,14 @@ from torch import Tensor
 
 from renderer.errors import InputError
 from renderer.io.images import read_image
+from train import checkpoints, run_folder
 from train.command_settings import EvaluateSettings, PublishSettings
 from train.commands.evaluate import evaluate
 from train.commands.publish import publish_network
+from train.hashing import content_hash
 from train.report.summary import summarize
-from train.runs import checkpoint
-from train.runs.saved_networks import PUBLISHED, load_run, load_selected
-from train.system.hashing import content_hash
+from train.run_folder import PUBLISHED
+from train.saved_networks import load_run, load_selected
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +146,9 @@ class TestSeveralLabels:
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     run = copytree(finished, tmp_path / "run")
-    state = checkpoint.load(run / checkpoint.BEST)
+    state = checkpoints.load(run / run_folder.BEST)
     state["architecture"] = state["architecture"] | {"width": "wide"}
-    checkpoint.save(run / checkpoint.BEST, state)
+    checkpoints.save(run / run_folder.BEST, state)
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
         publish_network(PublishSettings(str(run), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()

@@ -10,8 +10,8 @@ import renderer
 from tests.train.helpers import save_noise, save_untrained_network
 from train.command import USER_ERROR
 from train.report.results import require_new_run, require_replaceable
-from train.runs.checkpoint import LAST
-from train.runs.run_config import write_config
+from train.run_config import write_config
+from train.run_folder import LAST
 
 # Arguments of each command except for out=, or run= of a training.
 COMMANDS = {

@@ -19,9 +19,7 @@ from train import __main__ as command
 from train.command import USER_ERROR
 from train.commands import sweep
 from train.commands.sweep import format_sweep
-from train.runs.checkpoint import LAST
-from train.runs.run_lock import FAILURE, LOCK, locked
-from train.runs.run_log import read_metrics
+from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
 from train.runs.run_names import run_name
 from train.training import loop
 from train.training.run import Run

@@ -13,8 +13,8 @@ from PIL import Image
 from renderer.errors import InputError
 from train.report import plots
 from train.report.report_page import report_of, write_report
-from train.runs.run_config import write_config
-from train.runs.run_lock import locked
+from train.run_config import write_config
+from train.run_folder import locked
 
 HOSTILE = "<script>alert(1)</script>|*x*"
 COMMAND = "python -m train experiment=best"

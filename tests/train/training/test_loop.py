@@ -15,16 +15,17 @@ from augment.service import AugmentationService
 from augment.settings import AugmentationSettings
 from renderer import memory
 from renderer.errors import InputError
+from train import checkpoints, run_folder
 from train.data.sets import Split
+from train.device import MixedPrecision
 from train.networks import WideResNet
-from train.runs import checkpoint
-from train.runs.run_log import RunLog, read_metrics
+from train.processes import Interrupted
+from train.run_folder import read_metrics
 from train.settings import TrainSettings
-from train.system.device import MixedPrecision
-from train.system.processes import Interrupted
 from train.training import loop
 from train.training.loop import Trainer, activation_bytes, evaluate
 from train.training.recipe import SCHEDULE_FACTORS, freeze
+from train.training.run_log import RunLog
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
 # Noise for training and validation. With 16 images a batch, an epoch has three steps.
@@ -95,9 +96,9 @@ def fit_noise(trainer: Trainer) -> list[dict]:
     return fit(trainer, noise(TRAINED), noise(VALIDATED))
 
 
-def load(folder: Path, name: str = checkpoint.LAST) -> dict:
+def load(folder: Path, name: str = run_folder.LAST) -> dict:
     """Load a checkpoint of a run."""
-    return checkpoint.load(folder / name)
+    return checkpoints.load(folder / name)
 
 
 def states_after_steps(trainer: Trainer) -> list[State]:
@@ -371,7 +372,7 @@ def test_a_soup_is_the_mean_of_the_ends_of_its_epochs(tmp_path, ema_decay):
         torch.testing.assert_close(kept.double(), expected, rtol=0, atol=1e-6)
     assert not torch.equal(states[2]["head.weight"], states[5]["head.weight"])
     # The last network of a soup is kept, whatever its validation.
-    assert load(tmp_path, checkpoint.BEST)["epoch"] == 3
+    assert load(tmp_path, run_folder.BEST)["epoch"] == 3
 
 
 def test_each_epoch_of_a_soup_begins_with_the_initial_network_and_the_whole_schedule(tmp_path):
@@ -399,7 +400,7 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
     trainer = make_trainer(tmp_path, color_network(), epochs=5, batch_size=12)
     states = states_after_steps(trainer)
     fit(trainer, single_colors(12), single_colors(3))
-    best = load(tmp_path, checkpoint.BEST)
+    best = load(tmp_path, run_folder.BEST)
     last = load(tmp_path)
     assert best["epoch"] == 2
     assert best["validation_accuracy"] == 0.6
@@ -412,17 +413,17 @@ def test_best_pt_is_not_written_again_for_an_epoch_that_is_no_better(tmp_path, m
     accuracies = iter([0.6, 0.5, 0.4])
     monkeypatch.setattr(loop, "evaluate", lambda *_: {"loss": 1.0, "accuracy": next(accuracies)})
     written = []
-    save = checkpoint.save
+    save = checkpoints.save
 
     def recorded(path: Path, *arguments) -> None:
         written.append(path.name)
         save(path, *arguments)
 
-    monkeypatch.setattr(checkpoint, "save", recorded)
+    monkeypatch.setattr(checkpoints, "save", recorded)
     trainer = make_trainer(tmp_path, color_network(), epochs=3, batch_size=12)
     fit(trainer, single_colors(12), single_colors(3))
-    assert written.count(checkpoint.LAST) == 3
-    assert written.count(checkpoint.BEST) == 1
+    assert written.count(run_folder.LAST) == 3
+    assert written.count(run_folder.BEST) == 1
 
 
 class DivergingNetwork(nn.Module):
@@ -473,13 +474,13 @@ def test_a_run_that_diverges_ends_with_the_last_good_checkpoint(tmp_path, networ
 def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tmp_path):
     """A second accident, while the next one is written, is then not the end of the run."""
     fit_noise(make_trainer(tmp_path, epochs=2))
-    (tmp_path / checkpoint.LAST).write_bytes(b"")
+    (tmp_path / run_folder.LAST).write_bytes(b"")
     trainer = make_trainer(tmp_path, epochs=2)
     trainer.resume()
     assert trainer.epoch == 1
     fit_noise(trainer)
-    assert load(tmp_path, checkpoint.PREVIOUS)["epoch"] == 1
-    assert load(tmp_path, checkpoint.LAST)["epoch"] == 2
+    assert load(tmp_path, run_folder.PREVIOUS)["epoch"] == 1
+    assert load(tmp_path, run_folder.LAST)["epoch"] == 2
 
 
 @pytest.mark.parametrize(
@@ -496,7 +497,7 @@ def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tm
 def test_the_checkpoint_of_another_run_is_refused(tmp_path, changes, settings):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=12)
     fit(trainer, single_colors(12), single_colors(3))
-    checkpoint.save(tmp_path / checkpoint.LAST, load(tmp_path) | changes)
+    checkpoints.save(tmp_path / run_folder.LAST, load(tmp_path) | changes)
     with pytest.raises(InputError) as refused:
         make_trainer(tmp_path, color_network(), **settings).resume()
     sentence = str(refused.value)

@@ -14,11 +14,11 @@ from renderer.errors import InputError
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
+from train.checkpoints import load
 from train.commands.experiment import train
 from train.report.report_page import PAGE
-from train.runs.checkpoint import BEST, LAST, PREVIOUS, load
-from train.runs.run_log import read_metrics
-from train.runs.saved_networks import load_run
+from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
+from train.saved_networks import load_run
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.interpolation import FACTORS, INTERPOLATION, mix

@@ -24,18 +24,18 @@ from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run, finish, loaded_run
 from tests.train.helpers import read_markdown
+from train import checkpoints, run_folder
 from train.command_settings import LabSettings
 from train.data import batches
 from train.data.sets import Split
+from train.hashing import content_hash
+from train.processes import Interrupted
 from train.report.comparison import format_table
 from train.report.report_page import write_report
 from train.report.results import remove_run
 from train.report.summary import is_finished, summarize
-from train.runs import checkpoint
-from train.runs.run_log import read_metrics
-from train.runs.saved_networks import load_run
-from train.system.hashing import content_hash
-from train.system.processes import Interrupted
+from train.run_folder import read_metrics
+from train.saved_networks import load_run
 from train.system.user_errors import user_message
 from train.training import loop
 from train.training.data import load_data
@@ -47,8 +47,8 @@ WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
 def weight_hashes(folder: Path) -> list[str]:
     """Hash the weights of the last network and of the selected one."""
-    names = (checkpoint.LAST, checkpoint.BEST)
-    return [content_hash(checkpoint.load(folder / name)["model"]) for name in names]
+    names = (run_folder.LAST, run_folder.BEST)
+    return [content_hash(checkpoints.load(folder / name)["model"]) for name in names]
 
 
 def metrics(folder: Path) -> list[dict]:
@@ -209,7 +209,7 @@ class TestASignalDuringTraining:
 
     def assert_state(self, folder: Path, epoch: int, step: int | None) -> None:
         """Check the epochs that a checkpoint has completed, and the steps of the next one."""
-        state = checkpoint.load(folder / checkpoint.LAST)
+        state = checkpoints.load(folder / run_folder.LAST)
         assert state["epoch"] == epoch
         if step is None:
             assert state["under_way"] is None
@@ -234,18 +234,18 @@ class TestTheSignalOfABatchSystem:
         epochs = []
 
         def requeue(number, frame):
-            epochs.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
+            epochs.append(checkpoints.load(tmp_path / run_folder.LAST)["epoch"])
             raise SystemExit(-1)
 
         signal.signal(signal.SIGUSR2, requeue)
         assert self.train(tiny, tmp_path).code == -1
         assert epochs == [1]
-        assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
+        assert checkpoints.load(tmp_path / run_folder.LAST)["under_way"]["step"] == 2
 
     def test_ends_the_run_with_a_checkpoint_if_it_has_no_handler(self, tiny, tmp_path):
         signal.signal(signal.SIGUSR2, signal.SIG_DFL)
         assert self.train(tiny, tmp_path).code == 128 + signal.SIGUSR2
-        assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
+        assert checkpoints.load(tmp_path / run_folder.LAST)["under_way"]["step"] == 2
 
 
 def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
@@ -256,16 +256,16 @@ def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
     act_at(monkeypatch, 0, 1, interrupt_twice)
     with pytest.raises(KeyboardInterrupt):
         completed_run(tiny("augment=none"), tmp_path)
-    assert not checkpoint.exists(tmp_path)
+    assert not checkpoints.exists(tmp_path)
 
 
 def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp_path):
     completed_run(tiny(*WITHOUT_RENDERS), tmp_path)
     log = metrics(tmp_path)
-    last = (tmp_path / checkpoint.LAST).read_bytes()
+    last = (tmp_path / run_folder.LAST).read_bytes()
     completed_run(tiny(*WITHOUT_RENDERS, "train.resume=true"), tmp_path)
     assert metrics(tmp_path) == log
-    assert (tmp_path / checkpoint.LAST).read_bytes() == last
+    assert (tmp_path / run_folder.LAST).read_bytes() == last
 
 
 @pytest.mark.parametrize(
@@ -415,7 +415,7 @@ TENSORBOARD_APPEND = "tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSyste
     "writer",
     [
         pytest.param(TENSORBOARD_APPEND, id="TensorBoard"),
-        pytest.param("train.runs.run_log.RunLog.scalars", id="metrics"),
+        pytest.param("train.training.run_log.RunLog.scalars", id="metrics"),
         pytest.param("renderer.io.files.os.fsync", id="checkpoint"),
     ],
 )
@@ -651,7 +651,7 @@ class TestTheSelectedNetwork:
 
             @property
             def test(self):
-                epochs_of_looks.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
+                epochs_of_looks.append(checkpoints.load(tmp_path / run_folder.LAST)["epoch"])
                 return data.test
 
         scores = completed_run(tiny("augment=none"), tmp_path, GuardedData())
@@ -660,7 +660,7 @@ class TestTheSelectedNetwork:
         *epochs, _ = read_metrics(tmp_path)
         accuracies = [line["validation/accuracy"] for line in epochs]
         best_epoch = accuracies.index(max(accuracies)) + 1
-        assert checkpoint.load(tmp_path / checkpoint.BEST)["epoch"] == best_epoch
+        assert checkpoints.load(tmp_path / run_folder.BEST)["epoch"] == best_epoch
         assert scores["test/epoch"] == best_epoch
 
         network = load_run(tmp_path)
@@ -747,9 +747,9 @@ class TestValidationImages:
     @pytest.fixture
     def unknown(self, finished, tmp_path) -> Path:
         """Write a network that does not say which images it left out."""
-        state = checkpoint.load(finished / checkpoint.BEST)
+        state = checkpoints.load(finished / run_folder.BEST)
         state["architecture"] = state["architecture"] | {"validation": None}
-        checkpoint.save(tmp_path / "unknown.pt", state)
+        checkpoints.save(tmp_path / "unknown.pt", state)
         return tmp_path / "unknown.pt"
 
     def record_of_run(self, tiny, caplog, initial: Path, fraction: str, folder: Path):
@@ -762,7 +762,7 @@ class TestValidationImages:
             f"data.validation={fraction}",
         )
         completed_run(settings, folder)
-        return checkpoint.load(folder / checkpoint.BEST)["architecture"]["validation"]
+        return checkpoints.load(folder / run_folder.BEST)["architecture"]["validation"]
 
     def has_warning(self, caplog) -> bool:
         return any(line.startswith("validation: ") for line in caplog.messages)
@@ -835,8 +835,8 @@ def test_training_in_eval_mode_keeps_the_statistics_of_the_initial_network(
 ):
     overrides = "train.epochs=1", f"train.init_from={finished}", "train.eval_mode=true"
     completed_run(tiny(*overrides), tmp_path)
-    initial = checkpoint.load(finished / checkpoint.BEST)["model"]
-    trained = checkpoint.load(tmp_path / checkpoint.BEST)["model"]
+    initial = checkpoints.load(finished / run_folder.BEST)["model"]
+    trained = checkpoints.load(tmp_path / run_folder.BEST)["model"]
     statistics = ("running_mean", "running_var", "num_batches_tracked", "mean", "std")
     for name, value in trained.items():
         is_statistic = name.rpartition(".")[2] in statistics
@@ -863,7 +863,7 @@ def test_a_run_killed_within_its_first_epoch_is_resumed_there_and_ends_the_same(
         act_at(patch, 0, 4, kill)
         with pytest.raises(KeyboardInterrupt):
             completed_run(settings, killed)
-    state = checkpoint.load(killed / checkpoint.LAST)
+    state = checkpoints.load(killed / run_folder.LAST)
     assert state["epoch"] == 0
     assert state["under_way"]["step"] == 3
 
@@ -895,7 +895,7 @@ class FakeClock:
 def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, tiny, monkeypatch):
     """A step takes 10 s and a checkpoint 3 s, so that one is saved in 150 s or more."""
     clock = FakeClock()
-    save = checkpoint.save
+    save = checkpoints.save
     requested = loop.SignalHandler.requested
 
     def slow_save(*arguments):
@@ -907,7 +907,7 @@ def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, ti
         return requested(self)
 
     monkeypatch.setattr(loop.time, "perf_counter", clock.now)
-    monkeypatch.setattr(checkpoint, "save", slow_save)
+    monkeypatch.setattr(checkpoints, "save", slow_save)
     monkeypatch.setattr(loop.SignalHandler, "requested", slow_step)
     completed_run(
         tiny(*WITHOUT_RENDERS, "train.batch_size=1", "train.accumulation_steps=1"), tmp_path
@@ -934,16 +934,16 @@ class TestAResumedRun:
         assert modification_times(run) == before
 
     def test_is_stopped_if_its_best_network_is_missing(self, tiny, run):
-        (run / checkpoint.BEST).unlink()
+        (run / run_folder.BEST).unlink()
         self.assert_stopped(tiny, run)
 
     def test_is_stopped_if_its_best_network_is_cut(self, tiny, run):
-        path = run / checkpoint.BEST
+        path = run / run_folder.BEST
         path.write_bytes(path.read_bytes()[:2000])
         self.assert_stopped(tiny, run)
 
     def test_is_stopped_if_its_best_network_is_that_of_another_seed(self, tiny, run, tmp_path):
         completed_run(tiny(*WITHOUT_RENDERS, "seed=8"), tmp_path / "other")
-        other = (tmp_path / "other" / checkpoint.BEST).read_bytes()
-        (run / checkpoint.BEST).write_bytes(other)
+        other = (tmp_path / "other" / run_folder.BEST).read_bytes()
+        (run / run_folder.BEST).write_bytes(other)
         self.assert_stopped(tiny, run)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
+from train.device import MixedPrecision
 from train.settings import TrainSettings
-from train.system.device import MixedPrecision
 from train.training.shared_teacher import SharedTeacher, share_layers
 
 SIZE = 4

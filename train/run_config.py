@@ -5,12 +5,11 @@ files as before. Decisive settings are the settings that change the result. The
 number of threads, for example, is not decisive.
 """
 
-import json
 import os
 import platform
 import shlex
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -21,11 +20,12 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.command import program
+from train.fingerprints import fingerprints, is_changed
 from train.former_keys import rename_former_keys
-from train.runs.fingerprints import fingerprints, is_changed
+from train.run_folder import opened_text
 from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, mapped
 
 CONFIG = "config.yaml"
@@ -34,33 +34,6 @@ PACKAGES = ("torchvision", "numpy")
 # Arguments that are left out when the command line of a run is recorded. Whoever
 # resumes the run gives other values.
 NOT_RECORDED = ("run=", "train.resume=")
-
-
-@contextmanager
-def opened_text(path: Path) -> Iterator[str]:
-    """Read a text file for a `with` block that parses the text. Errors name the file."""
-    try:
-        if not path.is_file():
-            raise ValueError("there is no such file")
-        yield path.read_text(encoding="utf-8")
-    except Exception as error:
-        raise InputError(
-            f"{path} is damaged or of another kind ({single_line(error)}): use another run",
-        ) from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that contains one object."""
-    with opened_text(path) as text:
-        return parse_object(text)
-
-
-def parse_object(text: str) -> dict[str, Any]:
-    """Parse a JSON object. Raise ValueError if it is empty or no object."""
-    parsed = json.loads(text)
-    if not isinstance(parsed, dict) or not parsed:
-        raise ValueError("it holds no object of keys and values")
-    return parsed
 
 
 def read_config(path: Path) -> DictConfig:

@@ -31,10 +31,9 @@ from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.solids import HARD_NEGATIVES
 from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX, TABLE
-from train.evaluation.laboratory.lab_patterns import RESOLUTION
-from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
-from train.runs.run_config import read_json
-from train.runs.run_lock import LOCK, sole_writer
+from train.laboratory.lab_patterns import RESOLUTION
+from train.laboratory.shots import FOV, Shot, draw_shots
+from train.run_folder import LOCK, read_json, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
 

@@ -17,10 +17,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
+from train import fingerprints
 from train.command import read_settings
 from train.command_settings import AuditSettings
-from train.runs import fingerprints
-from train.runs.run_config import (
+from train.run_config import (
     CONFIG,
     decisive_settings,
     read_config,
@@ -28,8 +28,9 @@ from train.runs.run_config import (
     require_same_run,
     write_config,
 )
-from train.runs.run_log import METRICS, RunLog, read_metrics
+from train.run_folder import METRICS, read_metrics
 from train.settings import ExperimentSettings
+from train.training.run_log import RunLog
 
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):

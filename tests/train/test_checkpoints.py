@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from train.runs.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
+from train.checkpoints import content_hash, load, load_newest, save
+from train.run_folder import BEST, LAST, PREVIOUS
 
 STATE = {
     "model": {"weight": torch.arange(6.0).reshape(2, 3), "steps": torch.tensor(3)},

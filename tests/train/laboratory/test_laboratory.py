@@ -19,11 +19,11 @@ from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
-from train.evaluation.laboratory import lab_patterns as patterns
-from train.evaluation.laboratory import laboratory as lab
-from train.evaluation.laboratory.lab_patterns import PATTERN_FUNCTIONS, draw_pattern
-from train.evaluation.laboratory.laboratory import lab_parts, path_traced
-from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
+from train.laboratory import lab_patterns as patterns
+from train.laboratory import laboratory as lab
+from train.laboratory.lab_patterns import PATTERN_FUNCTIONS, draw_pattern
+from train.laboratory.laboratory import lab_parts, path_traced
+from train.laboratory.shots import FOV, Shot, draw_shots
 
 pytest.importorskip("mitsuba")
 

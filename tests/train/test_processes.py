@@ -20,11 +20,11 @@ from augment import AugmentationService, AugmentationSettings, distributed
 from augment.progress import Phases
 from augment.scene.scene import Scene
 from tests.runs import completed_run
+from train import checkpoints, run_folder
 from train.command import read_settings
-from train.runs import checkpoint
-from train.runs.run_log import read_metrics
+from train.processes import Interrupted, SignalHandler, process_group
+from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
-from train.system.processes import Interrupted, SignalHandler, process_group
 from train.training import loop
 
 ROOT = Path(__file__).parents[3]
@@ -130,7 +130,7 @@ def runs(tiny, tmp_path_factory) -> Path:
     once_for_both = [__name__, "torch._dynamo", "torch.utils.tensorboard", "torchvision.utils"]
     multiprocessing.set_forkserver_preload(once_for_both)
     multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
-    state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
+    state = checkpoints.load(folder / "mixed" / run_folder.LAST)
     assert (state["epoch"], state["under_way"]["step"]) == (1, 3)
     with pytest.MonkeyPatch.context() as patch:
         group_norms(patch)
@@ -141,7 +141,7 @@ def runs(tiny, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("name", ["two", "mixed"])
 def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
-    first, other = (checkpoint.load(runs / folder / checkpoint.LAST) for folder in ("one", name))
+    first, other = (checkpoints.load(runs / folder / run_folder.LAST) for folder in ("one", name))
     torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32
     torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
     for epoch in range(1, EPOCHS + 1):
@@ -228,7 +228,7 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
     assert command[:6] == start
     assert len(command) == 8
     (folder,) = (tmp_path / "runs").glob("*/*")
-    epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]
+    epochs = checkpoints.load(folder / run_folder.LAST)["epoch"]
     assert 1 <= epochs < 20
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from tests.runs import completed_run
-from train.runs import checkpoint
-from train.runs.run_log import read_metrics
+from train import checkpoints, run_folder
+from train.run_folder import read_metrics
 from train.training import loop
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a G
 
 def weights_of(config, folder) -> dict[str, torch.Tensor]:
     completed_run(config, folder)
-    return checkpoint.load(folder / checkpoint.LAST)["model"]
+    return checkpoints.load(folder / run_folder.LAST)["model"]
 
 
 @pytest.mark.parametrize("compile", ["auto", "never"])
@@ -34,7 +34,7 @@ def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, 
     overrides = ("train.device=cuda", "train.deterministic=true", "train.precision=bfloat16")
     whole = weights_of(tiny(*overrides), tmp_path / "whole")
     again = weights_of(tiny(*overrides), tmp_path / "parts")
-    (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
+    (tmp_path / "parts" / run_folder.LAST).unlink()  # the last epoch is lost
     parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
     for name, value in whole.items():
         assert torch.equal(value, again[name])

@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from train.networks import WideResNet
-from train.system import device
-from train.system.device import (
+from train import device
+from train.device import (
     SIZES,
     GraphedModel,
     MixedPrecision,
@@ -16,6 +15,7 @@ from train.system.device import (
     compiles,
     most_threads,
 )
+from train.networks import WideResNet
 
 CPU = torch.device("cpu")
 GPU = torch.device("cuda")

@@ -1,9 +1,7 @@
 """Write and read the metrics and the images of a training run."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -18,42 +16,12 @@ from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
-from train.runs.run_config import opened_text, parse_object
+from train.run_folder import METRICS, RENDERS
 
-METRICS = "metrics.jsonl"
-# Sub-folder of a run with images of the training renders of some epochs.
-RENDERS = "renders"
-# Sub-folder of a run with the scores of the network before the training.
-BEFORE = "before"
 # Images of an attack are reduced or enlarged to about this width in pixels.
 EXAMPLE = 128
-# Phases of an epoch. The log has the seconds of each phase. Together, the phases take
-# the whole time of the epoch.
-PHASES = ("attack", "training", "evaluation", "input_output")
 # All renders of an epoch are logged as one image, a grid with this many columns.
 GRID_COLUMNS = 20
-
-
-def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Read the metrics of a run from metrics.jsonl.
-
-    The file has a line for each epoch, and then a line with the final scores. An
-    incomplete last line, which a crash can leave, is ignored.
-    """
-    path = folder / METRICS
-    if not path.is_file():
-        return []
-    with opened_text(path) as text:
-        # A complete line ends with a line break.
-        complete_lines = text.split("\n")[:-1]
-        lines = [parse_object(line) for line in complete_lines]
-        for line in lines:
-            if any(not isinstance(value, int | float) for value in line.values()):
-                raise ValueError("a value is not a number")
-        epochs = [line.get("epoch", math.inf) for line in lines]
-        if not all(first < second for first, second in pairwise(epochs)):
-            raise ValueError("epochs are repeated, or follow the final scores")
-        return lines
 
 
 class RunLog:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from augment.random_streams import stream_seed
 from renderer.light.harmonics import equirectangular
 from train.command_settings import LabSettings
-from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
+from train.laboratory.lab_patterns import draw_color, draw_pattern
 
 # Vertical and horizontal field of view of the camera in degrees.
 FOV = 25.0

@@ -21,19 +21,15 @@ from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
 from renderer.validation import as_path, require_kind
+from train.checkpoints import checked, load
 from train.command_settings import ClassifierSettings
 from train.networks import PYTHON, WIDERESNET, build_network
-from train.runs.checkpoint import BEST, checked, load
+from train.run_folder import BEST, PUBLISHED, WEIGHTS
 from train.settings import published
 from train.system.user_errors import keyed
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
-# File of a published network, with weights in half precision.
-PUBLISHED = "model.safetensors"
-# File in the folder of a run that hardened a classifier of the user. It has the trained weights
-# under the names that they have in the file of the user.
-WEIGHTS = "weights.pt"
 # Entries in the file of a published network, in addition to the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
 # Entries in the description of a network that are no arguments of `build_network`.

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 from train.data.photographs import visible_files
 from train.networks import PYTHON
-from train.runs.saved_networks import selected_file
+from train.saved_networks import selected_file
 from train.settings import INPUTS, dotted, published
 
 # The files of a folder with more bytes are not read. Their sizes and times count instead.

@@ -15,14 +15,10 @@ from torch import Tensor, cuda
 
 from renderer.errors import InputError, require_file
 from renderer.io.files import atomic_write
+from train.hashing import content_hash
 from train.networks import VERSION
-from train.system.hashing import content_hash
+from train.run_folder import LAST, PREVIOUS
 
-# Files in the folder of a run: the last checkpoint, the checkpoint before it, and the
-# network with the highest validation accuracy.
-LAST = "last.pt"
-PREVIOUS = "previous.pt"
-BEST = "best.pt"
 # Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
 

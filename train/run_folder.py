@@ -1,0 +1,152 @@
+"""The folder of a run or of another command: its files' names, their text, and its lock."""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from renderer.errors import InputError, single_line
+from renderer.io.files import remove_unfinished
+
+# Name of the file in a folder that a process locks while it writes to the folder.
+LOCK = ".lock"
+# File with the reason why the last training in the folder failed.
+FAILURE = "failed.txt"
+
+# Files in the folder of a run: the last checkpoint, the checkpoint before it, and the
+# network with the highest validation accuracy.
+LAST = "last.pt"
+PREVIOUS = "previous.pt"
+BEST = "best.pt"
+# File of a published network, with weights in half precision.
+PUBLISHED = "model.safetensors"
+# File in the folder of a run that hardened a classifier of the user. It has the trained weights
+# under the names that they have in the file of the user.
+WEIGHTS = "weights.pt"
+METRICS = "metrics.jsonl"
+# Sub-folder of a run with images of the training renders of some epochs.
+RENDERS = "renders"
+# Sub-folder of a run with the scores of the network before the training.
+BEFORE = "before"
+# Phases of an epoch. The log has the seconds of each phase. Together, the phases take
+# the whole time of the epoch.
+PHASES = ("attack", "training", "evaluation", "input_output")
+
+
+@contextmanager
+def opened_text(path: Path) -> Iterator[str]:
+    """Read a text file for a `with` block that parses the text. Errors name the file."""
+    try:
+        if not path.is_file():
+            raise ValueError("there is no such file")
+        yield path.read_text(encoding="utf-8")
+    except Exception as error:
+        raise InputError(
+            f"{path} is damaged or of another kind ({single_line(error)}): use another run",
+        ) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that contains one object."""
+    with opened_text(path) as text:
+        return parse_object(text)
+
+
+def parse_object(text: str) -> dict[str, Any]:
+    """Parse a JSON object. Raise ValueError if it is empty or no object."""
+    parsed = json.loads(text)
+    if not isinstance(parsed, dict) or not parsed:
+        raise ValueError("it holds no object of keys and values")
+    return parsed
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """Read the metrics of a run from metrics.jsonl.
+
+    The file has a line for each epoch, and then a line with the final scores. An
+    incomplete last line, which a crash can leave, is ignored.
+    """
+    path = folder / METRICS
+    if not path.is_file():
+        return []
+    with opened_text(path) as text:
+        # A complete line ends with a line break.
+        complete_lines = text.split("\n")[:-1]
+        lines = [parse_object(line) for line in complete_lines]
+        for line in lines:
+            if any(not isinstance(value, int | float) for value in line.values()):
+                raise ValueError("a value is not a number")
+        epochs = [line.get("epoch", math.inf) for line in lines]
+        if not all(first < second for first, second in pairwise(epochs)):
+            raise ValueError("epochs are repeated, or follow the final scores")
+        return lines
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Try to lock a folder until the block ends, so that no other process writes to it.
+
+    The lock holds among all machines that share the file system.
+    If this succeeds, temporary files that a stopped process left in the folder
+    are removed. Yield False if another process has the lock.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    with suppress(Timeout):
+        lock.acquire(blocking=False)
+    if lock.is_locked:
+        remove_unfinished(folder)
+    try:
+        yield lock.is_locked
+    finally:
+        lock.release()
+
+
+@contextmanager
+def sole_writer(key: str, *folders: Path) -> Iterator[None]:
+    """Lock folders until the block ends, so that no other process writes to them.
+
+    Folders into which the block has written nothing are removed at the end.
+    """
+    with ExitStack() as stack:
+        for folder in folders:
+            if not stack.enter_context(locked(folder)):
+                raise InputError(
+                    f"{key}={folder} is being written by another process: "
+                    "wait, or choose another folder",
+                )
+        try:
+            yield
+        finally:
+            for folder in folders:
+                _remove_if_empty(folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    """Remove a folder if it holds nothing but the lock file."""
+    names = [path.name for path in folder.iterdir()]
+    if names == [LOCK]:
+        (folder / LOCK).unlink()
+        folder.rmdir()
+
+
+def state(folder: Path) -> str:
+    """Describe the state of a run that is not finished.
+
+    It is "not begun", "in training", "interrupted" or "failed: " and the reason.
+    """
+    if not folder.exists():
+        return "not begun"
+    with locked(folder) as is_ours:
+        if not is_ours:
+            return "in training"
+    failure = folder / FAILURE
+    if failure.exists():
+        reason = failure.read_text(encoding="utf-8", errors="replace").strip()
+        return f"failed: {reason}"
+    return "interrupted"
