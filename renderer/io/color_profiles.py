@@ -126,7 +126,9 @@ def _transform(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
         if space != SPACE_OF_MODE[mode]:
             raise ValueError(f"it is for {space}, but the image is {mode}")
         srgb = ImageCms.createProfile("sRGB")
-        transform = ImageCms.buildTransform(opened, srgb, mode, "RGB")
+        # Optimized, a transform of gray values would be off by up to 10 of 255.
+        flags = ImageCms.Flags.NOOPTIMIZE if mode == "L" else ImageCms.Flags.NONE
+        transform = ImageCms.buildTransform(opened, srgb, mode, "RGB", flags=flags)
         if mode == "CMYK":
             return transform
         levels = np.linspace(0, 255, 16).round().astype(np.uint8)

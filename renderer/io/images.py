@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import reprlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,8 @@ FORMATS = [
 # resized to a small square. The sides of the decoded image
 # are at least this many times as long as those of the square.
 MIN_DECODED_RATIO = 16
+# Largest change of an sRGB value from the level 0 to 1 of 255 at which 8 bits keep what 16 show.
+MAX_STEP = 4
 
 
 def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
@@ -110,8 +113,17 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
         image.draft(None, (min_side, min_side))
         convert = conversion_to_srgb(image, path)
+        has_more_bits = re.search(";1[26]", str(image.tile))
         color, alpha = color_and_alpha(image)
     if convert is not None:
+        levels = Image.new(color.mode, (2, 1))
+        levels.putpixel((1, 0), (1,) * len(color.getbands()))
+        darkest, next_level = np.asarray(convert(levels), dtype=int)[0]
+        if has_more_bits and np.abs(next_level - darkest).max() > MAX_STEP:
+            raise ValueError(
+                "it is linear light of 12 or 16 bits, whose dark values are not read: "
+                "save it in sRGB"
+            )
         color = convert(color)
     color = color.convert("RGB")
     if alpha is None:

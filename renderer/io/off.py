@@ -52,8 +52,10 @@ def read_off(file: MeshFile) -> list[Part]:
         raise ValueError(f"the vertices have other numbers than {header[0].decode()} announces")
     table = parse_numbers(vertex_text, np.float64).reshape(-1, width)
     vertices = table[:, :3]
-    color_numbers = table[:, color_start : color_start + color_width].ravel()
-    vertex_colors = _colors(color_numbers, np.full(vertex_count, color_width), file)
+    is_color = np.zeros(table.shape, dtype=bool)
+    is_color[:, color_start : color_start + color_width] = True
+    color_widths = np.full(vertex_count, color_width)
+    vertex_colors = _colors(vertex_text, table.ravel(), is_color.ravel(), color_widths, file)
 
     numbers = parse_numbers(face_text, np.float64)
     lengths = words_per_line(face_text)
@@ -65,7 +67,7 @@ def read_off(file: MeshFile) -> list[Part]:
     color_widths = lengths - 1 - sizes
     if not np.isin(color_widths, (0, 3, 4)).all() or (whole_numbers != numbers)[is_index].any():
         raise ValueError("a face is not a number of vertices, the vertices, and maybe a color")
-    face_colors = _colors(numbers[~is_index], color_widths, file)
+    face_colors = _colors(face_text, numbers, ~is_index, color_widths, file)
     indices = whole_numbers[is_index & (places > 0)]
     corners, polygons = triangles_of(file, vertices, indices, sizes)
     if not len(corners):
@@ -76,14 +78,30 @@ def read_off(file: MeshFile) -> list[Part]:
     return [Part(colored_mesh(vertices, faces, colors), normals)]
 
 
-def _colors(numbers: np.ndarray, widths: np.ndarray, file: MeshFile) -> np.ndarray:
-    """Convert rows of 3 or 4 numbers to sRGB-encoded colors, which are white for empty rows."""
-    # Bytes are written as whole numbers, and other colors with a point.
-    values = numbers.astype(np.uint8)
-    if numbers.max(initial=0) > 1 and (values == numbers).all():
-        numbers = values
+def _colors(
+    text: bytes, numbers: np.ndarray, is_color: np.ndarray, widths: np.ndarray, file: MeshFile
+) -> np.ndarray:
+    """Convert rows of 3 or 4 numbers to sRGB-encoded colors, which are white for empty rows.
+
+    The numbers are the words of the text. `is_color` selects those of the colors.
+    """
     colors = np.ones((len(widths), 4))
-    colors[np.arange(4) < widths[:, None]] = unit_colors(numbers, file)
+    is_given = np.arange(4) < widths[:, None]
+    colors[is_given] = numbers[is_color]
+    # Bytes are written as whole numbers, and other colors with a point.
+    given = colors[is_given]
+    highest = given.max(initial=0)
+    is_whole = (given == given.astype(np.uint8)).all()
+    # As bytes, colors of only 0 and 1 are almost black, and an opacity of 1 is almost transparent.
+    if is_whole and highest == 1 and (widths == 3).any():
+        words = np.array(text.split())[is_color]
+        if not any(b"." in word for word in words):
+            raise ValueError(
+                "the colors are only 0 and 1, and 1 may be white or almost black: "
+                "write colors from 0 to 255, or with a point such as 1.0"
+            )
+    values = given.astype(np.uint8) if is_whole and highest > 1 else given
+    colors[is_given] = unit_colors(values, file)
     if colors[:, 3].min(initial=1) < OPAQUE:
         raise ValueError("the file has transparent colors, which are not supported")
     return colors[:, :3]

@@ -21,6 +21,11 @@ _HEADER_SIZE = 84
 # Bit of `attribute` that says that the face has a color, or, with
 # the convention of Materialise Magics, that it has none of its own.
 _FLAG = 0x8000
+# First word of a line of a text file that no facet has. Some programs add lines of their own.
+_OTHER_LINE = re.compile(
+    rb"^\s*(?!(?:solid|facet|outer|vertex|endloop|endfacet|endsolid)\b)([a-z]\w*)",
+    re.MULTILINE | re.IGNORECASE,
+)
 
 
 def read_stl(file: MeshFile) -> list[Part]:
@@ -30,7 +35,7 @@ def read_stl(file: MeshFile) -> list[Part]:
     face_count = int.from_bytes(header[-4:], "little")
     # A binary file may begin with "solid", too, but has NUL bytes.
     if re.match(rb"\W*solid", content, re.IGNORECASE) and b"\0" not in content:
-        corners = _text_corners(content)
+        corners = _text_corners(content, file)
         colors = np.ones((1, 3))
     elif len(content) < _HEADER_SIZE + face_count * _FACE.itemsize or len(header) < _HEADER_SIZE:
         raise ValueError("the file is truncated: export it again")
@@ -45,9 +50,13 @@ def read_stl(file: MeshFile) -> list[Part]:
     return [Part(colored_mesh(corners.reshape(-1, 3), vertex_ids, colors))]
 
 
-def _text_corners(content: bytes) -> np.ndarray:
+def _text_corners(content: bytes, file: MeshFile) -> np.ndarray:
     """Parse the corners of the faces of a text file, shape (F, 3, 3)."""
     text = as_utf8(content).replace(b"\r", b"\n")
+    for keyword in dict.fromkeys(_OTHER_LINE.findall(text)):
+        if re.match(rb"colou?r|rgb", keyword, re.IGNORECASE):
+            raise ValueError("colors in the text form of STL are not supported: export it as PLY")
+        file.ignore(keyword.decode())
     vertices = re.findall(rb"^\s*vertex\b(.*)", text, re.MULTILINE | re.IGNORECASE)
     face_count = len(re.findall(rb"^\s*endfacet\b", text, re.MULTILINE | re.IGNORECASE))
     coordinates = parse_numbers(b"\n".join(vertices), np.float64)

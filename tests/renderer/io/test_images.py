@@ -220,6 +220,32 @@ def test_a_png_file_of_high_dynamic_range_is_refused(tmp_path):
         read_image(tmp_path / "a.png", 2)
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("depth", [8, 16])
+@pytest.mark.parametrize("gamma", [1.0, 1.8])
+def test_linear_light_of_16_bits_is_refused_and_never_loses_its_dark_values(
+    tmp_path, suffix, depth, gamma
+):
+    """The upper 8 bits of 0.003 in linear light are 0, although its sRGB value is 10."""
+    pixels = np.full((8, 8), round(0.003 * (2**depth - 1)), np.uint16 if depth == 16 else np.uint8)
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(pixels).save(path, icc_profile=profile(b"GRAY", gamma_curve(gamma)))
+    if depth == 16 and gamma == 1:
+        with pytest.raises(InputError, match="linear"):
+            read_image(path, 8)
+    else:
+        stored_value = (pixels[0, 0] >> (depth - 8)) / 255
+        expected = 255 * srgb_curve(np.array(stored_value**gamma))
+        assert np.abs(read(path) - expected).max() <= 2
+
+
+def test_linear_light_of_16_bits_is_refused_in_color(tmp_path):
+    rows = bytes([0, 200] * 6)
+    (tmp_path / "a.png").write_bytes(png((2, 1), 16, 2, rows, gAMA=png_numbers(1)))
+    with pytest.raises(InputError, match="linear"):
+        read_image(tmp_path / "a.png", 2)
+
+
 def test_the_mark_of_adobe_rgb_in_exif_data_counts(tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA005] = {1: "R03"}

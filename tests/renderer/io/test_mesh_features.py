@@ -421,6 +421,10 @@ ROWS = [
     Row("off", "negative face color", off(face="255 -1 0"), REFUSED),
     Row("off", "NCOFF", off("NCOFF", "255 0 0 0 0 1"), REFUSED),
     Row("off", "lines with CRLF", {"mesh.off": off()["mesh.off"].replace("\n", "\r\n")}, WHITE),
+    Row("off", "face color 1 0 0 without a point", off(face="1 0 0"), REFUSED),
+    Row("off", "COFF 1 0 0 without a point", off("COFF", "1 0 0"), REFUSED),
+    Row("off", "COFF 1 0 0 and alpha 1, transparent as bytes", off("COFF", "1 0 0 1"), RED),
+    Row("off", "face color 0 0 0", off(face="0 0 0"), (0.0, 0.0, 0.0)),
     Row("off", "face color 256", off(face="256 0 0"), REFUSED),
     Row("off", "color of a map", off(face="7"), REFUSED),
     Row("off", "1.#IND", {"mesh.off": off()["mesh.off"].replace("0 0 0", "0 0 0.#IND")}, REFUSED),
@@ -453,6 +457,14 @@ ROWS = [
     Row("gltf", "_FEATURE_ID_0 of integers", gltf_vertices("_FEATURE_ID_0", 3, 5121), WHITE),
     Row("stl", "text", {"mesh.stl": STL_TEXT}, WHITE),
     Row("stl", "text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
+    *(
+        Row("stl", line, {"mesh.stl": STL_TEXT.replace("outer", f"{line}\nouter")}, outcome)
+        for line, outcome in (
+            ("color 1 0 0", REFUSED),
+            ("  COLOUR 255 0 0", REFUSED),
+            ("attribute 31", IGNORED),
+        )
+    ),
     Row(
         "stl",
         "four vertices",
