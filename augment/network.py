@@ -6,11 +6,13 @@ A classifier shows its network batches of images in evaluation mode, and checks 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
 from augment.losses import log_odds
+from augment.progress import progress
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from augment.transforms import normalize_light
 from renderer.errors import (
@@ -29,6 +32,7 @@ from renderer.errors import (
     require_range,
     single_line,
 )
+from renderer.image import to_unit
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole
 
@@ -46,6 +50,12 @@ MAX_DEVIATION = 0.01
 # Pixel value of the gray image with which a function is called to find out whether it has
 # gradients.
 GRAY = 0.5
+
+
+# Number of images that a network sees at a time if nothing else is said.
+BATCH = 256
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -701,3 +711,112 @@ def remembering(classifier: Classifier) -> Classifier:
     remembered = Classifier(function, classifier.size, classifier.classes, classifier.name)
     remembered.operating_points = classifier.operating_points
     return remembered
+
+
+@torch.no_grad()
+def compute_outputs(
+    network: Callable[[Tensor], Tensor],
+    images: Tensor | Iterable[Tensor],
+    batch_size: int = BATCH,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Compute the outputs (..., *) of a network for many images (..., 3, H, W), without gradients.
+
+    The images are in [0, 1] or have 8 bits. They can also come as an iterable of batches
+    (N, 3, H, W), which are read one after the other. A network of torch is in eval mode meanwhile.
+    `device` is that of the network. None if the images are there, too.
+    """
+    limit = BatchSize(batch_size)
+    batches = images
+    if isinstance(images, Tensor):
+        batches = progress(images.flatten(0, -4).split(batch_size), "predictions")
+    outputs: list[Tensor] = []
+    with eval_mode(network):
+        for batch in batches:
+            moved = batch if device is None else batch.to(device)
+            shown = to_unit(moved) if moved.dtype == torch.uint8 else moved
+            # No images are a batch, too, which gives outputs their shape.
+            computed = limit.map(lambda rows, shown=shown: network(shown[rows]), len(shown) or 1)
+            # The network may compute in half precision.
+            outputs += [output.to(shown.dtype) for output in computed]
+    joined = torch.cat(outputs)
+    return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
+
+
+@dataclass
+class BatchSize:
+    """Number of images that a classifier sees at a time. It is halved when memory runs out.
+
+    Attributes:
+        images: Number of images, at least 1. It does not grow again.
+    """
+
+    images: int
+
+    def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
+        """Call a function for one batch of images after the other.
+
+        The function takes the slice of the images of a batch. If memory runs out, it is called
+        again with half of it.
+        """
+        begin = 0
+        while begin < total:
+            part = slice(begin, begin + self.images)
+            try:
+                result = compute(part)
+            except (RuntimeError, MemoryError) as error:
+                if self.images == 1 or not is_out_of_memory(error):
+                    raise
+                self.images //= 2
+                warn_once(self.images)
+            else:
+                yield result
+                begin = part.stop
+                continue
+            # Empty the cache outside of the `except` block, because the error refers to tensors
+            # there.
+            torch.cuda.empty_cache()
+
+
+@cache
+def warn_once(images: int) -> None:
+    """Warn that memory ran out and batches have fewer images, once for each number of images."""
+    logger = logging.getLogger(__name__)
+    logger.warning("memory ran out: the attack goes on with %d images per pass", images)
+
+
+@contextmanager
+def eval_mode(network: Any) -> Iterator[None]:
+    """Set a network to eval mode in a `with` block, and then restore the mode of each module.
+
+    A function is left as it is.
+    """
+    modules = network.modules() if isinstance(network, nn.Module) else ()
+    training = [module for module in modules if module.training]
+    # `eval` of a large network takes as long as rendering an image, so call it only if needed.
+    if training:
+        network.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
+@contextmanager
+def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
+    """Set a network to eval mode, without gradients of its parameters, in a `with` block.
+
+    The mode of each module, `requires_grad` of each parameter and the state of
+    the global random generators are restored after the block.
+    """
+    trainable = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    gpus = {parameter.device for parameter in network.parameters() if parameter.is_cuda}
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with eval_mode(network), torch.random.fork_rng(devices=sorted(gpus, key=str)):
+            yield
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)

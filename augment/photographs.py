@@ -18,8 +18,7 @@ from augment.attacks.attack import fooled_in_views
 from augment.attacks.eot import Quantized
 from augment.attacks.gain import Best, descend_gain, draw_log_gain, search_gain
 from augment.attacks.loop import Criterion
-from augment.model_passes import frozen_eval_mode
-from augment.network import Classifier
+from augment.network import Classifier, frozen_eval_mode
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,

@@ -17,14 +17,13 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import distributed
-from augment.attacks.attack import fooled_in_views, logits_of, warn_of_changed_light
+from augment.attacks.attack import fooled_in_views, warn_of_changed_light
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known
-from augment.model_passes import frozen_eval_mode
-from augment.network import NetworkCall
+from augment.network import NetworkCall, compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.scene.build import MeshSource, build_scene
@@ -418,7 +417,7 @@ class AugmentationService:
         with frozen_eval_mode(model), self.phases("attack_classifier"):
             attacked_model = preprocessed_model(self.settings.attack, model)
             batch_size = self.settings.attack.batch_size
-            logits = logits_of(attacked_model, images[rows, None], batch_size)[:, 0]
+            logits = compute_outputs(attacked_model, images[rows], batch_size)
         require_known(labels, logits)
         is_misclassified = ~is_correct(logits.argmax(1), labels[rows], self.positive_classes[1:])
         loss = label_loss(logits, labels[rows], absent=self.positive_classes[1:])

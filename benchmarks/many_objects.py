@@ -33,7 +33,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from augment.projected_light import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square
@@ -347,12 +347,8 @@ def predict(network: Classifier, images: torch.Tensor) -> np.ndarray:
         network: The network.
         images: Images, uint8, shape (N, 3, size, size).
     """
-    predicted = []
-    for batch in images.split(BATCH):
-        with torch.no_grad():
-            indices = network(batch / 255).argmax(1)
-        predicted += [network.classes[index] for index in indices.tolist()]
-    return np.array(predicted)
+    indices = compute_outputs(network, images, BATCH).argmax(1)
+    return np.array([network.classes[index] for index in indices.tolist()])
 
 
 def interpolate(original: Classifier, trained: Classifier, factor: float) -> Classifier:

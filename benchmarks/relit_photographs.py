@@ -20,9 +20,8 @@ import torch
 from torch import Tensor
 
 import norm_balls as nb
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from benchmarks.many_objects import ScoredGroup, mean_with_interval
-from renderer.image import to_unit
 from train.data.photographs import find_unlabeled, load_photographs
 from train.evaluation.tables import Estimate, format_interval
 from train.saved_networks import load_network
@@ -164,11 +163,9 @@ def score(
     return {title: column.double() for title, column in columns.items()}
 
 
-@torch.no_grad()
 def predict(classifier: Classifier, photographs: Tensor) -> Tensor:
     """Return the classes that a network predicts for photographs, shape (N,)."""
-    parts = [classifier(to_unit(part)).argmax(1) for part in photographs.split(BATCH)]
-    return torch.cat(parts)
+    return compute_outputs(classifier, photographs, BATCH).argmax(1)
 
 
 def cell(columns: Tensor, first: Tensor, control: Tensor | None) -> str:

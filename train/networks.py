@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.model_passes import eval_mode
-from augment.network import Normalized
+from augment.network import Normalized, eval_mode
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from train.settings import WIDERESNET

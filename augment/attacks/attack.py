@@ -24,8 +24,12 @@ from augment.attacks.optimizers import descend
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.losses import logit_gap
-from augment.model_passes import BatchSize, eval_mode
-from augment.network import Classifier, class_index, remembering
+from augment.network import (
+    Classifier,
+    class_index,
+    compute_outputs,
+    remembering,
+)
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress
@@ -305,8 +309,8 @@ class AttackResult(ShortRepr):
         fractions = [index / (frame_count - 1) for index in range(frame_count)]
         images = [self._image_between(fraction, example, view) for fraction in fractions]
         balls = [self._ball_between(fraction, example) for fraction in fractions]
-        logits = logits_of(self.preprocessed_model, torch.stack(images)[:, None], 1)
-        predicted = predictions(logits[:, 0], self.classifier.classes)
+        logits = compute_outputs(self.preprocessed_model, torch.stack(images), 1)
+        predicted = predictions(logits, self.classifier.classes)
         captions = []
         for name, confidence in zip(predicted["predicted"], predicted["confidence"], strict=True):
             captions.append(f"{name} {confidence:.0%}")
@@ -485,7 +489,7 @@ def _attack(
     model = preprocessed_model(settings, classifier)
 
     images_before = problem.images(problem.start)
-    logits_before = logits_of(model, images_before, settings.batch_size)
+    logits_before = compute_outputs(model, images_before, settings.batch_size)
     source = source_labels(scene, logits_before, classifier)
     if not force:
         require_clean_correct(scene, logits_before, source, classifier)
@@ -500,7 +504,7 @@ def _attack(
     if descent.zero_gradient.any():
         warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
-    logits = logits_of(model, images, settings.batch_size)
+    logits = compute_outputs(model, images, settings.batch_size)
     success_in_views = fooled_in_views(
         model,
         images,
@@ -583,19 +587,6 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
             "or set allow_negative=True to keep the light as it is"
         )
         warnings.warn(message, stacklevel=stacklevel)
-
-
-@torch.no_grad()
-def logits_of(
-    model: nn.Module, images: Float[Tensor, "E V 3 H W"], batch_size: int
-) -> Float[Tensor, "E V C"]:
-    """Compute the logits of all views of examples, batch by batch."""
-    all_images = images.flatten(0, 1)
-    batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
-    with eval_mode(model):
-        logits = torch.cat(list(progress(batches, "predictions")))
-    # The network may compute in half precision.
-    return logits.unflatten(0, images.shape[:2]).to(images.dtype)
 
 
 def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:
@@ -737,7 +728,7 @@ def fooled_in_views(
         "sensor noise",
     )
     for noisy_images in noisy_versions:
-        logits = logits_of(model, noisy_images, settings.batch_size)
+        logits = compute_outputs(model, noisy_images, settings.batch_size)
         noisy_predicted = logits.argmax(2).to(is_fooled.device)
         # A view must be fooled in every draw of the noise.
         is_fooled[tested] &= tested_criterion.reached_in_views(noisy_predicted)

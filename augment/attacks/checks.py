@@ -19,7 +19,6 @@ from augment.attacks.attack import (
     AttackResult,
     final_images,
     fooled_in_views,
-    logits_of,
     predictions,
     require_result,
 )
@@ -28,7 +27,7 @@ from augment.attacks.loop import Criterion
 from augment.attacks.optimizers import descend
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import progress
@@ -404,7 +403,7 @@ class Successes:
 
 def _predicted(result: AttackResult, images: Float[Tensor, "A V 3 H W"]) -> Tensor:
     """Return the classes that the attacked classifier predicts, shape (A, V)."""
-    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    logits = compute_outputs(result.preprocessed_model, images, result.settings.batch_size)
     return logits.argmax(2)
 
 
@@ -652,7 +651,7 @@ class _Adversaries:
         if not len(images):
             return torch.empty(0, images.shape[1], len(classifier.classes))
         model = preprocessed_model(settings, classifier)
-        return logits_of(model, images, settings.batch_size).cpu()
+        return compute_outputs(model, images, settings.batch_size).cpu()
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:

@@ -14,12 +14,12 @@ from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, w
 from augment.attacks.attack import (
     AttackResult,
     fooled_in_views,
-    logits_of,
     predictions,
     require_result,
 )
 from augment.attacks.checks import CHECKED, warnings
 from augment.attacks.eot import as_jpeg
+from augment.network import compute_outputs
 from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
@@ -215,7 +215,7 @@ def _numbers_of_version(
     Return a dictionary for each example: its successes, predictions, and differences from the
     images of the result.
     """
-    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    logits = compute_outputs(result.preprocessed_model, images, result.settings.batch_size)
     predicted = logits.argmax(2)
     success_in_views = fooled_in_views(
         result.preprocessed_model,

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.attack import logits_of, source_labels
+from augment.attacks.attack import source_labels
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import build_problem
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from augment.progress import progress
 from augment.scene.scene import Scene
 from augment.settings import SceneSettings
@@ -174,7 +174,7 @@ def _confidences(
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)
-    logits = logits_of(preprocessed_model(attack, classifier), images, attack.batch_size)
+    logits = compute_outputs(preprocessed_model(attack, classifier), images, attack.batch_size)
     # Probability of each of the C classes in each view of each example, shape (E, V, C).
     probabilities = logits.softmax(2)
     labels = source_labels(scene, logits, classifier)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from augment.attacks.loop import Criterion, Descent, DescentResult, Evaluation, Score, State
 from augment.losses import adversarial_cost
-from augment.model_passes import BatchSize
+from augment.network import BatchSize
 from augment.random_streams import generator
 
 

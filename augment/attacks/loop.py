@@ -43,7 +43,7 @@ from torch import Tensor, nn
 
 from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, add_sensor_noise
 from augment.losses import NO_CLASS, adversarial_cost, is_overconfident, logit_gap
-from augment.model_passes import BatchSize, frozen_eval_mode
+from augment.network import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
 from renderer.short_repr import ShortRepr
 

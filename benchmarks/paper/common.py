@@ -20,7 +20,7 @@ import yaml
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings
-from augment.attacks.attack import logits_of
+from augment.network import compute_outputs
 from augment.random_streams import generator
 from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, load_object
@@ -398,6 +398,6 @@ def predict(classifier: Classifier, images: Tensor) -> list[str]:
     Returns:
         Names of the predicted classes.
     """
-    logits = logits_of(classifier, images, BATCH_SIZE)
+    logits = compute_outputs(classifier, images, BATCH_SIZE)
     best = logits[:, 0].argmax(1).tolist()
     return [classifier.classes[index] for index in best]

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings, attack
-from augment.attacks.attack import AttackResult, logits_of
+from augment.attacks.attack import AttackResult
+from augment.network import compute_outputs
 from augment.random_streams import generator
 from benchmarks.common import Row
 from benchmarks.paper import common
@@ -108,7 +109,7 @@ def is_successful(attacked: AttackResult, values: Tensor) -> Tensor:
         Whether the attack's criterion is reached, bool, shape (E,).
     """
     images = attacked.problem.images(values)
-    logits = logits_of(attacked.classifier, images, common.BATCH_SIZE)
+    logits = compute_outputs(attacked.classifier, images, common.BATCH_SIZE)
     return attacked.criterion.reached(logits.argmax(2))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from augment import Classifier
-from augment.attacks.attack import logits_of
+from augment.network import compute_outputs
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.common import Row
@@ -88,7 +88,7 @@ def confidences_of_camera(
     """
     views = [common.View(camera, gray) for gray in common.GRAYS]
     scene = common.make_scene(subject, classifier.size, views)
-    logits = logits_of(classifier, common.render_all(scene), len(views))
+    logits = compute_outputs(classifier, common.render_all(scene), len(views))
     probabilities = logits[:, 0].softmax(1)
     label = classifier.label(subject.label)
     is_correct = probabilities.argmax(1) == label

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.attack import AttackResult, logits_of
+from augment.attacks.attack import AttackResult
+from augment.network import compute_outputs
 from renderer.image import to_bytes
 from renderer.rendering import light_sphere
 
@@ -41,7 +42,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     with torch.no_grad():
         images = result.problem.render(values, examples)
         conditions = result.problem.conditions(values, examples)
-        logits = logits_of(result.preprocessed_model, images, BATCH)[:, 0]
+        logits = compute_outputs(result.preprocessed_model, images, BATCH)[:, 0]
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
     highest_probability = probabilities.amax(dim=0)

@@ -18,12 +18,12 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
-from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
+from augment.attacks.attack import AttackResult, attack, fooled_in_views, predictions
 from augment.attacks.checks import success_by_radius
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Criterion
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
@@ -196,7 +196,7 @@ def is_correct(
     classifier: Classifier, scene: Scene, images: Float[Tensor, "E 1 3 H W"]
 ) -> Bool[Tensor, " E"]:
     """Test whether a classifier predicts the class of a scene, the same in all E examples."""
-    logits = logits_of(classifier, images, BATCH)[:, 0]
+    logits = compute_outputs(classifier, images, BATCH)[:, 0]
     return logits.argmax(1) == classifier.label(scene.labels[0])
 
 
@@ -351,7 +351,7 @@ class _TransferTest:
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))
-        predicted = logits_of(self.model, images, BATCH).argmax(2)
+        predicted = compute_outputs(self.model, images, BATCH).argmax(2)
         is_fooled = fooled_in_views(
             self.model,
             images,

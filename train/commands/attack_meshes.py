@@ -23,7 +23,6 @@ from augment.attacks.attack import (
     AttackResult,
     attack,
     fooled_in_views,
-    logits_of,
     predictions,
 )
 from augment.attacks.checks import (
@@ -38,7 +37,7 @@ from augment.attacks.files import require_renderers, save
 from augment.attacks.find_scene import find_scene
 from augment.attacks.loop import Criterion
 from augment.losses import NO_CLASS
-from augment.network import Classifier
+from augment.network import Classifier, compute_outputs
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.objects import SceneObject, add_table, load_object
@@ -481,7 +480,7 @@ def format_reloaded(
     """
     model = preprocessed_model(settings, classifier)
     # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
-    logits = logits_of(model, images[None], len(images))
+    logits = compute_outputs(model, images[None], len(images))
     predicted = logits.argmax(2)
     # The target class of the "attack" is `predicted`. `fooled_in_views` then tests whether
     # the images are still classified as `predicted` when there is noise.

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attacks.norm_ball import project, sample, take_step
 from augment.losses import label_loss
-from augment.model_passes import frozen_eval_mode
+from augment.network import frozen_eval_mode
 from augment.parameter_settings import StepSettings
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit

@@ -12,11 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.losses import kl_divergence
-from augment.model_passes import eval_mode
+from augment.network import compute_outputs
 from augment.progress import progress
 from augment.projected_light import relight_photographs
 from augment.random_streams import stream_seed
-from renderer.image import to_unit
 from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
@@ -109,12 +108,10 @@ def predict(
     """
     device = next(model.parameters()).device
     batches = torch.arange(len(split)).split(BATCH)
-    logits = []
-    with eval_mode(model):
-        shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
-        for index, images in enumerate(shown):
-            if light_key:
-                light_seed = stream_seed(*light_key, index, "relit")
-                images = relight_photographs(images, light_seed, slides=images)
-            logits.append(model(to_unit(images.to(device))).float().cpu())
-    return torch.cat(logits)
+    shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
+    if light_key:
+        shown = (
+            relight_photographs(images, stream_seed(*light_key, index, "relit"), slides=images)
+            for index, images in enumerate(shown)
+        )
+    return compute_outputs(model, shown, BATCH, device).cpu()

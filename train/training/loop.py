@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.model_passes import eval_mode
+from augment.network import compute_outputs, eval_mode
 from augment.progress import progress, progress_message
 from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
@@ -685,12 +685,11 @@ def evaluate(
     # Each of n processes scores every n-th image.
     own_rows = rows[distributed.rank() :: distributed.world_size()]
     batches = own_rows.split(EVALUATION_BATCH)
-    shown = progress(batches, f"{len(rows)} images")
-    with eval_mode(model):
-        for batch, images in zip(shown, split.squares(batches), strict=True):
-            logits = model(to_unit(images.to(device)))
-            labels = split.labels[batch]
-            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
-            hits += (logits.argmax(1) == labels).sum()
+    shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
+    all_logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
+    for batch, logits in zip(batches, all_logits.split(EVALUATION_BATCH), strict=True):
+        labels = split.labels[batch]
+        loss_sum += F.cross_entropy(logits, labels, reduction="sum")
+        hits += (logits.argmax(1) == labels).sum()
     loss_sum, hits = all_reduce_sum(totals).tolist()
     return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

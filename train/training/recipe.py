@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from augment.model_passes import eval_mode
-from augment.network import nearest
+from augment.network import eval_mode, nearest
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 

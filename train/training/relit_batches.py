@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attack_settings import RelightingSettings
 from augment.attacks.gain import descend_gain, draw_log_gain
-from augment.model_passes import frozen_eval_mode
+from augment.network import frozen_eval_mode
 from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.image import decode, to_bytes, to_unit

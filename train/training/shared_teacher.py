@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from augment.model_passes import eval_mode
+from augment.network import eval_mode
 from train.device import PRECISIONS, MixedPrecision
 from train.settings import ALL_BUT_LAST, TrainSettings
 from train.training.recipe import last_layer

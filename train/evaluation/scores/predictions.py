@@ -8,18 +8,15 @@ import csv
 import hashlib
 import io
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import torch
 
 from augment.losses import log_odds
-from augment.model_passes import eval_mode
-from augment.network import Label, NetworkCall, as_class_names
-from augment.progress import progress
+from augment.network import Label, NetworkCall, as_class_names, compute_outputs, eval_mode
 from renderer.errors import InputError, require_range, single_line
-from renderer.image import to_unit
 from renderer.io.files import atomic_write
 from renderer.settings import MAX_SIZE
 from renderer.short_repr import ShortRepr
@@ -200,13 +197,9 @@ def compute_logits(
             "the model has a single class, so its log-odds are infinite: "
             "evaluate a model with at least two classes",
         )
-    call = NetworkCall("model")
-    in_eval_mode = eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext()
-    batches = []
-    with in_eval_mode, torch.inference_mode():
-        for batch in progress(images.split(BATCH), "predictions"):
-            batches.append(call(model, to_unit(batch.to(device))))
-    logits = torch.cat(batches).float().cpu()
+    checked = partial(NetworkCall("model"), model)
+    with eval_mode(model):
+        logits = compute_outputs(checked, images, BATCH, device).cpu()
     expected = (len(images), classes)
     if logits.shape != expected:
         raise InputError(

@@ -1,5 +1,6 @@
-"""An attack in batches or parts is the same attack, even if memory runs out."""
+"""Many images pass through a network in batches, also if memory runs out."""
 
+import copy
 import logging
 from dataclasses import fields
 
@@ -10,7 +11,7 @@ from torch import nn
 from augment.attack_settings import AttackSettings
 from augment.attacks.loop import Criterion, DescentResult
 from augment.attacks.optimizers import descend
-from augment.model_passes import warn_once
+from augment.network import compute_outputs, warn_once
 
 OUT_OF_MEMORY = [
     torch.OutOfMemoryError("CUDA out of memory"),
@@ -106,3 +107,45 @@ def test_an_attack_in_parts_is_the_attack(group_size):
     expected = attack(Limited())
     assert expected.steps.unique().numel() > 1
     require_same(attack(Limited(), group_size=group_size), expected)
+
+
+@pytest.fixture
+def network():
+    """A network in training mode that would change its outputs and itself there."""
+    torch.manual_seed(0)
+    layers = [nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Flatten(), nn.Dropout(), nn.Linear(144, 5)]
+    network = nn.Sequential(*layers)
+    network[1].eval()
+    return network
+
+
+@pytest.mark.parametrize("shape", [(7,), (7, 2), (0,)])
+@pytest.mark.parametrize("batch_size", [1, 3, 99])
+def test_outputs_of_many_images_are_those_of_a_copy_in_eval_mode(network, shape, batch_size):
+    images = torch.rand(*shape, 3, 8, 8)
+    state = {name: value.clone() for name, value in network.state_dict().items()}
+    outputs = compute_outputs(network, images, batch_size)
+    assert [module.training for module in network] == [True, False, True, True, True]
+    assert all(value.equal(state[name]) for name, value in network.state_dict().items())
+    assert not outputs.requires_grad
+    expected = copy.deepcopy(network).eval()(images.flatten(0, -4)).view(*shape, 5)
+    torch.testing.assert_close(outputs, expected.detach())
+
+
+def test_images_of_8_bits_and_batches_from_files_have_the_same_outputs(network):
+    stored = torch.randint(256, (7, 3, 8, 8), dtype=torch.uint8)
+    expected = compute_outputs(network, stored / 255)
+    torch.testing.assert_close(compute_outputs(network, stored, 2), expected)
+    torch.testing.assert_close(compute_outputs(network, iter(stored.split(3)), 2), expected)
+
+
+def test_outputs_in_half_precision_get_the_type_of_the_images():
+    outputs = compute_outputs(lambda images: images.mean((2, 3)).half(), torch.rand(3, 3, 4, 4))
+    assert outputs.dtype == torch.float32
+
+
+def test_outputs_without_memory_come_in_smaller_batches():
+    limited = Limited(3)
+    images = torch.rand(7, 3, 1, 1)
+    assert compute_outputs(limited, images, 8).equal(Limited()(images))
+    assert limited.batch_sizes == [7, 4, 2, 2, 2, 1]
