@@ -36,7 +36,7 @@ sweep() {
     local experiment=$1
     shift
     "$python" -m train --multirun "experiment=$experiment" data=npz "data.path=$DATA" \
-        "scene.meshes=$MESHES" "sweep=$runs/$experiment" "$@"
+        label=orange "scene.meshes=$MESHES" "sweep=$runs/$experiment" "$@"
 }
 
 # Print the tables of experiment $1 on the photographs $2 without the sources $3.

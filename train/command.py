@@ -413,9 +413,14 @@ def _as_text(key: str, value: str) -> str:
     if not value or value[0] in (*QUOTES, "~"):
         return override
     try:
-        parsed = OverridesParser.create().parse_override(override).value()
+        parsed_override = OverridesParser.create().parse_override(override)
     except HydraException:
         return f"{key}={quoted(value)}"
+    if parsed_override.is_sweep_override() and not set("[](){}" + QUOTES) & set(value):
+        # The values of a sweep are texts, too: label=true,false.
+        values = [_as_text(key, item.strip()) for item in value.split(",")]
+        return f"{key}={','.join(item.partition('=')[2] for item in values)}"
+    parsed = parsed_override.value()
     if isinstance(parsed, list) and not set("[]{}" + QUOTES) & set(value[1:-1]):
         # Classes can be named true, null or 1.5. Hydra would read them as values.
         members = zip(value[1:-1].split(","), parsed, strict=False)

@@ -543,9 +543,10 @@ class ExperimentSettings(NetworkSettings):
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
     label: Any = setting(  # str | list[str], for which OmegaConf has no type
-        "orange",
+        None,
         "Positive class: the class of the meshes, whose recall and false positives are measured. "
-        "Or several: [orange, apple]. null: the classes that scene.meshes name.",
+        "Or several: [orange, apple]. null: the classes that scene.meshes name or, without meshes, "
+        "each class that has a sub-folder of photographs.",
         is_text=True,
     )
     compare: list[str] = setting(
@@ -579,13 +580,15 @@ class ExperimentSettings(NetworkSettings):
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
         super().__post_init__()
+        renders_meshes = self.augment.renders and self.augment.mode != "folder"
+        if renders_meshes:
+            self._check_silhouettes()
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
             # are known. `with_classes_of_meshes` then creates these settings again.
             return
         self._remove_generated_positives()
-        if self.augment.renders and self.augment.mode != "folder":
-            self._check_silhouettes()
+        if renders_meshes:
             self._count_examples()
 
     def _check_silhouettes(self) -> None:
@@ -616,6 +619,18 @@ class ExperimentSettings(NetworkSettings):
             if not is_positive:
                 kept.append(item)
         self.scene.hard_negatives = kept
+
+    @property
+    def label_follows_from_meshes(self) -> bool:
+        """Whether a label that is not set is the list of the classes of the meshes."""
+        has_meshes = bool(self.scene.meshes) and self.augment.mode != "folder"
+        return self.label is None and has_meshes and self.shows_positives
+
+    @property
+    def shows_positives(self) -> bool:
+        """Whether the run trains on objects of the positive classes, or scores images of them."""
+        is_scored = bool(self.evaluate.photos) or self.evaluate.laboratory_setups > 0
+        return self.augment.renders or self.train.ranking_weight > 0 or is_scored
 
     @property
     def views(self) -> int:

@@ -57,7 +57,7 @@ def test_a_solid_of_the_label_is_no_hard_negative_unless_it_is_of_another_class(
 
 
 def test_the_demonstration_has_one_epoch_of_three_rounds():
-    settings = train_command.read(["run=here"])
+    settings = train_command.read(["run=here", "label=orange"])
     image_count = round(0.9 * 10 * settings.data.train_per_class)
     rounds = rounds_of_epoch(
         image_count,
@@ -175,6 +175,7 @@ TWO_CLASSES = [
         (["scene.hard_negatives=[{mesh: 'solid:orange'}]", "augment.examples=6"], "positive class"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
+        (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
         (["label=ornage"], "'ornage' is not a class of the model"),
         ([*TWO_CLASSES, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
         (
@@ -229,6 +230,9 @@ KEYS = train_command.keys | evaluate_command.keys
     ("argument", "override"),
     [
         ("photos=2024", "photos='2024'"),
+        ("photos=2024,2025", "photos='2024','2025'"),
+        ("label=true,false", "label='true','false'"),
+        ("label=null,1.10, cup", "label=null,'1.10',cup"),
         ("evaluate.photos=1.10", "evaluate.photos='1.10'"),
         ("+data.path=1e3", "data.path='1e3'"),
         ("run=a\udcff", "run='a\udcff'"),
@@ -244,7 +248,6 @@ def test_a_name_that_is_no_text_to_hydra_is_quoted(argument, override):
     [
         "train.epochs=3",
         "photos=none",
-        "photos=2024,2025",
         "run=a/b.c",
         "2024",
         "run='ä'",

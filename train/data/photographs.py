@@ -41,6 +41,9 @@ MACOS_FOLDER = "__MACOSX"
 # A folder whose name begins with "other_" has photographs of a class that the
 # network lacks.
 OTHER_PREFIX = "other_"
+# Largest number of classes that are positive because they have a sub-folder. The scores of each
+# class take as much time and memory as all photographs.
+MAX_LABELS = 50
 # Table with the source and the object of each photograph of a folder.
 TABLE = "photos.csv"
 # pnb-lab writes a file of this name to its folder of renders.
@@ -183,6 +186,29 @@ def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
         raise InputError(f"{folder} is not a folder: give a folder of photographs")
     names = {*folder_names(folder)}
     return sorted(name for name in classes if composed(name) in names)
+
+
+def choose_labels(folder: Path, classes: Sequence[str], label: Label | None) -> list[str]:
+    """Choose the positive classes, on whose photographs recall is measured.
+
+    None chooses all classes of the network that have a sub-folder.
+    """
+    if label is not None:
+        return [classes[class_index(classes, name, "label")] for name in label_names(label)]
+    labels = class_folders(folder, classes)
+    if not labels:
+        known = ", ".join(classes[:3])
+        raise InputError(
+            f"folder={folder} has no sub-folder of a class of the network ({known}, ...): "
+            "name the sub-folders by classes, or give classes or label"
+        )
+    if len(labels) > MAX_LABELS:
+        raise InputError(
+            f"folder={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
+            "are scored one by one: choose the positive classes with label",
+            "label",
+        )
+    return labels
 
 
 def folder_names(folder: Path) -> list[str]:

@@ -16,22 +16,17 @@ from augment.plain_networks import (
     gradient_flags_kept,
 )
 from augment.settings import NormalizeLight
-from renderer.errors import InputError
 from renderer.validation import as_folder
 from train.command_settings import require_calibration
-from train.data.photographs import class_folders, require_outside
+from train.data.photographs import choose_labels, require_outside
 from train.device import MixedPrecision, choose_precision
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import Scores
 from train.report.results import require_replaceable
 from train.run_folder import sole_writer
-from train.settings import label_names, published
+from train.settings import published
 from train.system.user_errors import keyed, writable_folder
-
-# Largest number of classes that are positive because they have a sub-folder. The scores of each
-# class take as much time and memory as all photographs.
-MAX_LABELS = 50
 
 
 def evaluate(
@@ -123,7 +118,7 @@ def evaluate(
             device,
             normalize_light=normalize_light,
         )
-        labels = _choose_labels(classifier, folder, label)
+        labels = choose_labels(folder, classifier.classes, label)
         model = MixedPrecision(classifier.to(device), choose_precision(precision, device))
         predictor = Predictor(model, classifier.classes, classifier.size, device)
         target = None
@@ -142,31 +137,6 @@ def evaluate(
             if target:
                 scoring.write(scores, target)
     return scores
-
-
-def _choose_labels(
-    classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
-) -> list[str]:
-    """Choose the positive classes, on whose photographs recall is measured.
-
-    None chooses all classes of the network that have a sub-folder.
-    """
-    if label is not None:
-        return [classifier.classes[classifier.label(name)] for name in label_names(label)]
-    labels = class_folders(folder, classifier.classes)
-    if not labels:
-        known = ", ".join(classifier.classes[:3])
-        raise InputError(
-            f"folder={folder} has no sub-folder of a class of the network ({known}, ...): "
-            "name the sub-folders by classes, or give classes or label"
-        )
-    if len(labels) > MAX_LABELS:
-        raise InputError(
-            f"folder={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
-            "are scored one by one: choose the positive classes with label",
-            "label",
-        )
-    return labels
 
 
 def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:

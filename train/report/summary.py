@@ -223,7 +223,7 @@ def trained_labels(folder: Path) -> list[str]:
         run = summarize(folder)
     except InputError:
         return []
-    if "label" in run.settings:
+    if run.settings.get("label") is not None:
         return label_names(cast(Any, run.settings["label"]))
     scored = [[*scores.labels] for scores in run.photographs.values()]
     return scored[0] if scored else []

@@ -169,27 +169,22 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     """Replace a missing label, or a label that is an index, by the names of the classes.
 
     The label lists the positive classes. If it is missing, these are the classes
-    of the meshes. The names of the classes are known from the initial network.
+    of the meshes. The names of the classes are known from the initial network. Without one, the
+    settings stay.
     """
     names = [] if settings.label is None else label_names(settings.label)
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
     if len(names) == 1:
         _print_assumed_class(settings.scene.meshes, names[0])
-    if names and not may_have_index:
+    if not (may_have_index or settings.label_follows_from_meshes):
         return settings
     initial = load_initial(settings)
-    if names:
-        if initial is None:
-            return settings
-        return with_class_names(settings, initial.classes)
     if initial is None:
-        raise InputError(
-            "label is not set, and without train.init_from the names of the classes are unknown: "
-            "set label=CLASS",
-            "label",
-        )
-    return with_classes_of_meshes(settings, initial.classes)
+        # `Run.load` checks the label when it knows the classes of the data.
+        return settings
+    change = with_class_names if names else with_classes_of_meshes
+    return change(settings, initial.classes)
 
 
 def _print_assumed_class(meshes: Sequence[Any], label: str) -> None:

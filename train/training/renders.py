@@ -36,7 +36,7 @@ def build_service(
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64, device=device)
     phases = Phases(device)
-    names = label_names(settings.label)
+    names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
     is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1

@@ -31,7 +31,7 @@ from renderer.image import to_unit
 from train import checkpoints, console, run_folder
 from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
-from train.data.photographs import find_photographs, require_outside
+from train.data.photographs import choose_labels, find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
 from train.device import (
     MixedPrecision,
@@ -118,11 +118,12 @@ class Run:
         settings = self.settings
         # Labels of the data become indices into the classes of the network.
         self.data = _relabel(settings, self.data, self.initial)
+        _require_label(settings, self.data)
         for name, photographs in settings.evaluate.folders.items():
             require_outside(self.folder / name, photographs)
-            _require_names(settings, self.data)
             with keyed("evaluate.photos"):
-                find_photographs(photographs, self.data.classes, settings.label)
+                labels = choose_labels(photographs, self.data.classes, settings.label)
+                find_photographs(photographs, self.data.classes, labels)
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier = self._require_folder()
@@ -457,7 +458,7 @@ class Run:
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),
             folder=self.scored_folders[name],
-            label=self.settings.label,
+            label=choose_labels(self.scored_folders[name], self.data.classes, self.settings.label),
             out=folder / name,
             skip_unreadable=self.settings.evaluate.skip_unreadable,
         )
@@ -484,11 +485,21 @@ def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
     return load_data(settings, initial), initial
 
 
-def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
-    """Raise InputError if the setting `label` is the index of a class instead of its name.
+def _require_label(settings: ExperimentSettings, data: DataSet) -> None:
+    """Check that the positive class is known, and that photographs can have it as a folder.
 
     The sub-folders of photographs have names of classes, and no indices.
     """
+    needs_label = settings.augment.renders or settings.train.ranking_weight > 0
+    if settings.label is None and needs_label:
+        choices = ", ".join(data.classes[:5])
+        raise InputError(
+            f"label is not set: set it to the class of the meshes, one of the {len(data.classes)} "
+            f"classes {choices}{', ...' if len(data.classes) > 5 else ''}",
+            "label",
+        )
+    if settings.label is None or not settings.evaluate.folders:
+        return
     for label in label_names(settings.label):
         name = class_name(data.classes, label, "label")
         if name != label:

@@ -256,7 +256,6 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
         ("train.init_from=null,missing.pt", "train.init_from"),
         ("evaluate.photos=null,missing", "evaluate.photos: missing is not a folder"),
         ("model.name=wideresnet,torchvision:resnet", "model.name"),
-        ("label=null", "label is not set"),
     ],
 )
 def test_a_wrong_setting_of_any_run_fails_once_before_a_run_begins(

@@ -637,6 +637,15 @@ def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names
     assert not (tmp_path / "photographs").exists()
 
 
+def test_without_a_label_and_renders_photographs_are_scored_for_each_class_with_a_folder(
+    tiny, photos, tmp_path
+):
+    overrides = ["label=null", f"evaluate.photos={photos}"]
+    completed_run(tiny(*WITHOUT_RENDERS, *overrides), tmp_path)
+    summary = json.loads((tmp_path / "photographs" / "summary.json").read_text())
+    assert summary["label"] == ["apple", "orange"]
+
+
 class TestTheSelectedNetwork:
     def test_is_the_best_on_validation_and_scored_once_after_the_last_epoch(self, tiny, tmp_path):
         data = load_data(tiny())
