@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from train.evaluation.scores.metrics import (
+from train.results.metrics import (
     RATES,
     ROC_METRICS,
     Jackknife,
@@ -31,7 +31,7 @@ from train.evaluation.scores.metrics import (
     leave_out,
     weighted_means,
 )
-from train.evaluation.tables import Estimate, Table
+from train.results.tables import Estimate, Table
 
 METRICS = (*ROC_METRICS, "recall", "FPR", "top-1")
 METHODS = ("jackknife", "bootstrap", "images")

@@ -39,7 +39,8 @@ from benchmarks.splits import Method, adapt_texture_or_material, load, log_evalu
 from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
-from train.evaluation.scores.metrics import (
+from train.laboratory.laboratory import write_laboratory
+from train.results.metrics import (
     Jackknife,
     Units,
     average,
@@ -47,8 +48,7 @@ from train.evaluation.scores.metrics import (
     leave_out,
     weighted_means,
 )
-from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
-from train.laboratory.laboratory import write_laboratory
+from train.results.tables import Estimate, Table, format_fraction, format_interval, fraction
 
 TEST = "test"
 SAME = "objects trained on"

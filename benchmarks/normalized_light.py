@@ -27,12 +27,12 @@ from augment.settings import NormalizedLightSettings
 from benchmarks.splits import LABEL, TEST, VALIDATION, load, solids
 from train.command_settings import LabSettings
 from train.data.photographs import Photograph, find_photographs, load_photographs
-from train.evaluation.scores.metrics import Pooled, auc_and_recalls, metric_title
-from train.evaluation.scores.predictions import compute_logits, rank_classes
-from train.evaluation.tables import Table, format_interval
 from train.laboratory.laboratory import write_laboratory
-from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
-from train.report.summary import RunSummary
+from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
+from train.results.metrics import Pooled, auc_and_recalls, metric_title
+from train.results.predictions import compute_logits, rank_classes
+from train.results.store import RunSummary
+from train.results.tables import Table, format_interval
 from train.run_folder import read_json
 from train.settings import published
 

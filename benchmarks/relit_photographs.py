@@ -23,7 +23,7 @@ import norm_balls as nb
 from augment.network import Classifier, compute_outputs
 from benchmarks.many_objects import ScoredGroup, mean_with_interval
 from train.data.photographs import find_unlabeled, load_photographs
-from train.evaluation.tables import Estimate, format_interval
+from train.results.tables import Estimate, format_interval
 from train.saved_networks import load_network
 
 # Photographs per pass.

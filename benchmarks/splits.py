@@ -44,18 +44,18 @@ from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.data.sets import Split, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
-from train.evaluation.scores.metrics import METRICS, Pooled, metric_title
-from train.evaluation.scores.predictions import (
+from train.hashing import content_hash
+from train.laboratory.laboratory import write_laboratory
+from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
+from train.results.metrics import METRICS, Pooled, metric_title
+from train.results.predictions import (
     PREDICTIONS,
     Prediction,
     Predictor,
     write_predictions,
 )
-from train.evaluation.tables import Estimate, Table, format_interval
-from train.hashing import content_hash
-from train.laboratory.laboratory import write_laboratory
-from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
-from train.report.summary import RunSummary, summarize
+from train.results.store import RunSummary, summarize
+from train.results.tables import Estimate, Table, format_interval
 from train.saved_networks import is_classifier, load_network, load_run
 from train.training.loop import evaluate
 

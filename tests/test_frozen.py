@@ -470,7 +470,7 @@ def trained(call, monkeypatch, tmp_path_factory) -> Callable[[str], Path]:
 
     The run is made when a first test asks for it.
     """
-    monkeypatch.setattr("train.report.report_page.report_of", lambda folders, out: "no report")
+    monkeypatch.setattr("train.results.page.report_of", lambda folders, out: "no report")
 
     def run(name: str) -> Path:
         if name not in FOLDERS:

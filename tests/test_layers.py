@@ -104,7 +104,7 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
         "train.command",
         "train.help",
         "train.__main__",
-        "train.report",
+        "train.results",
         "train.system.user_errors",
     )
     checked = 0

@@ -1,6 +1,6 @@
 import logging
 
-from train.auditing.audit_report import AuditReport as AuditReport
+from train.auditing.report import AuditReport as AuditReport
 from train.command_settings import AuditSettings as AuditSettings
 from train.command_settings import EvaluateSettings as EvaluateSettings
 from train.command_settings import LabSettings as LabSettings

@@ -3,7 +3,7 @@
     main = Command(
         name="compare",
         settings=CompareSettings,
-        body="train.report.comparison:print_comparison",
+        body="train.results.compare:print_comparison",
         help=HelpText("Print Markdown tables of finished runs.", ["pnb-compare runs=[a,b]"]),
     )
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks.common import Row, write_csv
+from train.results.epoch_metrics import attack_success
 from train.run_folder import read_metrics
-from train.runs.epoch_metrics import attack_success
 
 # Measures of a round of attacks, with the titles of their axes.
 MEASURES = {

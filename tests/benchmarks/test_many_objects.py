@@ -14,8 +14,8 @@ from torch import nn
 from augment.network import Classifier
 from benchmarks import many_objects, splits
 from train.data.photographs import TABLE
-from train.evaluation.tables import Estimate, fraction
 from train.laboratory import lab_patterns
+from train.results.tables import Estimate, fraction
 
 CLASSES = ["orange", "lemon", "packet"]
 

@@ -3,7 +3,7 @@
 An audit consists of many measurements, such as the attacks on one network with
 one kind of lighting. Each result is written to its own file or folder, completely
 or not at all. An audit that was stopped therefore continues with the first
-missing result. `train.auditing.audit_page` then reads all results and writes the
+missing result. `train.auditing.page` then reads all results and writes the
 report.
 
 The folder of the audit has a subfolder of results for each network. The names of
@@ -29,7 +29,7 @@ from renderer.io.files import atomic_write
 from renderer.light.presets import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
-from train.auditing import audit_page as page
+from train.auditing import page
 from train.auditing.lights import (
     KINDS,
     QUERIES,
@@ -39,7 +39,7 @@ from train.auditing.lights import (
     transfer_success,
 )
 from train.auditing.plain_light import PlainViews, find_plain_views
-from train.auditing.relit_audit import (
+from train.auditing.relit import (
     RELIT_FOLDER,
     measure_photographs,
     photographs_screen,
@@ -51,11 +51,11 @@ from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabeled
 from train.device import choose_device
-from train.evaluation.scores.predictions import Predictor
-from train.evaluation.scores.scoring import evaluate_photographs
 from train.laboratory.laboratory import write_laboratory
-from train.report.report_page import PAGE
-from train.report.results import RESULTS, require_replaceable
+from train.results.overwrite import RESULTS, require_replaceable
+from train.results.page import PAGE
+from train.results.predictions import Predictor
+from train.results.scoring import evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer
 from train.saved_networks import load_chosen, load_network

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from augment.network import Classifier
-from train.evaluation.scores.metrics import metric_title
-from train.evaluation.tables import Table, describe_intervals, format_interval
-from train.report.comparison import ALL, Evaluation, Evaluations, difference, mean_metric
-from train.report.first_screen import EQUAL_RATE, gain_sentence
+from train.results.compare import ALL, Evaluation, Evaluations, difference, mean_metric
+from train.results.first_screen import EQUAL_RATE, gain_sentence
+from train.results.metrics import metric_title
+from train.results.tables import Table, describe_intervals, format_interval
 
 # Keys of the two networks of an audit. They are also the names of the subfolders for
 # their results.

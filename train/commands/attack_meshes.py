@@ -50,8 +50,7 @@ from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.commands import attack_photographs
 from train.device import choose_device, choose_rasterizer
-from train.evaluation.tables import Table
-from train.report.attack_tables import (
+from train.results.attack_tables import (
     FIGURE,
     TABLE,
     TRANSFERS,
@@ -61,7 +60,8 @@ from train.report.attack_tables import (
     write_sweeps,
     write_transfers,
 )
-from train.report.results import remove_attack, require_replaceable
+from train.results.overwrite import remove_attack, require_replaceable
+from train.results.tables import Table
 from train.run_config import write_config
 from train.run_folder import sole_writer
 from train.saved_networks import load_chosen, load_network

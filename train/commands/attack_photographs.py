@@ -6,8 +6,8 @@ from renderer.errors import InputError
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings
 from train.device import choose_device
-from train.evaluation.relit import MODELED, RELIT, attack_folder
-from train.report.results import remove_attack, require_replaceable
+from train.results.overwrite import remove_attack, require_replaceable
+from train.results.relit import MODELED, RELIT, attack_folder
 from train.run_config import write_config
 from train.run_folder import sole_writer
 from train.saved_networks import load_chosen

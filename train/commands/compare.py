@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from train.command_settings import CompareSettings
-from train.report.comparison import format_comparison, format_short_comparison
-from train.report.summary import finished_runs
+from train.results.compare import format_comparison, format_short_comparison
+from train.results.store import finished_runs
 from train.system.verbosity import is_verbose, shortened
 
 

@@ -7,9 +7,9 @@ from augment.plain_networks import as_facts, require_no_facts
 from train.command_settings import EvaluateSettings
 from train.data.photographs import class_folders
 from train.device import choose_device
-from train.evaluation.scores.scoring import format_overall, format_scores
 from train.functions.evaluate import evaluate as evaluate_network
-from train.report.summary import trained_labels
+from train.results.scoring import format_overall, format_scores
+from train.results.store import trained_labels
 from train.saved_networks import load_chosen, load_run
 from train.settings import label_names, published
 from train.system.user_errors import keyed

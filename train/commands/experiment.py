@@ -22,10 +22,10 @@ from augment.settings import MODES
 from train import checkpoints, console
 from train.command import compose, program, read_settings
 from train.processes import Interrupted, broadcast, process_group
-from train.report.comparison import format_short_comparison, format_table
-from train.report.report_page import report_of
-from train.report.results import remove_run, require_new_run
-from train.report.summary import is_finished, summarize
+from train.results.compare import format_short_comparison, format_table
+from train.results.overwrite import remove_run, require_new_run
+from train.results.page import report_of
+from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.run_folder import sole_writer
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings

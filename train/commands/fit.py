@@ -21,7 +21,7 @@ from renderer.light.files import save_light
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack_meshes import build_attacked
 from train.data.masks import read_mask
-from train.report.results import require_replaceable
+from train.results.overwrite import require_replaceable
 from train.settings import read_object
 from train.system.user_errors import writable_folder
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from train.command_settings import LabSettings
 from train.laboratory.laboratory import write_laboratory
-from train.report.results import require_replaceable
+from train.results.overwrite import require_replaceable
 from train.settings import label_names
 
 

@@ -8,7 +8,7 @@ from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.presets import load_light
 from train.command_settings import LightSettings
-from train.report.results import require_replaceable
+from train.results.overwrite import require_replaceable
 from train.system.user_errors import keyed
 
 

@@ -7,11 +7,11 @@ from typing import Any
 from augment.network import Classifier
 from renderer.errors import InputError
 from train.command_settings import PublishSettings
-from train.evaluation.scores import scoring
-from train.evaluation.scores.predictions import Predictor
 from train.networks import PYTHON
-from train.report.results import require_replaceable
-from train.report.summary import summarize, trained_labels
+from train.results import scoring
+from train.results.overwrite import require_replaceable
+from train.results.predictions import Predictor
+from train.results.store import summarize, trained_labels
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected, publish
 from train.settings import mapped, published

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 from train.command_settings import ReportSettings
-from train.report.report_page import write_report
-from train.report.results import OF_AUDIT, RESULTS, require_replaceable
+from train.results.overwrite import OF_AUDIT, RESULTS, require_replaceable
+from train.results.page import write_report
 from train.system.user_errors import writable_folder
 
 

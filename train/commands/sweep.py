@@ -24,10 +24,10 @@ from renderer.io.files import atomic_write
 from train import checkpoints, console
 from train.command import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
-from train.report.comparison import format_short_comparison, format_table
-from train.report.report_page import PAGE, report_of
-from train.report.results import require_new_run, require_replaceable
-from train.report.summary import is_finished, summarize
+from train.results.compare import format_short_comparison, format_table
+from train.results.overwrite import require_new_run, require_replaceable
+from train.results.page import PAGE, report_of
+from train.results.store import is_finished, summarize
 from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state
 from train.runs.run_names import run_name

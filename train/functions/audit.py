@@ -18,11 +18,11 @@ from augment.settings import NormalizeLight
 from renderer.errors import InputError
 from renderer.validation import as_list
 from train.auditing.audit import run_audit
-from train.auditing.audit_report import AuditReport, read_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
+from train.auditing.report import AuditReport, read_audit
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
-from train.report.results import require_replaceable
+from train.results.overwrite import require_replaceable
 from train.system.folders import folder_or_temporary
 
 

@@ -20,10 +20,10 @@ from renderer.validation import as_folder
 from train.command_settings import require_calibration
 from train.data.photographs import choose_labels, require_outside
 from train.device import MixedPrecision, choose_precision
-from train.evaluation.scores import scoring
-from train.evaluation.scores.predictions import Predictor
-from train.evaluation.scores.scoring import Scores
-from train.report.results import require_replaceable
+from train.results import scoring
+from train.results.overwrite import require_replaceable
+from train.results.predictions import Predictor
+from train.results.scoring import Scores
 from train.run_folder import sole_writer
 from train.settings import published
 from train.system.user_errors import keyed, writable_folder

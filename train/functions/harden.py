@@ -28,8 +28,8 @@ from train.__main__ import main
 from train.class_names import require_others, with_classes_of_meshes
 from train.command import read_settings
 from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
-from train.report.report_page import report_of
-from train.report.results import require_new_run
+from train.results.overwrite import require_new_run
+from train.results.page import report_of
 from train.run_folder import sole_writer
 from train.settings import (
     OTHER,

@@ -7,8 +7,8 @@ from typing import Any
 from augment.network import Classifier
 from renderer.errors import InputError
 from renderer.validation import require_kind
-from train.evaluation.scores.metrics import METRICS, read_metric
-from train.evaluation.tables import Estimate
+from train.results.metrics import METRICS, read_metric
+from train.results.tables import Estimate
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected
 from train.settings import published

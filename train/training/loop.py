@@ -33,8 +33,8 @@ from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_
 from train.data.sets import Split
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import SignalHandler, all_reduce_sum, wrap_ddp
+from train.results.epoch_metrics import epoch_metrics, format_epoch
 from train.run_folder import PHASES
-from train.runs.epoch_metrics import epoch_metrics, format_epoch
 from train.settings import RELIGHT, TrainSettings
 from train.system.user_errors import keyed
 from train.training.averages import Averages

@@ -40,13 +40,13 @@ from train.device import (
     choose_threads,
     set_deterministic,
 )
-from train.evaluation.scores.metrics import METRICS
-from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
-from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
 from train.laboratory.kept_aside import kept_aside_settings
 from train.laboratory.laboratory import is_laboratory, write_laboratory
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
-from train.report.results import remove_run
+from train.results.metrics import METRICS
+from train.results.overwrite import remove_run
+from train.results.predictions import BATCH, Model, Predictor, compute_logits
+from train.results.scoring import Scores, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.saved_networks import NORMALIZE_LIGHT, export

@@ -17,13 +17,12 @@ from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
 from renderer.light.presets import load_light
-from train.auditing import audit, lights
-from train.auditing import audit_page as page
+from train.auditing import audit, lights, page
 from train.auditing.audit import run_audit
-from train.auditing.audit_screen import withstood_sentence
 from train.auditing.frames import frames_of
 from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
 from train.auditing.plain_light import find_plain_views
+from train.auditing.screen import withstood_sentence
 from train.command_settings import AuditSettings
 from train.laboratory import lab_patterns as patterns
 

@@ -17,10 +17,10 @@ from train.auditing.remedies import (
     recommend,
 )
 from train.data.photographs import Photograph
-from train.evaluation.scores.metrics import Pooled
-from train.evaluation.scores.predictions import Prediction
-from train.report.comparison import Evaluation, pools_of
-from train.report.summary import RunSummary
+from train.results.compare import Evaluation, pools_of
+from train.results.metrics import Pooled
+from train.results.predictions import Prediction
+from train.results.store import RunSummary
 
 COUNT = 60
 

@@ -17,7 +17,7 @@ from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
 from train.commands.attack_meshes import attacks, overrides
-from train.report.attack_tables import format_attack
+from train.results.attack_tables import format_attack
 
 
 def configured(*arguments: str) -> AttackExperimentSettings:

@@ -11,7 +11,7 @@ from renderer.errors import InputError
 from scripts.attack import list_parameters, main
 from tests.helpers import bright_or_dark
 from train.commands.attack_meshes import run
-from train.evaluation.relit import PICTURE_COUNT, RELIT, read_relit
+from train.results.relit import PICTURE_COUNT, RELIT, read_relit
 
 
 def load_bright_or_dark():

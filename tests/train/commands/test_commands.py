@@ -29,7 +29,7 @@ from train.command import USER_ERROR
 from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
-from train.report.summary import trained_labels
+from train.results.store import trained_labels
 from train.run_folder import LOCK, sole_writer
 from train.saved_networks import load_run
 

@@ -16,7 +16,7 @@ from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands.experiment import train
-from train.report.report_page import PAGE
+from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.saved_networks import load_run
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings

@@ -30,10 +30,10 @@ from train.data import batches
 from train.data.sets import Split
 from train.hashing import content_hash
 from train.processes import Interrupted
-from train.report.comparison import format_table
-from train.report.report_page import write_report
-from train.report.results import remove_run
-from train.report.summary import is_finished, summarize
+from train.results.compare import format_table
+from train.results.overwrite import remove_run
+from train.results.page import write_report
+from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
 from train.saved_networks import load_run
 from train.system.user_errors import user_message

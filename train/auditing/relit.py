@@ -13,7 +13,11 @@ from augment.attack_settings import RelightingSettings
 from augment.network import Classifier
 from augment.photographs import ADVERSARIAL, RANDOM, SLIDE
 from train.command_settings import AuditSettings
-from train.evaluation.relit import (
+from train.results import plots
+from train.results.first_screen import FirstScreen, ShownMetric
+from train.results.page import write_page
+from train.results.plots import Picture
+from train.results.relit import (
     MODELED,
     TITLES,
     RelitPhotograph,
@@ -21,11 +25,7 @@ from train.evaluation.relit import (
     attack_folder,
     read_relit,
 )
-from train.evaluation.tables import Table, join_words
-from train.report import plots
-from train.report.first_screen import FirstScreen, ShownMetric
-from train.report.plots import Picture
-from train.report.report_page import write_page
+from train.results.tables import Table, join_words
 from train.run_config import CONFIG, read_config
 from train.settings import published
 

@@ -19,20 +19,10 @@ from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.class_names import in_words
-from train.evaluation.scores.scoring import CONTACT_SHEET
-from train.evaluation.scores.sheet import evenly_spaced
-from train.evaluation.tables import (
-    Table,
-    as_text,
-    format_fraction,
-    format_interval,
-    fraction,
-    join_words,
-)
 from train.laboratory.kept_aside import can_be_generated
-from train.report import comparison as compare
-from train.report import plots, summary
-from train.report.first_screen import (
+from train.results import compare, plots, store
+from train.results.epoch_metrics import attack_success
+from train.results.first_screen import (
     NETWORKS,
     Compared,
     FirstScreen,
@@ -41,11 +31,20 @@ from train.report.first_screen import (
     describe_place,
     is_laboratory,
 )
-from train.report.plots import Picture
-from train.report.summary import Methods, RunSummary, Scored, ScoredRun
+from train.results.plots import Picture
+from train.results.scoring import CONTACT_SHEET
+from train.results.sheet import evenly_spaced
+from train.results.store import Methods, RunSummary, Scored, ScoredRun
+from train.results.tables import (
+    Table,
+    as_text,
+    format_fraction,
+    format_interval,
+    fraction,
+    join_words,
+)
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS
-from train.runs.epoch_metrics import attack_success
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, published
 from train.system.user_errors import user_message
 
@@ -80,8 +79,8 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
     A run or attack that cannot be read is listed on the page.
     """
-    found = summary.find(folders)
-    methods = summary.group_by_method(found.runs)
+    found = store.find(folders)
+    methods = store.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
     shown = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
     renders = {}
@@ -91,7 +90,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         if first.epochs:
             renders[method] = _read_renders(first, "epoch", "Renders")
             examples[method] = _read_renders(first, "attacks", "Renders before and after")
-    groups = summary.group_by_images(shown)
+    groups = store.group_by_images(shown)
     return write_page(
         out,
         "runs.html.jinja",
@@ -100,11 +99,11 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         title=_title(found, methods),
         screen=_first_screen(groups),
         lead=[*_accuracy_sentences(methods), *_relit_sentences(methods)],
-        tables=[table for table in summary.run_tables(methods, {}) if table.rows],
+        tables=[table for table in store.run_tables(methods, {}) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
         curves=_plot_metrics(_collect_epochs(shown, found.unfinished)),
-        seconds=summary.seconds_table(shown),
+        seconds=store.seconds_table(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders=renders,
         examples=examples,
@@ -113,7 +112,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     )
 
 
-def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
+def _about(found: store.Findings, folders: Sequence[Path]) -> str:
     """Write the line below the title of the page."""
     counts = []
     if found.runs:
@@ -137,7 +136,7 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
     return about
 
 
-def _title(found: summary.Findings, methods: Methods) -> str:
+def _title(found: store.Findings, methods: Methods) -> str:
     """Write the title of the page."""
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
@@ -146,7 +145,7 @@ def _title(found: summary.Findings, methods: Methods) -> str:
     for runs in methods.values():
         for scores in runs[0].photographs.values():
             labels.update(scores.labels)
-    trained = [method for method, runs in methods.items() if runs[0].method != summary.INITIAL]
+    trained = [method for method, runs in methods.items() if runs[0].method != store.INITIAL]
     if labels and len(trained) < len(methods):
         return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
@@ -158,7 +157,7 @@ def _title(found: summary.Findings, methods: Methods) -> str:
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
-def _collect_epochs(methods: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
+def _collect_epochs(methods: Methods, unfinished: Sequence[store.Unfinished]) -> Epochs:
     """Collect the metrics of each epoch that are plotted."""
     epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
     started = [run for run in unfinished if run.epochs]
@@ -178,7 +177,7 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("train.report", "."),
+        loader=PackageLoader("train.results", "."),
         undefined=StrictUndefined,
         autoescape=True,
         trim_blocks=True,
@@ -215,7 +214,7 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
     """
     try:
         lines = [f"report: {write_report(folders, out)}"]
-        groups = summary.group_by_images(summary.group_by_method(summary.find(folders).runs))
+        groups = store.group_by_images(store.group_by_method(store.find(folders).runs))
         screen = _first_screen(groups)
         if screen is not None:
             lines = [" ".join([screen.answer, *screen.sentences]), *lines]
@@ -370,7 +369,7 @@ def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, 
     hardened = []
     for method, reference in pairs:
         first_run = group[reference][0].run
-        if first_run.method == summary.INITIAL:
+        if first_run.method == store.INITIAL:
             hardened.append((method, reference))
     return hardened[-1] if hardened else pairs[-1]
 
@@ -382,7 +381,7 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     if not pairs:
         return None
     method, base = _choose_pair(group, pairs)
-    is_hardening = group[base][0].run.method == summary.INITIAL
+    is_hardening = group[base][0].run.method == store.INITIAL
     # All runs of a method have the same labels and images, so the first one stands for all.
     scored = group[method][0]
     if is_hardening:
@@ -452,7 +451,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         path = scored_runs[0].folder / CONTACT_SHEET
         alt = f"predictions of {method} on {title}"
         sheets[method] = plots.from_file(path, alt, SHEET_WIDTH)
-    tables = [summary.score_table("", group)]
+    tables = [store.score_table("", group)]
     rocs: list[Picture | None] = []
     problem = ""
     try:
@@ -499,7 +498,7 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     return tables
 
 
-def _attack_section(attack: summary.AttackSummary) -> dict[str, Any]:
+def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
     """Collect the content of a section of the page about an attack."""
     images = {}
     for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):

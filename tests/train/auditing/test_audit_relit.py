@@ -11,9 +11,9 @@ import augment
 from renderer.errors import InputError
 from tests.helpers import bright_or_dark
 from train.auditing.audit import run_audit
-from train.auditing.relit_audit import RELIT_FOLDER
+from train.auditing.relit import RELIT_FOLDER
 from train.command_settings import AuditSettings
-from train.evaluation.relit import RELIT, read_relit
+from train.results.relit import RELIT, read_relit
 
 NETWORKS = {
     "classifier": augment.Classifier(bright_or_dark, 16, ["bright", "dark"], "first"),

@@ -10,15 +10,8 @@ import torch
 from PIL import Image
 
 from train.data.photographs import DESCRIPTION, Photograph
-from train.evaluation.scores.metrics import Pooled
-from train.evaluation.scores.predictions import (
-    PREDICTIONS,
-    Prediction,
-    rank_classes,
-    write_predictions,
-)
-from train.report.comparison import Difference, Evaluation, pools_of
-from train.report.first_screen import (
+from train.results.compare import Difference, Evaluation, pools_of
+from train.results.first_screen import (
     NETWORKS,
     Compared,
     choose_disagreements,
@@ -26,7 +19,14 @@ from train.report.first_screen import (
     describe_place,
     gain_sentence,
 )
-from train.report.summary import RunSummary
+from train.results.metrics import Pooled
+from train.results.predictions import (
+    PREDICTIONS,
+    Prediction,
+    rank_classes,
+    write_predictions,
+)
+from train.results.store import RunSummary
 
 # Classes of the images, and the classes that two networks predict.
 SHOWN = ("banana", "mug", "mug", "other_cup", "other_cup", "banana")

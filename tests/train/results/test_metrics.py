@@ -12,7 +12,7 @@ from scipy.stats import t as student_t
 
 from benchmarks.coverage import METRICS, Setup, measure
 from train.data.photographs import Photograph
-from train.evaluation.scores.metrics import (
+from train.results.metrics import (
     RATES,
     Jackknife,
     Units,
@@ -24,8 +24,8 @@ from train.evaluation.scores.metrics import (
     thresholds,
     weighted_means,
 )
-from train.evaluation.scores.predictions import rank_classes
-from train.evaluation.tables import OBJECTS, THESE_OBJECTS
+from train.results.predictions import rank_classes
+from train.results.tables import OBJECTS, THESE_OBJECTS
 
 # The scores have few values, so that ties are common.
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)

@@ -14,11 +14,10 @@ from PIL import Image
 from renderer.io.images import read_square
 from train.class_names import in_words
 from train.data.photographs import DESCRIPTION
-from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.tables import Estimate, Table, describe_intervals, join_words
-from train.report import comparison as compare
-from train.report import plots
-from train.report.plots import Picture
+from train.results import compare, plots
+from train.results.plots import Picture
+from train.results.predictions import PREDICTIONS, Prediction, read_predictions
+from train.results.tables import Estimate, Table, describe_intervals, join_words
 
 # Metric "recall at a false-positive rate of 10%". At an equal rate, the recall of two
 # networks can be compared.

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from train.evaluation.tables import Proportion, Table, format_fraction, format_interval, fraction
+from train.results.tables import Proportion, Table, format_fraction, format_interval, fraction
 
 
 def test_a_fraction_has_the_wilson_interval():

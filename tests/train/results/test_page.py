@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from renderer.errors import InputError
-from train.report import plots
-from train.report.report_page import report_of, write_report
+from train.results import plots
+from train.results.page import report_of, write_report
 from train.run_config import write_config
 from train.run_folder import locked
 

@@ -12,9 +12,9 @@ from jaxtyping import Int
 from PIL import Image
 
 from renderer.io.images import open_image
-from train.evaluation.scores.metrics import auc_and_recalls
-from train.evaluation.scores.sheet import Pair, draw_roc
-from train.evaluation.tables import Estimate
+from train.results.metrics import auc_and_recalls
+from train.results.sheet import Pair, draw_roc
+from train.results.tables import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

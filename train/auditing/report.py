@@ -8,12 +8,12 @@ from typing import Any
 from renderer.io.files import atomic_write
 from renderer.short_repr import ShortRepr
 from renderer.validation import as_path
-from train.auditing.audit_page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.lights import KINDS
+from train.auditing.page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.remedies import CLASSIFIER, HARDENED
-from train.evaluation.scores.metrics import METRICS, read_metric
-from train.evaluation.scores.scoring import SUMMARY
-from train.evaluation.tables import Estimate
+from train.results.metrics import METRICS, read_metric
+from train.results.scoring import SUMMARY
+from train.results.tables import Estimate
 from train.run_folder import read_json
 
 

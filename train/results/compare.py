@@ -15,7 +15,7 @@ from augment.progress import progress
 from augment.settings import MODES
 from renderer.errors import InputError
 from train.class_names import in_words
-from train.evaluation.scores.metrics import (
+from train.results.metrics import (
     METRICS,
     TOP_RANKS,
     Pool,
@@ -23,10 +23,9 @@ from train.evaluation.scores.metrics import (
     change,
     metric_title,
 )
-from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.scores.scoring import CONTACT_SHEET
-from train.evaluation.tables import Estimate, Table, describe_intervals, format_interval
-from train.report.summary import (
+from train.results.predictions import PREDICTIONS, Prediction, read_predictions
+from train.results.scoring import CONTACT_SHEET
+from train.results.store import (
     INITIAL,
     RunSummary,
     Scored,
@@ -38,6 +37,7 @@ from train.report.summary import (
     run_tables,
     seconds_table,
 )
+from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.settings import PHOTOGRAPHS
 
 # `class_table` has no rows if there are more classes than this.

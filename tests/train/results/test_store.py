@@ -4,9 +4,9 @@ import pytest
 
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
-from train.evaluation.tables import format_interval, fraction
-from train.report.comparison import format_table
-from train.report.summary import finished_runs, summarize
+from train.results.compare import format_table
+from train.results.store import finished_runs, summarize
+from train.results.tables import format_interval, fraction
 
 
 @pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n', '{"epoch": 1}\n{"test/accuracy": 1'])

@@ -10,13 +10,13 @@ from augment.attacks.files import LINES
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data import photographs
-from train.evaluation.relit import RELIT
-from train.evaluation.scores.predictions import PREDICTIONS
-from train.evaluation.scores.scoring import CONTACT_SHEET, SUMMARY
-from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
-from train.report.attack_tables import FIGURE, TABLE, TRANSFERS
-from train.report.report_page import PAGE
-from train.report.summary import is_finished
+from train.results.attack_tables import FIGURE, TABLE, TRANSFERS
+from train.results.page import PAGE
+from train.results.predictions import PREDICTIONS
+from train.results.relit import RELIT
+from train.results.scoring import CONTACT_SHEET, SUMMARY
+from train.results.sheet import ROC_FIGURE, ROC_TABLE
+from train.results.store import is_finished
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, FAILURE, METRICS, PUBLISHED, RENDERS, WEIGHTS
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST

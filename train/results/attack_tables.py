@@ -15,8 +15,8 @@ from torch import Tensor
 from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
 from renderer.io.files import atomic_write
-from train.evaluation.tables import Proportion, Table, format_fraction, fraction
-from train.report.plots import COLORS
+from train.results.plots import COLORS
+from train.results.tables import Proportion, Table, format_fraction, fraction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

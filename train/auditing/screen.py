@@ -12,15 +12,15 @@ from typing import Any
 from train.auditing.lights import KINDS, LightKind
 from train.auditing.plain_light import PlainViews
 from train.class_names import in_words
-from train.evaluation.scores.metrics import Pool
-from train.evaluation.tables import Estimate, fraction, join_words
-from train.report import plots
-from train.report.first_screen import (
+from train.results import plots
+from train.results.first_screen import (
     ComparedImage,
     FirstScreen,
     ShownMetric,
     ShownPrediction,
 )
+from train.results.metrics import Pool
+from train.results.tables import Estimate, fraction, join_words
 
 # Width of the picture that shows a view before and after an attack, in pixels.
 PAIR_WIDTH = 400

@@ -15,15 +15,15 @@ from augment.attacks.files import LINES
 from augment.settings import MODES
 from renderer.errors import InputError, single_line
 from train import console, run_config, run_folder
-from train.evaluation.scores.metrics import (
+from train.results.metrics import (
     METRICS,
     AreaUnderCurve,
     Thresholds,
     metric_title,
     read_metric,
 )
-from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
-from train.evaluation.tables import Estimate, Table, describe_intervals, format_interval
+from train.results.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
+from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
 from train.saved_networks import load_selected

@@ -11,16 +11,16 @@ import pytest
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.data.photographs import Photograph
-from train.evaluation.scores.metrics import pool
-from train.evaluation.scores.predictions import Prediction, write_predictions
-from train.report.comparison import (
+from train.results.compare import (
     class_table,
     format_comparison,
     format_short_comparison,
     format_table,
 )
-from train.report.report_page import write_report
-from train.report.summary import ScoredRun, summarize
+from train.results.metrics import pool
+from train.results.page import write_report
+from train.results.predictions import Prediction, write_predictions
+from train.results.store import ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
 Scores = dict[str | None, tuple[Sequence[float], Sequence[float]]]

@@ -14,15 +14,15 @@ from scipy.special import logsumexp, softmax
 
 from renderer.errors import InputError
 from train.data.photographs import Photograph
-from train.evaluation.scores.metrics import AT_THRESHOLD, METRICS
-from train.evaluation.scores.predictions import (
+from train.results.metrics import AT_THRESHOLD, METRICS
+from train.results.predictions import (
     Prediction,
     Predictor,
     rank_classes,
     read_predictions,
     write_predictions,
 )
-from train.evaluation.scores.scoring import (
+from train.results.scoring import (
     Scores,
     choose_operating_points,
     evaluate_photographs,
@@ -31,8 +31,8 @@ from train.evaluation.scores.scoring import (
     score,
     write,
 )
-from train.evaluation.scores.sheet import FRAME_WIDTH, IMAGE_SIZE
-from train.evaluation.tables import THESE_OBJECTS, fraction
+from train.results.sheet import FRAME_WIDTH, IMAGE_SIZE
+from train.results.tables import THESE_OBJECTS, fraction
 
 
 class TableModel(torch.nn.Module):

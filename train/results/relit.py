@@ -29,8 +29,8 @@ from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.short_repr import ShortRepr
 from train.data.photographs import Photograph, find_unlabeled, load_photographs
-from train.evaluation.scores.sheet import evenly_spaced
-from train.evaluation.tables import Proportion, Table, format_fraction, fraction
+from train.results.sheet import evenly_spaced
+from train.results.tables import Proportion, Table, format_fraction, fraction
 from train.run_folder import read_json
 
 # Name of the file with the predictions for all photographs.

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from renderer.short_repr import ShortRepr
-from train.evaluation.scores.predictions import Prediction
-from train.evaluation.tables import (
+from train.results.predictions import Prediction
+from train.results.tables import (
     IMAGES,
     OBJECTS,
     THESE_OBJECTS,

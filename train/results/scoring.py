@@ -26,7 +26,7 @@ from renderer.io.images import write_image
 from renderer.short_repr import ShortRepr
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
-from train.evaluation.scores.metrics import (
+from train.results.metrics import (
     FRACTION_METRICS,
     ROC_METRICS,
     TOP_RANKS,
@@ -38,15 +38,15 @@ from train.evaluation.scores.metrics import (
     thresholds,
     within_rank,
 )
-from train.evaluation.scores.predictions import (
+from train.results.predictions import (
     PREDICTIONS,
     FolderPredictions,
     Prediction,
     Predictor,
     write_predictions,
 )
-from train.evaluation.scores.sheet import contact_sheet, write_roc
-from train.evaluation.tables import (
+from train.results.sheet import contact_sheet, write_roc
+from train.results.tables import (
     Estimate,
     Proportion,
     Table,

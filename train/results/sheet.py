@@ -13,8 +13,8 @@ from PIL import Image, ImageOps
 
 from renderer.io.files import atomic_write
 from renderer.io.tiles import PAPER, Tile, draw_grid
-from train.evaluation.scores.metrics import RATES, auc_and_recalls, roc_curve
-from train.evaluation.scores.predictions import Prediction, by_label
+from train.results.metrics import RATES, auc_and_recalls, roc_curve
+from train.results.predictions import Prediction, by_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,16 +14,9 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.auditing.audit_screen import (
-    attack_pictures,
-    charts,
-    plain_sentence,
-    screen_of_one,
-    withstood_sentence,
-)
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.auditing.plain_light import PlainViews
-from train.auditing.relit_audit import relit_sections
+from train.auditing.relit import relit_sections
 from train.auditing.remedies import (
     CLASSIFIER,
     HARDENING,
@@ -32,14 +25,16 @@ from train.auditing.remedies import (
     Recommendation,
     recommend,
 )
+from train.auditing.screen import (
+    attack_pictures,
+    charts,
+    plain_sentence,
+    screen_of_one,
+    withstood_sentence,
+)
 from train.class_names import in_words
-from train.evaluation.scores.metrics import Units, leave_out, read_metric, weighted_means
-from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.scores.scoring import SUMMARY
-from train.evaluation.tables import Estimate, Proportion, fraction
-from train.report import comparison as compare
-from train.report import plots, summary
-from train.report.first_screen import (
+from train.results import compare, plots, store
+from train.results.first_screen import (
     NETWORKS,
     Compared,
     FirstScreen,
@@ -48,8 +43,12 @@ from train.report.first_screen import (
     describe_place,
     describe_prediction,
 )
-from train.report.plots import Picture
-from train.report.report_page import scores_section, write_page
+from train.results.metrics import Units, leave_out, read_metric, weighted_means
+from train.results.page import scores_section, write_page
+from train.results.plots import Picture
+from train.results.predictions import PREDICTIONS, Prediction, read_predictions
+from train.results.scoring import SUMMARY
+from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
 
@@ -278,10 +277,10 @@ def _evaluations(score_folders: Mapping[str, Path]) -> compare.Evaluations:
     """Read the predictions of several networks for the same images."""
     runs = {}
     for name, folder in score_folders.items():
-        scores = {folder.name: summary.PhotographScores.read(read_json(folder / SUMMARY))}
-        runs[name] = [summary.RunSummary(folder.parent, name, {"network": name}, scores, None)]
+        scores = {folder.name: store.PhotographScores.read(read_json(folder / SUMMARY))}
+        runs[name] = [store.RunSummary(folder.parent, name, {"network": name}, scores, None)]
     # All networks were scored on the same images, so there is a single group.
-    (group,) = summary.group_by_images(runs).values()
+    (group,) = store.group_by_images(runs).values()
     return compare.read_evaluations(group)
 
 
@@ -289,9 +288,9 @@ def _score_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
     """Collect the plots, tables and pictures of the scores on each folder of test images."""
     runs = {}
     for name, folder in results.items():
-        scores = summary.read_summaries(folder)
-        runs[name] = [summary.RunSummary(folder, name, {"network": name}, scores, None)]
-    return [scores_section(title, group) for title, group in summary.group_by_images(runs).items()]
+        scores = store.read_summaries(folder)
+        runs[name] = [store.RunSummary(folder, name, {"network": name}, scores, None)]
+    return [scores_section(title, group) for title, group in store.group_by_images(runs).items()]
 
 
 def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:

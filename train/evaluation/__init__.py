@@ -1,1 +1,0 @@
-"""Evaluation of networks: scores on photographs, and a laboratory that renders test images."""

@@ -1,0 +1,1 @@
+"""Results of networks: predictions, metrics, comparisons, tables and report pages."""
