@@ -15,6 +15,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -43,6 +44,13 @@ TORCHSCRIPT = (".pt", ".pth", ".ts", ".jit", ".torchscript")
 SUFFIXES = (EXPORTED, ONNX, *TORCHSCRIPT)
 # Beginnings of the names of members of a file of `torch.export` that run code when they are read.
 CODE_MEMBERS = ("custom_obj_", "opaque_obj_")
+# Largest relative change of the logits of an image with the other images of its batch.
+MAX_CHANGE = 0.01
+# End of the error about a network that has dropout or the statistics of each batch.
+IN_TRAINING_MODE = (
+    "was exported in training mode, in which the logits of an image are random or depend on other "
+    "images: call eval() before you export it"
+)
 # Part of the names of their compiled members.
 COMPILED = "/aotinductor/"
 # Keys under which training scripts store the weights of a network in a checkpoint.
@@ -101,7 +109,22 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = Fals
         network, size or USUAL_SIZE, facts.classes, facts.normalization, name=name
     )
     classifier.assumed = assumed_facts(size, normalization_of(classifier.function) or None)
+    _require_evaluation_outputs(classifier, name)
     return classifier
+
+
+def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
+    """Raise InputError if the logits of an image are random or change with the other images.
+
+    They do in a network that was exported in training mode, on which `eval()` has no effect.
+    """
+    levels = torch.linspace(0, 1, 3 * 3 * classifier.size**2)
+    images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
+    images = images.view(3, 3, classifier.size, classifier.size)
+    with torch.no_grad():
+        first, second = (classifier.function(images[[0, other]]).float() for other in (1, 2))
+    if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
+        raise InputError(f"name={name} {IN_TRAINING_MODE}", "name")
 
 
 def build_file(
@@ -182,6 +205,12 @@ def _read_exported(path: Path) -> Content:
     """Read a network that `torch.export.save` wrote to a file."""
     _require_plain_members(path)
     program = torch.export.load(path)
+    for node in program.graph.nodes:
+        schema = getattr(node.target, "_schema", None)
+        # `train` is an argument of dropout, and `training` one of batch normalization.
+        modes = [place.name.startswith("train") for place in schema.arguments] if schema else []
+        if any(value is True for value in compress(node.args, modes)):
+            raise InputError(f"name={path} {IN_TRAINING_MODE}", "name")
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are

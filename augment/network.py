@@ -503,9 +503,10 @@ class AnyFunction(Wrapper):
         def note(module: nn.Module, _: object) -> None:
             # Transformations of images are modules in training mode, too, but have no weights.
             has_weights = any(True for _ in module.parameters(recurse=False))
-            if module.training and (
-                has_weights or isinstance(module, nn.modules.dropout._DropoutNd)
-            ):
+            has_mode = isinstance(
+                module, nn.modules.dropout._DropoutNd | nn.modules.batchnorm._NormBase
+            )
+            if module.training and (has_weights or has_mode):
                 in_training.append(type(module).__name__)
 
         hook = register_module_forward_pre_hook(note)

@@ -26,7 +26,7 @@ def small_network() -> nn.Module:
 
 def save_torchscript(network: nn.Module, folder: Path) -> Path:
     path = folder / "network.pt"
-    torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)).save(path)
+    torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE), check_trace=False).save(path)
     return path
 
 
@@ -51,6 +51,19 @@ def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save)
     (gradient,) = torch.autograd.grad(found.sum(), images)
     (expected_gradient,) = torch.autograd.grad(expected.sum(), images)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("save", [save_torchscript, save_exported])
+@pytest.mark.parametrize("layer", [nn.Dropout(0.5), nn.BatchNorm2d(4)])
+def test_a_file_of_a_network_in_training_mode_is_refused(tmp_path, save, layer):
+    """The mode is part of such a file, so `eval()` could not change it."""
+    convolution, *rest = small_network()
+    network = nn.Sequential(convolution, layer, *rest)
+    load_classifier(str(save(network.eval(), tmp_path)), size=SIZE, trust_code=True)
+    path = save(network.train(), tmp_path)
+    with pytest.raises(InputError, match=r"training mode.*eval"):
+        load_classifier(str(path), size=SIZE, trust_code=True)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
