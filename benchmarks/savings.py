@@ -135,8 +135,8 @@ def light_step_savings(view: View) -> Iterator[Saving]:
         needed=step,
     )
     # A transfer matrix of random numbers has no zeros to skip.
-    dense_transfer = torch.rand_like(glossy_operator.distinct_transfer)
-    dense_operator = replace(glossy_operator, distinct_transfer=dense_transfer)
+    dense_transfer = torch.rand_like(glossy_operator.transfer)
+    dense_operator = replace(glossy_operator, transfer=dense_transfer)
     yield Saving(
         name="as many coefficients and channels without gloss",
         complete=glossy_step,

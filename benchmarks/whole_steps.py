@@ -95,12 +95,10 @@ class ByHand:
 
     The products with the operator, the background, the mask of clamped values
     and the gradient are written out for one light of the operator's type, a
-    gray background and linear values. There are no checks and no autograd. As in
-    the library, equal pixels are multiplied once if most pixels are equal.
+    gray background and linear values. There are no checks and no autograd.
 
     Args:
-        operator: Operator of P covered pixels from the light to the image. D of
-            them are multiplied.
+        operator: Operator of P covered pixels from the light to the image.
         background: Gray value in [0, 1].
 
     Attributes:
@@ -109,12 +107,9 @@ class ByHand:
             (3, P).
         coefficients: Indices of the K coefficients that reach the surface,
             shape (K,).
-        distinct: Distinct pixels and their copies, as indices in the image.
-            None if all pixels are multiplied.
-        transfer: Transfer matrix of the multiplied pixels, shape (K, D).
-        albedo: Albedo of the multiplied pixels, shape (3, D).
-        background_part: What the background contributes to the multiplied
-            pixels, shape (D,).
+        transfer: Transfer matrix, shape (K, P).
+        albedo: Albedo of the pixels, shape (3, P).
+        background_part: What the background contributes to the pixels, shape (P,).
         empty_image: Image of the background alone, shape (3, size²).
     """
 
@@ -123,15 +118,10 @@ class ByHand:
         self.shape = (3, size, size)
         self.pixels = operator.pixels.expand(3, -1)
         self.coefficients = operator.nonzero
-        self.distinct = None
-        self.transfer = operator.distinct_transfer[0]
+        self.transfer = operator.transfer[0]
         self.albedo = operator.albedo
         self.background_part = (1 - operator.coverage) * background
         self.empty_image = operator.coverage.new_full((3, size**2), background)
-        if operator.distinct is not None:
-            self.distinct = operator.distinct.at(operator.pixels)
-            self.albedo = self.albedo[:, operator.distinct.distinct]
-            self.background_part = self.background_part[operator.distinct.distinct]
 
     def step(self, light: Tensor, loss: Loss) -> tuple[Tensor, Tensor]:
         """Render a light, and compute the gradient of the loss by the light.
@@ -150,16 +140,8 @@ class ByHand:
         # Operations in place reuse the memory of the values.
         is_unclamped = values.eq_(clamped)
         image = self.empty_image.clone()
-        if self.distinct is None:
-            image.scatter_(1, self.pixels, clamped)
-        else:
-            self.distinct.write(clamped, image)
-        image = image.view(self.shape)
-        image_gradient = loss.gradient(image).reshape(3, -1)
-        if self.distinct is None:
-            image_gradient = image_gradient.gather(1, self.pixels)
-        else:
-            image_gradient = self.distinct.add_up(image_gradient)
+        image = image.scatter_(1, self.pixels, clamped).view(self.shape)
+        image_gradient = loss.gradient(image).reshape(3, -1).gather(1, self.pixels)
         irradiance_gradient = image_gradient.mul_(is_unclamped).mul_(self.albedo)
         reaching_gradient = torch.nn.functional.linear(irradiance_gradient, self.transfer)
         gradient = torch.zeros_like(light)

@@ -16,7 +16,6 @@ from torch import Tensor
 from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
-from renderer.angles import ANGLE_UNIT, DEGREES, angles_in_degrees
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
 from renderer.errors import (
     MAX_SCALE,
@@ -272,7 +271,6 @@ def _describe(
         "local_lights": local_light_names,
         "background": background,
         "cameras": [asdict(camera) for camera in adversary.cameras],
-        ANGLE_UNIT: DEGREES,
         "image": asdict(adversary.settings),
         "pixels": adversary.pixels is not None,
     }
@@ -362,8 +360,7 @@ def reload(folder: str | Path) -> Adversary:
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     """Read the files of an adversary."""
     settings = ImageSettings(**description["image"])
-    angle_unit = description.get(ANGLE_UNIT)
-    cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
+    cameras = tuple(_camera(camera) for camera in description["cameras"])
     attacked_object = _read_object(folder, description)
     for camera in cameras:
         # This raises InputError if the camera is inside of the mesh.
@@ -395,19 +392,12 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     )
 
 
-def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Create a camera from its fields in adversary.json.
-
-    `angle_unit` is None in files of earlier versions.
-    """
-    described = angles_in_degrees(description, angle_unit)
-    # Earlier versions of the library wrote `clip_range` under the name "reach".
-    if "reach" in described:
-        described["clip_range"] = described.pop("reach")
-    if "roll" in described:
-        return PinholeCamera(**described)
-    kind = PerspectiveCamera if "distance" in described else OrthographicCamera
-    return kind(**described)
+def _camera(fields: dict[str, Any]) -> Camera:
+    """Create a camera from its fields in adversary.json."""
+    if "roll" in fields:
+        return PinholeCamera(**fields)
+    kind = PerspectiveCamera if "distance" in fields else OrthographicCamera
+    return kind(**fields)
 
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:

@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from renderer.angles import ANGLE_UNIT, ANGLES, DEGREES, angles_in_degrees
 from renderer.errors import MAX_SCALE, InputError, require_bounded, require_file
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
@@ -76,8 +75,6 @@ def save_light(
             "give coefficients of this shape"
         )
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
-    if any(name in description for name in ANGLES):
-        description[ANGLE_UNIT] = DEGREES
     picture = basis.picture(coefficients)
     try:
         atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
@@ -106,7 +103,6 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         if name not in kind_of_name:
             known = " or ".join(kind_of_name)
             raise InputError(f"basis is {name!r}: give a light with the basis {known}")
-        description = angles_in_degrees(description, description.pop(ANGLE_UNIT, None))
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -8,9 +8,8 @@ gloss (`renderer.surface.gloss`), and shadows and bounces (the package
 `renderer.operators`).
 
 Shapes use these letters: a view has S covered samples in P pixels, which show G
-faces of the mesh. D of the pixels are distinct, and the others are copies of
-them (`renderer.operators.distinct_pixels`). K coefficients of the light reach a
-pixel. The dots (...) are any axes of a batch of lights.
+faces of the mesh. K coefficients of the light reach a pixel. The dots (...) are any
+axes of a batch of lights.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
@@ -30,15 +29,12 @@ from torch.nn.functional import linear
 from renderer.errors import MAX_MAGNITUDE, InputError, as_device, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
-from renderer.operators.distinct_pixels import (
-    DistinctPixels,
-)
 from renderer.operators.lamp_paths import SparseTransfer
 from renderer.settings import ImageSettings
 from renderer.validation import as_tensor
 
 # Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.
-TENSORS = ("albedo", "coverage", "pixels", "nonzero")
+TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")
 # Number of color channels.
 COLORS = 3
 
@@ -52,8 +48,8 @@ class TransferOperator:
     All floating-point tensors have the same dtype.
 
     Attributes:
-        distinct_transfer: Radiance of the D distinct pixels per unit of each of K
-            coefficients, in C channels, shape (C, K, D). C = 3 is one channel for
+        transfer: Radiance of the P covered pixels per unit of each of K
+            coefficients, in C channels, shape (C, K, P). C = 3 is one channel for
             each color. C = 1 is one channel that all colors share. It takes a
             third of the memory and the time, but is only possible if no pixel
             mixes albedos (one sample per pixel, or a mesh of one color). C = 2
@@ -73,10 +69,6 @@ class TransferOperator:
         sparse: Nonzero entries of further rows of the matrix, in three channels.
             These are rows of projected patterns, which are mostly zero. None
             without such rows.
-        distinct: D groups of covered pixels that are equal in every light.
-            Products are only computed for one pixel of each group, its distinct
-            pixel. None if most pixels differ. Each pixel is then a group, and
-            D = P.
 
     Example:
         >>> import torch
@@ -89,7 +81,7 @@ class TransferOperator:
         True
     """
 
-    distinct_transfer: Float[Tensor, "channels K D"]
+    transfer: Float[Tensor, "channels K P"]
     albedo: Float[Tensor, "3 P"]
     coverage: Float[Tensor, " P"]
     pixels: Int[Tensor, " P"]
@@ -97,7 +89,6 @@ class TransferOperator:
     settings: ImageSettings
     basis: Basis = HARMONICS
     sparse: SparseTransfer | None = None
-    distinct: DistinctPixels | None = None
 
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
@@ -241,8 +232,6 @@ class TransferOperator:
                 f"radiance_gradient has shape {given}, but the operator needs (..., 3, P) for its "
                 f"P = {expected[1]} covered pixels: give a gradient of this shape"
             )
-        if self.distinct is not None:
-            radiance_gradient = self.distinct.add_up(radiance_gradient)
         return self._light_gradient(radiance_gradient)
 
     def _images(
@@ -250,8 +239,8 @@ class TransferOperator:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render images without autograd, and return what the gradient needs.
 
-        It returns the images, 1 for values of the distinct pixels that clamping left alone
-        and 0 for others, and the clamped linear values of the distinct pixels.
+        It returns the images, 1 for values of the covered pixels that clamping left alone
+        and 0 for others, and the clamped linear values of the covered pixels.
         """
         unclamped = self._radiance(lights).add_(background.term)
         clamped_values = unclamped.clamp(0, 1)
@@ -269,32 +258,26 @@ class TransferOperator:
             pixel_index = pixel_index.expand(*batch_shape, -1, -1)
             image_shape = (*batch_shape, *image_shape)
         images = canvas.clone(memory_format=torch.contiguous_format)
-        if self._distinct_in_image is not None:
-            self._distinct_in_image.write(encoded, images)
-        else:
-            # `scatter_` takes half the time of `index_copy_` on a CPU.
-            images.scatter_(-1, pixel_index, encoded)
+        # `scatter_` takes half the time of `index_copy_` on a CPU.
+        images.scatter_(-1, pixel_index, encoded)
         return images.view(image_shape), is_unclamped, clamped_values
 
     def _gradient_of_images(
         self,
         image_gradient: Float[Tensor, "... 3 size size"],
-        is_unclamped: Float[Tensor, "... 3 D"],
-        clamped_values: Float[Tensor, "... 3 D"],
+        is_unclamped: Float[Tensor, "... 3 P"],
+        clamped_values: Float[Tensor, "... 3 P"],
     ) -> Float[Tensor, "... coefficients 3"]:
         """Convert the gradient of a loss from the images of `_images` to the lights.
 
         The last two arguments are the last two results of `_images`.
         """
         flat_gradient = image_gradient.flatten(-2)
-        if self._distinct_in_image is not None:
-            pixel_gradient = self._distinct_in_image.add_up(flat_gradient)
-        else:
-            pixel_index = self._pixels_by_color
-            if is_unclamped.ndim > 2:
-                pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
-            # `gather` is faster than `index_select`, most of all for three axes.
-            pixel_gradient = flat_gradient.gather(-1, pixel_index)
+        pixel_index = self._pixels_by_color
+        if is_unclamped.ndim > 2:
+            pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
+        # `gather` is faster than `index_select`, most of all for three axes.
+        pixel_gradient = flat_gradient.gather(-1, pixel_index)
         if not self._is_linear:
             pixel_gradient = encode_gradient(clamped_values, pixel_gradient, self.settings.encoding)
         gradient = self._light_gradient(pixel_gradient.mul_(is_unclamped))
@@ -327,25 +310,20 @@ class TransferOperator:
         if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
-    def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 D"]:
-        """Compute the light that D pixels send to the camera, without autograd or checks.
-
-        Pixels that are equal in every light are computed once, which leaves the D
-        distinct pixels. The radiance is multiplied by the fraction of the pixel that the
-        mesh covers.
-        """
-        dtype = self.distinct_transfer.dtype
+    def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 P"]:
+        """Compute `radiance` without autograd or checks."""
+        dtype = self.transfer.dtype
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero)
         # A call of `to` that converts nothing takes notable time for small images.
         if lights.dtype != dtype:
             used_lights = used_lights.to(dtype)
         if self._shared is not None:
-            radiance = (used_lights.mT @ self._shared).mul_(self._distinct_albedo)
+            radiance = (used_lights.mT @ self._shared).mul_(self.albedo)
             if self._white is not None:
                 radiance.add_(used_lights.mT @ self._white)
         else:
-            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.distinct_transfer)
+            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
         if self.sparse is not None:
             light_of_entry = lights.to(radiance.dtype).index_select(-2, self.sparse.function)
             # Radiance that each nonzero entry of the matrix adds to its pixel: one row for
@@ -355,24 +333,21 @@ class TransferOperator:
         return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
     def _light_gradient(
-        self, radiance_gradient: Float[Tensor, "... 3 D"]
+        self, radiance_gradient: Float[Tensor, "... 3 P"]
     ) -> Float[Tensor, "... coefficients 3"]:
-        """Convert a gradient from the radiance of D pixels to the lights.
-
-        The D pixels are the distinct pixels: one of each group of equal pixels.
-        """
+        """Compute `light_gradient` without checks."""
         upstream = radiance_gradient
-        dtype = self.distinct_transfer.dtype
+        dtype = self.transfer.dtype
         if upstream.dtype != dtype:
             upstream = upstream.to(dtype)
         # Compute the gradient with respect to the K used coefficients, shape (..., 3, K). The
         # function `linear(a, b)` of torch is a bᵀ.
         if self._shared is not None:
-            used_gradient = linear(upstream * self._distinct_albedo, self._shared)
+            used_gradient = linear(upstream * self.albedo, self._shared)
             if self._white is not None:
                 used_gradient = used_gradient + linear(upstream, self._white)
         else:
-            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.distinct_transfer)
+            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
             gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
@@ -412,13 +387,13 @@ class TransferOperator:
     ) -> _PreparedBackground:
         """Flatten background images, and compute what they add to the covered pixels."""
         flat_images = images.flatten(-2)
-        at_pixels = flat_images.index_select(-1, self._select_distinct(self.pixels))
+        at_pixels = flat_images.index_select(-1, self.pixels)
         if self.settings.encoding != "linear":
             # Repeat the background for each light before it is decoded, as `composite` does.
             # The decoding computes powers, whose last bit depends on the position of a
             # number in memory.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
-        coverage = self._select_distinct(self.coverage).to(images)[None]
+        coverage = self.coverage.to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
         return _PreparedBackground(images=flat_images, term=term)
 
@@ -432,27 +407,11 @@ class TransferOperator:
             InputError: If there is no such device.
         """
         device = as_device(device)
-        if device == self.distinct_transfer.device:
+        if device == self.transfer.device:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        # The copy does not group equal pixels. On a GPU, the gradients of the pixels of a group
-        # would be added up in a random order, so that results would differ between runs.
-        transfer = self.transfer.to(device)
-        return replace(self, distinct_transfer=transfer, **tensors, sparse=sparse, distinct=None)
-
-    @cached_property
-    def transfer(self) -> Tensor:
-        """Transfer matrix of all P covered pixels, in C channels, shape (C, K, P).
-
-        If some pixels are equal, this property copies `distinct_transfer` to all
-        pixels when it is first read.
-        """
-        if self.distinct is None:
-            return self.distinct_transfer
-        shape = (*self.distinct_transfer.shape[:-1], len(self.pixels))
-        empty = self.distinct_transfer.new_empty(shape)
-        return self.distinct.write(self.distinct_transfer, empty)
+        return replace(self, **tensors, sparse=sparse)
 
     @property
     def by_channel(self) -> Tensor:
@@ -468,29 +427,13 @@ class TransferOperator:
 
     @cached_property
     def _shared(self) -> Tensor | None:
-        """Channel of `distinct_transfer` that all colors share, shape (K, D), or None."""
-        return self.distinct_transfer[0] if len(self.distinct_transfer) < COLORS else None
+        """Channel of `transfer` that all colors share, shape (K, P), or None."""
+        return self.transfer[0] if len(self.transfer) < COLORS else None
 
     @cached_property
     def _white(self) -> Tensor | None:
-        """Channel of specular reflection that is added to all colors, shape (K, D), or None."""
-        return self.distinct_transfer[1] if len(self.distinct_transfer) == 2 else None
-
-    @cached_property
-    def _distinct_albedo(self) -> Tensor:
-        """Albedo of the distinct pixels, shape (3, D)."""
-        return self._select_distinct(self.albedo)
-
-    @cached_property
-    def _distinct_in_image(self) -> DistinctPixels | None:
-        """Groups of equal pixels as in `distinct`, with row-major indices of image pixels."""
-        return None if self.distinct is None else self.distinct.at(self.pixels)
-
-    def _select_distinct(self, values: Num[Tensor, "... P"]) -> Num[Tensor, "... D"]:
-        """Select the values of the D distinct pixels from those of the P covered pixels."""
-        if self.distinct is None:
-            return values
-        return values.index_select(-1, self.distinct.distinct)
+        """Channel of specular reflection that is added to all colors, shape (K, P), or None."""
+        return self.transfer[1] if len(self.transfer) == 2 else None
 
     @cached_property
     def _background_cache(self) -> dict[str, tuple[Any, _PreparedBackground]]:
@@ -524,7 +467,7 @@ class TransferOperator:
         All other places become exactly 0. The matrix has one row for each
         coefficient, and one column for each used coefficient.
         """
-        return torch.eye(self.basis.size).to(self.distinct_transfer)[:, self.nonzero]
+        return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
 class _PreparedBackground(NamedTuple):
@@ -533,12 +476,11 @@ class _PreparedBackground(NamedTuple):
     Attributes:
         images: Background images, shape (..., 3, size²).
         term: Linear values of the background that are added to the radiance of
-            the D distinct pixels (one of each group of equal covered pixels),
-            shape (..., 3, D).
+            the P covered pixels, shape (..., 3, P).
     """
 
     images: Float[Tensor, "... 3 size²"]
-    term: Float[Tensor, "... 3 D"]
+    term: Float[Tensor, "... 3 P"]
 
 
 class _Radiance(torch.autograd.Function):
@@ -550,11 +492,7 @@ class _Radiance(torch.autograd.Function):
     ) -> Float[Tensor, "... 3 P"]:
         """Compute the radiance of the P covered pixels, times the fraction that the mesh covers."""
         ctx.operator = operator
-        radiance = operator._radiance(lights)
-        if operator.distinct is None:
-            return radiance
-        all_radiance = radiance.new_empty(*radiance.shape[:-1], len(operator.pixels))
-        return operator.distinct.write(radiance, all_radiance)
+        return operator._radiance(lights)
 
     @staticmethod
     @once_differentiable

@@ -22,11 +22,6 @@ from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
 from renderer.mesh import Mesh
 from renderer.operators.apply import COLORS, TransferOperator
-from renderer.operators.distinct_pixels import (
-    DistinctPixels,
-    find_distinct_pixels,
-    indices_of_true,
-)
 from renderer.operators.lamp_paths import SparseTransfer, concatenate_entries, local_transfer
 from renderer.operators.rays import Rays, Surface
 from renderer.operators.shadows import Transport, build_transport
@@ -145,9 +140,6 @@ class _OperatorBuilder:
         surface = Surface(self.mesh, fragments, self.settings, given_gloss=self.gloss)
         channels = self._channels(surface)
         albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
-        distinct = None
-        if self._is_uniform_on_faces(surface, channels):
-            distinct = find_distinct_pixels(fragments, albedo)
         # Rows of the matrix as dense tensors.
         dense = []
         # Rows of the matrix as lists of their nonzero entries.
@@ -159,12 +151,10 @@ class _OperatorBuilder:
             else:
                 dense.append(self._local_rows(local_light, entries, surface))
         if self.basis.environment is not None:
-            dense.append(
-                self._environment_rows(self.basis.environment, surface, channels, distinct)
-            )
+            dense.append(self._environment_rows(self.basis.environment, surface, channels))
         all_rows = self._concatenate(dense, channels.number, len(fragments.pixels))
         return TransferOperator(
-            distinct_transfer=all_rows.transfer,
+            transfer=all_rows.transfer,
             albedo=albedo,
             coverage=fragments.coverage.to(self.dtype),
             pixels=fragments.pixels,
@@ -172,18 +162,7 @@ class _OperatorBuilder:
             settings=self.settings,
             basis=self.basis,
             sparse=concatenate_entries(sparse),
-            distinct=distinct,
         )
-
-    def _is_uniform_on_faces(self, surface: Surface, channels: _Channels) -> bool:
-        """Tell whether two pixels that the same face fills have the same values in the matrix.
-
-        This needs flat normals, a matte surface in which all colors share a
-        channel, no shadows, no lamps and no projectors.
-        """
-        is_matte = surface.gloss is None and channels.is_shared
-        has_open_sky = self.transport is None and not self.basis.local_lights
-        return is_matte and has_open_sky and self.settings.normals == "flat"
 
     def _channels(self, surface: Surface) -> _Channels:
         """Choose how many channels the transfer matrix of a view needs.
@@ -245,18 +224,13 @@ class _OperatorBuilder:
         environment: EnvironmentPart,
         surface: Surface,
         channels: _Channels,
-        distinct: DistinctPixels | None,
     ) -> _DenseRows:
-        """Compute the rows of the transfer matrix for environment light.
-
-        The rows contain shadows and bounces. With `distinct`, they are rows for the
-        distinct pixels only.
-        """
+        """Compute the rows of the transfer matrix for environment light, shadows and bounces."""
         harmonics_basis = environment.basis
         all_coefficients = torch.arange(harmonics_basis.size)
         if surface.gloss is None:
             weights = None if channels.is_shared else channels.sample_albedo
-            transfer = _box_filter(surface, weights, harmonics_basis, self.dtype, distinct)
+            transfer = _box_filter(surface, weights, harmonics_basis, self.dtype)
             coefficients = harmonics_basis.nonzero
         else:
             albedo = channels.sample_albedo
@@ -352,7 +326,6 @@ def _box_filter(
     albedo: Float[Tensor, "S C"] | None,
     basis: Harmonics,
     dtype: torch.dtype,
-    distinct: DistinctPixels | None = None,
 ) -> Float[Tensor, "C K P"]:
     """Compute the transfer matrix of a matte surface under an open sky, without shadows.
 
@@ -360,8 +333,7 @@ def _box_filter(
     over the samples of the pixel (box filter). A_l is the factor of the coefficient
     in the irradiance (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the
     normal of a sample. Sums are computed in float64. An `albedo` of None is 1 in a single
-    channel. With `distinct`, only one pixel of each group is computed, which needs flat
-    normals and an albedo of 1.
+    channel.
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
@@ -370,8 +342,6 @@ def _box_filter(
         # Irradiance of each seen face from a light with a single coefficient of 1: one row for
         # each face, one column for each coefficient.
         face_values = basis.irradiance(surface.face_planes)
-        if albedo is None and _are_pixels_mostly_filled(fragments):
-            return _copy_from_faces(fragments, face_values, dtype, distinct)
         # The value of a pixel is a weighted sum of entries. With flat normals, all samples of
         # the same face in the pixel are one entry.
         entry_to_pixel, entry_to_face, weights = _group_weights(fragments, albedo)
@@ -396,56 +366,6 @@ def _box_filter(
             sums = _weighted_row_sums(channel_weights, entry_to_value, block_starts, values)
             channel[:, pixels] = sums.to(dtype).T
     return transfer
-
-
-def _are_pixels_mostly_filled(fragments: Fragments) -> bool:
-    """Tell whether more than half of the covered pixels show a single face in all samples."""
-    is_filled = fragments.groups.sample_count == fragments.samples**2
-    return 2 * int(is_filled.sum()) > len(fragments.pixels)
-
-
-def _copy_from_faces(
-    fragments: Fragments,
-    face_values: Float[Tensor, "G K"],
-    dtype: torch.dtype,
-    distinct: DistinctPixels | None,
-) -> Tensor:
-    """Compute `_box_filter` for flat normals and an albedo of 1, by copying values of faces.
-
-    A pixel that a single face fills has the values of this face. Only the other
-    pixels need sums over several faces. The face values are the irradiance A_l Y_lm(n) from
-    each harmonic.
-    """
-    # A group is all samples of one face in a pixel.
-    group_to_pixel, group_to_face, sample_count = fragments.groups
-    groups_per_pixel = torch.bincount(group_to_pixel, minlength=len(fragments.pixels))
-    first_group = _row_starts(groups_per_pixel)[:-1]
-    if distinct is not None:
-        groups_per_pixel = groups_per_pixel.index_select(0, distinct.distinct)
-        first_group = first_group.index_select(0, distinct.distinct)
-    # Adding 0.0 turns -0.0 into 0.0. The copied values then have the same bits as sums, which
-    # start at 0.0 and are never -0.0.
-    values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
-    # First give each pixel (column) the values of the face of its first group.
-    transfer = values_by_function.index_select(1, group_to_face.index_select(0, first_group))
-    # Then replace the pixels that no single face fills. A group of samples is partial if it
-    # has fewer samples than a pixel.
-    is_partial_group = sample_count < fragments.samples**2
-    partial_groups = indices_of_true(is_partial_group)
-    partial_to_face = group_to_face.index_select(0, partial_groups)
-    partial_sample_count = sample_count.index_select(0, partial_groups)
-    partial_weights = partial_sample_count.double() / fragments.samples**2
-    partial_pixels = indices_of_true(is_partial_group.index_select(0, first_group))
-    entry_starts = _row_starts(groups_per_pixel.index_select(0, partial_pixels))
-    for first in range(0, len(partial_pixels), BLOCK):
-        block_starts = entry_starts[first : first + BLOCK + 1]
-        entries = slice(int(block_starts[0]), int(block_starts[-1]))
-        sums = _weighted_row_sums(
-            partial_weights[entries], partial_to_face[entries], block_starts, face_values
-        )
-        block_pixels = partial_pixels[first : first + BLOCK].expand(len(transfer), -1)
-        transfer.scatter_(1, block_pixels, sums.to(dtype).T.contiguous())
-    return transfer[None]
 
 
 def _row_starts(counts: Int[Tensor, " N"]) -> Int[Tensor, " starts"]:

@@ -69,7 +69,7 @@ class TransferOperators(Sequence[TransferOperator]):
         first = self._operators[0]
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
-            if not is_same or operator.distinct_transfer.dtype != first.distinct_transfer.dtype:
+            if not is_same or operator.transfer.dtype != first.transfer.dtype:
                 raise InputError(
                     "operators differ in image settings, basis of light or dtype: compute all "
                     "operators with the same settings, basis and dtype"
@@ -210,7 +210,7 @@ class TransferOperators(Sequence[TransferOperator]):
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
         """Stacks of at most `_operators_per_stack` operators, which hold all operators."""
-        device = self._operators[0].distinct_transfer.device
+        device = self._operators[0].transfer.device
         stacks = []
         # The stacks are kept, and later calls may need gradients.
         with torch.inference_mode(False):
@@ -245,7 +245,7 @@ class TransferOperators(Sequence[TransferOperator]):
         """Render all V views, with one batched matrix product for each stack of operators."""
         encoding = self._operators[0].settings.encoding
         # One light for each image. All images of the first view come first.
-        lights = view_lights.flatten(0, -3).to(self._operators[0].distinct_transfer.dtype)
+        lights = view_lights.flatten(0, -3).to(self._operators[0].transfer.dtype)
         lights_per_view = len(lights) // len(self)
         # One background for each image, or a single one. The last axis has all pixels.
         backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
@@ -364,8 +364,8 @@ class OperatorStack:
         # If the number of coefficients is odd, append coefficient 0 once more. Its additional
         # row in `transfer` stays zero.
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
-        channel_count = max(len(operator.distinct_transfer) for operator in operators)
-        like = operators[0].distinct_transfer
+        channel_count = max(len(operator.transfer) for operator in operators)
+        like = operators[0].transfer
         shape = (len(operators), channel_count, len(coefficients), len(pixels))
         transfer = like.new_zeros(shape)
         albedo = like.new_ones(len(operators), COLORS, len(pixels))
@@ -378,7 +378,7 @@ class OperatorStack:
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
             if channel_count < COLORS:
-                channels = transfer[index][: len(operator.distinct_transfer)]
+                channels = transfer[index][: len(operator.transfer)]
                 channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:

@@ -9,18 +9,14 @@ import trimesh
 from oracles import draw, mesh_of, patchwork
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode, encode
-from renderer.light.basis import HARMONICS, SumBasis
 from renderer.light.harmonics import nonzero_coefficients
-from renderer.light.projector import Projector
 from renderer.mesh import Mesh
-from renderer.operators import distinct_pixels, lamp_paths
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS, ImageSettings
-from renderer.surface.gloss import Gloss
 from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
@@ -71,23 +67,20 @@ class Layout:
     mesh: Mesh
     samples: int
     channels: int
-    size: int = SIZE
 
     def operator(self, encoding: str = "linear") -> TransferOperator:
-        settings = ImageSettings(self.size, self.samples, encoding)
+        settings = ImageSettings(SIZE, self.samples, encoding)
         return operator_of(self.mesh, IN_FRONT, settings, torch.float64)
 
 
 COARSE_BALL = trimesh.creation.icosphere(subdivisions=1)
 FINE_BALL = trimesh.creation.icosphere(subdivisions=2)
-ICOSAHEDRON = trimesh.creation.icosphere(subdivisions=0)
 DENTED = patchwork(FINE_BALL.vertices, FINE_BALL.faces)
 LAYOUTS = {
     "one color": Layout(mesh_of(COARSE_BALL, (0.8, 0.4, 0.1)), 3, 1),
     "one sample per pixel": Layout(DENTED, 1, 1),
     "mixed albedos": Layout(DENTED, 3, 3),
     "outside of the image": Layout(square(0.1, center=(20, 0, 0)), 2, 1),
-    "equal pixels": Layout(mesh_of(ICOSAHEDRON, (0.8, 0.4, 0.1)), 2, 1, size=96),
 }
 all_layouts = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
@@ -129,66 +122,6 @@ def test_the_radiance_is_the_product_of_light_and_transfer(layout):
     torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=64 * EPS)
 
 
-def test_most_pixels_of_large_faces_are_multiplied_once():
-    """A face that fills pixels has one of them. All other pixels show several faces or an edge."""
-    operator = LAYOUTS["equal pixels"].operator()
-    columns = operator.transfer[0].T
-    distinct_columns = len(columns.unique(dim=0))
-    mixed_count = int((operator.coverage < 1).sum())
-    multiplied_count = operator.distinct_transfer.shape[-1]
-    assert distinct_columns <= multiplied_count < len(operator.pixels) / 4
-    assert mixed_count < multiplied_count
-
-
-def test_an_operator_on_another_device_has_the_transfer_of_all_pixels():
-    operator = LAYOUTS["equal pixels"].operator()
-    moved = operator.to("meta")
-    assert moved.distinct is None
-    assert moved.distinct_transfer.shape == operator.transfer.shape
-
-
-def test_equal_pixels_change_no_transfer(monkeypatch):
-    operator = LAYOUTS["equal pixels"].operator()
-    monkeypatch.setattr(distinct_pixels, "FEWEST_COPIES", 10**9)
-    expected = LAYOUTS["equal pixels"].operator()
-    assert expected.distinct is None
-    assert torch.equal(operator.transfer, expected.transfer)
-    assert torch.equal(operator.by_channel, expected.by_channel)
-
-
-def test_pixels_of_one_face_with_several_colors_are_not_equal():
-    mesh = patchwork(ICOSAHEDRON.vertices, ICOSAHEDRON.faces)
-    operator = operator_of(mesh, IN_FRONT, ImageSettings(128, 1), torch.float64)
-    light = draw(49, 3)
-    expected = multiply(operator, light)
-    torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=64 * EPS)
-
-
-PINK = mesh_of(ICOSAHEDRON, (0.8, 0.4, 0.4))
-DENTED_PINK = Mesh.plain(DENTED.vertices, DENTED.faces, (0.8, 0.4, 0.4))
-CLOSE_UP = PerspectiveCamera(70.0, 0.0, 2.2, distance=3.0)
-
-
-@pytest.mark.parametrize(
-    ("mesh", "changed", "basis"),
-    [
-        (PINK, {"normals": "smooth"}, HARMONICS),
-        (DENTED_PINK, {"shadows": True}, HARMONICS),
-        (Gloss(roughness=0.5).on(PINK), {}, HARMONICS),
-        (PINK, {}, SumBasis((HARMONICS, Projector(4, 28.6, 91.7, 3.0, 45.8)))),
-    ],
-    ids=["smooth normals", "shadows", "gloss", "projector"],
-)
-def test_pixels_of_one_face_under_other_light_are_not_equal(monkeypatch, mesh, changed, basis):
-    # The rows of the projector are dense, and stand in the transfer.
-    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
-    settings = ImageSettings(96, 1, **changed)
-    [operator] = build_operators(mesh, [CLOSE_UP], settings, choose("numpy"), basis=basis)
-    light = draw(basis.size, 3).float()
-    expected = multiply(operator, light)
-    torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=1e-4)
-
-
 @all_layouts
 def test_the_gradient_by_the_light_is_a_central_difference(layout):
     """Radiance is linear, so a step of any length gives the derivative up to rounding."""
@@ -224,9 +157,9 @@ def test_lights_of_another_shape_are_refused(shape):
         operator.radiance(torch.zeros(shape))
 
 
-def background_of(kind: str, batch: tuple[int, ...], size: int = SIZE) -> float | Tensor:
+def background_of(kind: str, batch: tuple[int, ...]) -> float | Tensor:
     """Return a background for a batch of lights."""
-    images = draw(*batch, 3, size, size, seed=3).abs().clamp(max=1)
+    images = draw(*batch, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
     if kind == "gray":
         return 0.3
     if kind == "color":
@@ -260,8 +193,8 @@ def test_an_image_and_its_gradient_are_those_of_plain_operations(layout, batch, 
     """At least a tenth of the values of visible meshes is clamped."""
     operator = layout.operator(encoding)
     lights = draw(*batch, 49, 3).requires_grad_()
-    upstream = draw(*batch, 3, layout.size, layout.size, seed=1)
-    background = background_of(kind, batch, layout.size)
+    upstream = draw(*batch, 3, SIZE, SIZE, seed=1)
+    background = background_of(kind, batch)
     expected = compose(operator, lights, background)
     is_clamped = (expected == 0) | (expected == 1)
     assert is_clamped.float().mean() > 0.1 or not len(operator.pixels)
@@ -277,7 +210,7 @@ def test_an_image_and_its_gradient_are_those_of_plain_operations(layout, batch, 
 def test_the_gradient_without_autograd_is_that_of_autograd(layout, batch):
     operator = layout.operator("srgb")
     lights = draw(*batch, 49, 3).requires_grad_()
-    upstream = draw(*batch, 3, layout.size, layout.size, seed=1)
+    upstream = draw(*batch, 3, SIZE, SIZE, seed=1)
     expected = operator.image(lights, 0.3)
     [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
     image, gradient = operator.image_and_gradient(lights, lambda _: upstream, 0.3)
