@@ -7,8 +7,7 @@ checkpoints are also written in between.
 
 import math
 import time
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,34 +15,29 @@ from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.network import compute_outputs, eval_mode
-from augment.progress import progress, progress_message
+from augment.network import compute_outputs
+from augment.progress import progress
 from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
-from renderer.memory import require_memory
 from train import checkpoints, console, run_folder
 from train.checkpoints import random_state, restore_random_state
-from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
+from train.data.batches import Batch, Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
-from train.device import GraphedModel, MixedPrecision, compiles
-from train.processes import SignalHandler, all_reduce_sum, wrap_ddp
-from train.results.epoch_metrics import epoch_metrics, format_epoch
+from train.device import MixedPrecision
+from train.processes import SignalHandler, all_reduce_sum
 from train.run_folder import PHASES
-from train.settings import RELIGHT, TrainSettings
-from train.system.user_errors import keyed
+from train.results.epoch_metrics import epoch_metrics, format_epoch
+from train.settings import TrainSettings
 from train.training.averages import Averages
-from train.training.baselines import Baseline
-from train.training.loss import TrainingLoss
-from train.training.recipe import build_optimizer, learning_rate, set_training_mode
-from train.training.relit_batches import RelitBatches
+from train.training.recipe import set_training_mode
 from train.training.run_log import RunLog
-from train.training.shared_teacher import share_layers
+from train.training.step import TrainingStep, fitting_batch_size, require_equal_shares
 
 # Number of images in a pass of the validation.
 EVALUATION_BATCH = 512
@@ -51,10 +45,6 @@ EVALUATION_BATCH = 512
 SAVING_EVERY = 60.0
 # Largest fraction of the time of an epoch in which checkpoints are written.
 SAVING_SHARE = 0.02
-
-# Batch of training images: images, uint8, shape (B, 3, H, W), their labels, shape (B,), and
-# whether each image is a render, bool, shape (B,).
-Batch = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass
@@ -89,29 +79,6 @@ class EpochState:
         }
 
 
-@dataclass(frozen=True)
-class EpochPlan:
-    """Training images and rounds of an epoch.
-
-    Attributes:
-        split: Images and labels of the data.
-        rows: Indices in `split` of the training images, shape (N,). The other
-            images validate.
-        rounds: Rounds of the epoch. A round has its own order of images.
-        steps: Number of training steps in each round.
-    """
-
-    split: Split
-    rows: Int[Tensor, " N"]
-    rounds: list[Round]
-    steps: list[int]
-
-    @property
-    def total(self) -> int:
-        """Number of training steps in the whole epoch."""
-        return sum(self.steps)
-
-
 class Trainer:
     """Trainer of one network, which writes checkpoints to the folder of the run.
 
@@ -124,6 +91,8 @@ class Trainer:
         averages: Moving average and model soup of the network.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
+        best: Content of best.pt, the network that the training selected. It is empty before the
+            end of the first epoch.
     """
 
     def __init__(
@@ -136,7 +105,7 @@ class Trainer:
         labeled: bool = True,
     ):
         """Check the settings, and build the optimizer."""
-        _require_equal_shares(settings)
+        require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(
                 f"ranking_weight={settings.ranking_weight} requires hard negatives: "
@@ -151,13 +120,15 @@ class Trainer:
         self.seed = service.seed
         self.epoch = 0
         self.history: list[dict[str, float]] = []
+        self.best: dict[str, Any] = {}
 
+        self._log: RunLog | None = None
         # State of the epoch that has begun. None between two epochs.
         self._epoch_state: EpochState | None = None
         # States of the random generators at the checkpoint from which a run is resumed.
         self._random_state: dict[str, Any] = {}
-        # Content of best.pt, until it is written.
-        self._best: dict[str, Any] | None = None
+        # Whether best.pt has yet to be written.
+        self._best_is_new = False
         # Time at which the last checkpoint was written or, before that, of the start.
         self._saved_at = time.perf_counter()
         # Seconds that it took to write the last checkpoint.
@@ -176,53 +147,17 @@ class Trainer:
             # network. It is highest before any training, and cannot choose an epoch.
             keeps_latest=not labeled,
         )
-        self._build_step(labeled)
-
-    def _build_step(self, labeled: bool) -> None:
-        """Build the optimizer, the gradient scaler, the loss and the augmentation."""
-        settings = self.settings
-        positive_classes = self.service.positive_classes
-        # `wrap_ddp` may replace layers of the network. The optimizer is built
-        # afterwards, so that it has the parameters of the new layers.
-        replica = wrap_ddp(self.model)
-        # The first optimizer of a process imports the compiler of torch, which takes seconds.
-        with progress_message("loading the optimizer"):
-            self.optimizer = build_optimizer(self.model, settings)
-        is_scaled = self.model.precision == "float16"
-        self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
-        teacher = self.initial if has_teacher else None
-        with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, self.device)
-        # Module that computes the logits of the teacher. It may take the features from
-        # the network in training.
-        teacher_module: nn.Module | None = teacher
-        if teacher is not None and not is_compiled:
-            size = self.architecture["size"]
-            teacher_module = share_layers(settings, self.model, teacher, size)
-        loss = TrainingLoss(replica, settings, positive_classes, teacher_module, labeled)
-        self._loss = loss.compute
-        self._augmentation: Baseline | RelitBatches = Baseline(
-            settings.augmentation,
-            self.model,
-            self.seed,
-            positive_classes[1:],
+        self.step = TrainingStep(
+            settings,
+            model,
+            self.averages,
+            teacher=self.initial if has_teacher else None,
+            positive_classes=service.positive_classes,
+            seed=service.seed,
+            size=architecture["size"],
+            labeled=labeled,
         )
-        if settings.augmentation == RELIGHT:
-            self._augmentation = RelitBatches(settings, self.model, teacher, self.seed)
-        self._attacked: nn.Module = self.model
-        self._validated: nn.Module = self.averages.selected
-        if is_compiled:
-            self._compile()
-
-    def _compile(self) -> None:
-        """Record the loss, the attacked network and the validated network as CUDA graphs."""
-        # torch limits the number of compiled functions in a process. Those of an
-        # earlier run are removed.
-        torch.compiler.reset()
-        self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-        self._attacked = GraphedModel(self.model)
-        self._validated = GraphedModel(self.averages.selected)
 
     @property
     def selected(self) -> MixedPrecision:
@@ -237,13 +172,14 @@ class Trainer:
         contains the network after the last epoch. `held_out` marks the validation images, and `log`
         is None in all processes but the first one.
         """
+        self._log = log
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
         self._limit_batch_size(split, len(train))
         with SignalHandler() as signals:
             while self.epoch < self.settings.epochs:
-                if self._train_epoch(split, train, signals, log):
-                    self._end_epoch(split, validation, log)
+                if self._train_epoch(split, train, signals):
+                    self._end_epoch(split, validation)
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
@@ -253,61 +189,19 @@ class Trainer:
                     signals.stop()
 
     def _limit_batch_size(self, split: Split, image_count: int) -> None:
-        """Limit the batch size to the images of a round, and check that a batch fits in memory.
+        """Limit the batch size to the images of a round and to the memory."""
+        limits = (self.settings.images_per_epoch, self.service.settings.regenerate_every)
+        in_round = min([image_count, *filter(None, limits)]) + len(self.service)
+        size = split.images.shape[-1]
+        batch_size = fitting_batch_size(self.settings, self.model, in_round, size)
+        self.settings = replace(self.settings, batch_size=batch_size)
 
-        A larger batch would only hold copies of the images.
-        """
-        settings = self.settings
-        limits = (settings.images_per_epoch, self.service.settings.regenerate_every)
-        in_round = min([image_count, *(limit for limit in limits if limit)]) + len(self.service)
-        # Each process divides its part of a batch into equal parts.
-        shares = distributed.world_size() * settings.accumulation_steps
-        largest = math.ceil(in_round / shares) * shares
-        if settings.batch_size > largest:
-            console.warning(
-                "batch_size=%d is more than the %d images that a round shows: it is %d",
-                settings.batch_size,
-                in_round,
-                largest,
-            )
-            self.settings = replace(settings, batch_size=largest)
-        at_once = self.settings.batch_size // shares
-        (image,) = split.squares([torch.zeros(1, dtype=torch.int64)])
-        needed = at_once * activation_bytes(deepcopy(self.model), image.shape[-1])
-        require_memory(f"the activations of batch_size={at_once}", needed, self.device)
-
-    def _train_epoch(
-        self,
-        split: Split,
-        rows: Int[Tensor, " N"],
-        signals: SignalHandler,
-        log: RunLog | None,
-    ) -> bool:
+    def _train_epoch(self, split: Split, rows: Int[Tensor, " N"], signals: SignalHandler) -> bool:
         """Take the training steps of an epoch that remain.
 
         If the run was resumed within the epoch, some steps were taken before. Return False if a
         signal stopped the epoch before its last step.
         """
-        plan = self._plan(split, rows)
-        if self._epoch_state is None:
-            self._epoch_state = self._begin_epoch(plan, log)
-        else:
-            # The run continues within an epoch, with the random numbers of the first attempt.
-            restore_random_state(self._random_state)
-        state = self._epoch_state
-        with closing(self._remaining_batches(plan, state, log)) as batches:
-            for batch in batches:
-                step_in_run = self.epoch * plan.total + state.step
-                state.sums += self._step(*batch, state.step / plan.total, step_in_run)
-                state.step += 1
-                if signals.requested():
-                    return state.step == plan.total
-                if state.step < plan.total and self._saving_is_due():
-                    self._save()
-        return True
-
-    def _plan(self, split: Split, rows: Int[Tensor, " N"]) -> EpochPlan:
-        """Divide the current epoch into rounds, and count the training steps of each round."""
         settings = self.settings
         rounds = rounds_of_epoch(
             image_count=len(rows),
@@ -318,147 +212,117 @@ class Trainer:
             images_per_round=self.service.settings.regenerate_every,
         )
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
-        return EpochPlan(split, rows, rounds, steps)
-
-    def _begin_epoch(self, plan: EpochPlan, log: RunLog | None) -> EpochState:
-        """Begin an epoch: render the images of its first round."""
-        self.averages.begin_epoch(self.initial, self.optimizer)
-        renders = self._regenerate(plan.rounds[0], log)
-        return EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
-
-    def _remaining_batches(
-        self, plan: EpochPlan, state: EpochState, log: RunLog | None
-    ) -> Generator[Batch, None, None]:
-        """Yield the remaining batches of an epoch, and render new images before each new round.
-
-        `state` is updated when a round begins.
-        """
-        # `state.diagnostics` has an item for each round that has begun. The last of them
-        # is the current round.
-        current = len(state.diagnostics) - 1
-        for index in range(current, len(plan.rounds)):
-            is_new = index > current
-            if is_new:
-                state.renders = self._regenerate(plan.rounds[index], log)
+        state = self._begin_epoch(rounds[0])
+        # The state has the diagnostics of each round that has begun.
+        begun = len(state.diagnostics)
+        for index, now in enumerate(rounds):
+            if index < begun - 1:
+                continue
+            if index >= begun:
+                state.renders = self._regenerate(now)
                 state.diagnostics.append(state.renders.diagnostics)
+            title = f"epoch {self.epoch + 1}"
+            if len(rounds) > 1:
+                title += f", round {index + 1} of {len(rounds)}"
+            # Number of the steps of this round that were taken before.
+            first = state.step - sum(steps[:index])
             with self.phases("training"):
-                renders = Split(to_bytes(state.renders.images), state.renders.labels)
-                set_training_mode(self.model, self.settings)
-                # Number of the steps of this round that were taken before.
-                first = state.step - sum(plan.steps[:index])
-                batches = training_batches(
-                    TrainingImages(plan.split, plan.rows, renders),
-                    batch_size=self.settings.batch_size,
-                    seed=self.seed,
-                    this_round=plan.rounds[index],
-                    flips=self.settings.flips,
-                    first=first,
-                )
-                title = f"epoch {self.epoch + 1}"
-                if len(plan.rounds) > 1:
-                    title += f", round {index + 1} of {len(plan.rounds)}"
-                yield from progress(batches, title, plan.steps[index], first)
+                batches = self._batches(split, rows, now, first)
+                for batch in progress(batches, title, steps[index], first):
+                    state.sums += self._take_step(batch, state.step, sum(steps))
+                    state.step += 1
+                    if signals.requested():
+                        return state.step == sum(steps)
+                    if state.step < sum(steps) and self._saving_is_due():
+                        self._save()
+        return True
 
-    def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
+    def _begin_epoch(self, first_round: Round) -> EpochState:
+        """Begin an epoch by rendering the images of its first round, or continue it.
+
+        A resumed run continues within an epoch, with the random numbers of the first attempt.
+        """
+        if self._epoch_state:
+            restore_random_state(self._random_state)
+            return self._epoch_state
+        self.averages.begin_epoch(self.initial, self.step.optimizer)
+        renders = self._regenerate(first_round)
+        sums = torch.zeros(2, device=self.device)
+        self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
+        return self._epoch_state
+
+    def _batches(
+        self, split: Split, rows: Int[Tensor, " N"], now: Round, first: int
+    ) -> Iterator[Batch]:
+        """Put the network in training mode, and yield the batches of a round from `first` on."""
+        renders = cast(EpochState, self._epoch_state).renders
+        set_training_mode(self.model, self.settings)
+        return training_batches(
+            TrainingImages(split, rows, Split(to_bytes(renders.images), renders.labels)),
+            batch_size=self.settings.batch_size,
+            seed=self.seed,
+            this_round=now,
+            flips=self.settings.flips,
+            first=first,
+        )
+
+    def _take_step(self, batch: Batch, number: int, count: int) -> Float[Tensor, " 2"]:
+        """Take a step, which has a number of `count` steps in its epoch."""
+        done = number / count
+        # Each epoch of a model soup runs through the whole schedule of the learning rate.
+        if not self.settings.soup:
+            done = (self.epoch + done) / self.settings.epochs
+        return self.step.take(batch, done, self.epoch * count + number)
+
+    def _regenerate(self, now: Round) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self._attacked, now.number)
-        if log and renders.attack_examples:
+            renders = self.service.regenerate(self.step.attacked, now.number)
+        if self._log and renders.attack_examples:
             # The images are written now, because a run that is resumed within this round
             # does not attack the renders again.
             with self.phases("input_output"):
                 classes = self.architecture["classes"]
-                log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
+                self._log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
         return renders
 
-    def _step(
-        self,
-        images: UInt8[Tensor, "B 3 H W"],
-        labels: Int[Tensor, " B"],
-        rendered: Bool[Tensor, " B"],
-        epoch_fraction: float,
-        step_in_run: int,
-    ) -> Float[Tensor, " 2"]:
-        """Take a training step: change the weights by the gradient of the loss of a batch.
-
-        Return the sum of the losses of the images, and the number of correct predictions.
-        """
-        settings = self.settings
-        done = (self.epoch + epoch_fraction) / settings.epochs
-        if settings.soup:
-            # Each epoch of a model soup runs through the whole schedule of the
-            # learning rate.
-            done = epoch_fraction
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(settings, done)
-        augmented = self._augmentation.apply(images, labels, step_in_run)
-        tensors = [augmented, labels, rendered]
-        if settings.consistency_weight:
-            # The consistency term compares the images before and after the augmentation.
-            tensors = [images, labels, rendered, augmented]
-        self.optimizer.zero_grad(set_to_none=True)
-        sums = self._add_gradients(tensors)
-        if settings.clip_gradient:
-            self.scaler.unscale_(self.optimizer)
-            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
-        self.scaler.step(self.optimizer)
-        self.scaler.update()
-        self.averages.end_step()
-        return sums
-
-    def _add_gradients(self, tensors: Sequence[Tensor]) -> Float[Tensor, " 2"]:
-        """Compute the gradient of the loss of a batch.
-
-        The batch is divided into smaller batches to save memory. Their gradients
-        are added. Return the sum of the losses of the images, and the number of hits.
-        """
-        count = self.settings.accumulation_steps
-        sums = torch.zeros(2, device=self.device)
-        # A list of chunks for each tensor. A smaller batch has one chunk of each tensor.
-        chunks = [tensor.chunk(count) for tensor in tensors]
-        for small_batch in zip(*chunks, strict=True):
-            loss, hits = self._loss(*small_batch)
-            self.scaler.scale(loss / count).backward()
-            image_count = len(small_batch[0])
-            sums += torch.stack([loss.detach() * image_count, hits])
-        return sums
-
-    def _end_epoch(self, split: Split, rows: Int[Tensor, " N"], log: RunLog | None) -> None:
+    def _end_epoch(self, split: Split, rows: Int[Tensor, " N"]) -> None:
         """Finish an epoch: validate the network, keep it if it is the best, and log the metrics."""
         state = cast(EpochState, self._epoch_state)
         self._epoch_state = None
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
-            validated = evaluate(self._validated, split, rows)
+            validated = evaluate(self.step.validated, split, rows)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         # The network of this epoch replaces the selected network if it is better, or if the
         # settings select the last network.
         if self.averages.is_kept(validated["accuracy"]):
-            self._best = {
+            self._best_is_new = True
+            self.best = {
                 "model": self.averages.weights(),
                 **self._description(),
                 "validation_accuracy": validated["accuracy"],
             }
-        if log and len(state.renders.labels):
+        if self._log and len(state.renders.labels):
             with self.phases("input_output"):
-                log.renders(state.renders.images, self.epoch)
+                self._log.renders(state.renders.images, self.epoch)
 
         image_count = state.step * self.settings.batch_size
         trained = {
             "loss": loss_sum / image_count,
             "accuracy": hits / image_count,
-            "learning_rate": self.optimizer.param_groups[0]["lr"],
+            "learning_rate": self.step.optimizer.param_groups[0]["lr"],
         }
         # A phase that this process did not run counts as 0 seconds. The attack is such a
         # phase if the run was resumed after it.
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
         metrics = epoch_metrics(trained, validated, state.diagnostics, seconds)
         self.history.append({"epoch": self.epoch, **metrics})
-        if log:
-            log.scalars(metrics, self.epoch)
+        if self._log:
+            self._log.scalars(metrics, self.epoch)
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
@@ -483,13 +347,12 @@ class Trainer:
             self._require_finite(float(self._epoch_state.sums[0]), self.epoch + 1)
         with self.phases("input_output"):
             state = self.state_dict()
-            best = self._best
-            self._best = None
             if distributed.rank() > 0:
                 return
             start = time.perf_counter()
-            if best:
-                checkpoints.save(self.folder / run_folder.BEST, best)
+            if self._best_is_new:
+                checkpoints.save(self.folder / run_folder.BEST, self.best)
+                self._best_is_new = False
             previous = self.folder / run_folder.PREVIOUS
             checkpoints.save(self.folder / run_folder.LAST, state, previous)
             self._saved_at = time.perf_counter()
@@ -524,8 +387,7 @@ class Trainer:
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "scaler": self.scaler.state_dict(),
+            **self.step.state_dict(),
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
@@ -543,8 +405,7 @@ class Trainer:
         self.history = state["history"]
         accuracies = [line["validation/accuracy"] for line in self.history]
         self.model.network.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.scaler.load_state_dict(state["scaler"])
+        self.step.load_state_dict(state)
         self.averages.load_state_dict(state, accuracies)
         for network in (self.model, self.initial, self.selected):
             if network:
@@ -603,9 +464,7 @@ class Trainer:
             best = checkpoints.load(path)
             self._require_own_architecture(best)
             own = self._description()
-            # Earlier versions stored "mode" as "arm".
-            mode = best.get("mode", best.get("arm"))
-            if best["seed"] != own["seed"] or mode != own["mode"]:
+            if (best["seed"], best["mode"]) != (own["seed"], own["mode"]):
                 raise ValueError("it is of another run")
             # best.pt can be from an epoch after the checkpoint. This epoch is then trained
             # again, and its accuracy is not known yet.
@@ -613,6 +472,7 @@ class Trainer:
                 line = self.history[best["epoch"] - 1]
                 if line["validation/accuracy"] != best["validation_accuracy"]:
                     raise ValueError("its accuracy is not the one that this run had")
+            self.best = best
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(
                 f"{path} is not the best network of this run ({single_line(error)}): "
@@ -626,43 +486,6 @@ class Trainer:
         """
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
-
-
-def activation_bytes(model: nn.Module, size: int) -> int:
-    """Measure the memory that a training step keeps for each image until its backward pass."""
-    totals = []
-    device = next(model.parameters()).device
-    for count in (1, 2):
-        kept: dict[int, int] = {}
-
-        def keep(tensor: Tensor, kept: dict[int, int] = kept) -> Tensor:
-            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-            return tensor
-
-        hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
-        with eval_mode(model), torch.enable_grad(), hooks:
-            # The result holds the kept tensors, whose addresses would otherwise be used again.
-            result = model(torch.full((count, 3, size, size), 0.5, device=device))
-        totals.append(sum(kept.values()))
-        del result
-    # The difference leaves out the weights, which all images share.
-    return max(0, totals[1] - totals[0])
-
-
-def _require_equal_shares(settings: TrainSettings) -> None:
-    """Raise InputError if a batch cannot be divided equally.
-
-    Each process gets an equal part of the batch, and divides it into
-    `accumulation_steps` equal parts.
-    """
-    process_count = distributed.world_size()
-    steps = settings.accumulation_steps
-    if settings.batch_size % (process_count * steps):
-        raise InputError(
-            f"batch_size={settings.batch_size} is no multiple of {process_count} processes × "
-            f"accumulation_steps={steps}: set it to a multiple of {process_count * steps}",
-            "batch_size",
-        )
 
 
 @torch.no_grad()

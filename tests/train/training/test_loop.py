@@ -23,11 +23,18 @@ from train.processes import Interrupted
 from train.run_folder import read_metrics
 from train.settings import TrainSettings
 from train.training import loop
-from train.training.loop import Trainer, activation_bytes, evaluate
+from train.training.loop import Trainer, evaluate
 from train.training.recipe import SCHEDULE_FACTORS, freeze
 from train.training.run_log import RunLog
+from train.training.step import activation_bytes
 
-ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
+ARCHITECTURE = {
+    "classes": ["fig", "lime", "pear"],
+    "size": 16,
+    "depth": 10,
+    "width": 1,
+    "dropout": 0.0,
+}
 # Noise for training and validation. With 16 images a batch, an epoch has three steps.
 TRAINED = 40
 VALIDATED = 20
@@ -108,7 +115,7 @@ def states_after_steps(trainer: Trainer) -> list[State]:
     def record(*_) -> None:
         states.append(copy.deepcopy(trainer.model.network.state_dict()))
 
-    trainer.optimizer.register_step_post_hook(record)
+    trainer.step.optimizer.register_step_post_hook(record)
     return states
 
 
@@ -120,7 +127,7 @@ def signal_after_step(trainer: Trainer, step: int) -> None:
         if len(states) == step:
             signal.raise_signal(signal.SIGTERM)
 
-    trainer.optimizer.register_step_post_hook(send)
+    trainer.step.optimizer.register_step_post_hook(send)
 
 
 def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path):
@@ -189,7 +196,7 @@ def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp
 def test_the_schedule_goes_on_within_an_epoch(tmp_path):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=4, schedule="cosine")
     rates = []
-    trainer.optimizer.register_step_post_hook(
+    trainer.step.optimizer.register_step_post_hook(
         lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]),
     )
     fit(trainer, single_colors(12), single_colors(3))
@@ -283,12 +290,12 @@ def test_several_processes_that_resume_count_a_loss_once_between_them(tmp_path, 
 
 def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
     trainer = make_trainer(tmp_path, precision="float16", epochs=1)
-    trainer.scaler.load_state_dict(trainer.scaler.state_dict() | {"scale": 256.0})
+    trainer.step.scaler.load_state_dict(trainer.step.scaler.state_dict() | {"scale": 256.0})
     fit_noise(trainer)
     resumed = make_trainer(tmp_path, precision="float16", epochs=1)
     resumed.resume()
-    assert resumed.scaler.get_scale() == 256
-    assert trainer.scaler.get_scale() == 256
+    assert resumed.step.scaler.get_scale() == 256
+    assert trainer.step.scaler.get_scale() == 256
 
 
 @pytest.mark.parametrize(
@@ -384,7 +391,7 @@ def test_each_epoch_of_a_soup_begins_with_the_initial_network_and_the_whole_sche
     def record(model: nn.Module, *_) -> None:
         if model.training:
             begun.append(copy.deepcopy(model.state_dict()))
-            rates.append(trainer.optimizer.param_groups[0]["lr"])
+            rates.append(trainer.step.optimizer.param_groups[0]["lr"])
 
     trainer.model.register_forward_pre_hook(record)
     fit_noise(trainer)

@@ -22,7 +22,7 @@ from train.saved_networks import load_run
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.interpolation import FACTORS, INTERPOLATION, mix
-from train.training.loss import TrainingLoss
+from train.training.losses import TrainingLoss
 from train.training.relit_batches import RelitBatches
 
 NAME = "shufflenet_v2_x0_5"

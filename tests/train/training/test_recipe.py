@@ -16,7 +16,7 @@ from renderer.image import to_unit
 from train.networks import WideResNet
 from train.settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.baselines import PGD, Baseline
-from train.training.loss import TrainingLoss
+from train.training.losses import TrainingLoss
 from train.training.recipe import (
     SCHEDULE_FACTORS,
     build_optimizer,

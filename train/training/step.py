@@ -1,0 +1,202 @@
+"""One training step: augment a batch, compute the gradient of its loss, and change the weights."""
+
+import math
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from augment import distributed
+from augment.network import eval_mode
+from augment.progress import progress_message
+from renderer.errors import InputError
+from renderer.memory import require_memory
+from train import console
+from train.data.batches import Batch
+from train.device import GraphedModel, MixedPrecision, compiles
+from train.processes import wrap_ddp
+from train.settings import RELIGHT, TrainSettings
+from train.system.user_errors import keyed
+from train.training.averages import Averages
+from train.training.baselines import Baseline
+from train.training.losses import TrainingLoss
+from train.training.recipe import build_optimizer, learning_rate
+from train.training.relit_batches import RelitBatches
+from train.training.shared_teacher import share_layers
+
+
+class TrainingStep:
+    """Loss, augmentation and optimizer of a network, with which it takes training steps.
+
+    Attributes:
+        attacked: Network in training, as the attack on the renders calls it.
+        validated: Network that is validated, as the validation calls it.
+    """
+
+    attacked: nn.Module
+    validated: nn.Module
+
+    def __init__(
+        self,
+        settings: TrainSettings,
+        model: MixedPrecision,
+        averages: Averages,
+        teacher: MixedPrecision | None,
+        positive_classes: Sequence[int],
+        seed: int,
+        size: int,
+        labeled: bool,
+    ):
+        """Build the optimizer, the loss and the augmentation.
+
+        `teacher` is the network before the training, or None without distillation.
+        """
+        self._settings = settings
+        self._model = model
+        self._averages = averages
+        self._device = next(model.parameters()).device
+        # `wrap_ddp` may replace layers of the network. The optimizer is built
+        # afterwards, so that it has the parameters of the new layers.
+        replica = wrap_ddp(model)
+        # The first optimizer of a process imports the compiler of torch, which takes seconds.
+        with progress_message("loading the optimizer"):
+            self.optimizer = build_optimizer(model, settings)
+        is_scaled = model.precision == "float16"
+        self.scaler = torch.amp.GradScaler(self._device.type, enabled=is_scaled)
+        self._augmentation: Baseline | RelitBatches
+        if settings.augmentation == RELIGHT:
+            self._augmentation = RelitBatches(settings, model, teacher, seed)
+        else:
+            absent = positive_classes[1:]
+            self._augmentation = Baseline(settings.augmentation, model, seed, absent)
+        with keyed(choice="compile"):
+            is_compiled = compiles(settings.compile, self._device)
+        # Module that computes the logits of the teacher. It may take the features from
+        # the network in training.
+        pupil: nn.Module | None = teacher
+        if teacher is not None and not is_compiled:
+            pupil = share_layers(settings, model, teacher, size)
+        self._loss = TrainingLoss(replica, settings, positive_classes, pupil, labeled).compute
+        self.attacked = model
+        self.validated = averages.selected
+        if is_compiled:
+            # torch limits the number of compiled functions in a process. Those of an
+            # earlier run are removed.
+            torch.compiler.reset()
+            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
+            self.attacked = GraphedModel(model)
+            self.validated = GraphedModel(averages.selected)
+
+    def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
+        """Change the weights by the gradient of the loss of a batch.
+
+        `done` is the fraction of the training that is done, and `number` the number of earlier
+        steps of the run. Return the sum of the losses of the images, and the number of correct
+        predictions.
+        """
+        settings = self._settings
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(settings, done)
+        images, labels, rendered = batch
+        augmented = self._augmentation.apply(images, labels, number)
+        tensors = [augmented, labels, rendered]
+        if settings.consistency_weight:
+            # The consistency term compares the images before and after the augmentation.
+            tensors = [images, labels, rendered, augmented]
+        self.optimizer.zero_grad(set_to_none=True)
+        sums = self._add_gradients(tensors)
+        if settings.clip_gradient:
+            self.scaler.unscale_(self.optimizer)
+            nn.utils.clip_grad_norm_(self._model.parameters(), settings.clip_gradient)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        self._averages.end_step()
+        return sums
+
+    def _add_gradients(self, tensors: Sequence[Tensor]) -> Float[Tensor, " 2"]:
+        """Compute the gradient of the loss of a batch in parts, which saves memory.
+
+        Return the sum of the losses of the images, and the number of correct predictions.
+        """
+        count = self._settings.accumulation_steps
+        sums = torch.zeros(2, device=self._device)
+        # A list of chunks for each tensor. A part of the batch has one chunk of each tensor.
+        chunks = [tensor.chunk(count) for tensor in tensors]
+        for part in zip(*chunks, strict=True):
+            loss, hits = self._loss(*part)
+            self.scaler.scale(loss / count).backward()
+            sums += torch.stack([loss.detach() * len(part[0]), hits])
+        return sums
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of the optimizer and of the gradient scaler for a checkpoint."""
+        return {"optimizer": self.optimizer.state_dict(), "scaler": self.scaler.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the optimizer and the gradient scaler from a checkpoint."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.scaler.load_state_dict(state["scaler"])
+
+
+def require_equal_shares(settings: TrainSettings) -> None:
+    """Raise InputError if a batch cannot be divided equally.
+
+    Each process gets an equal part of the batch, and divides it into
+    `accumulation_steps` equal parts.
+    """
+    process_count = distributed.world_size()
+    steps = settings.accumulation_steps
+    if settings.batch_size % (process_count * steps):
+        raise InputError(
+            f"batch_size={settings.batch_size} is no multiple of {process_count} processes × "
+            f"accumulation_steps={steps}: set it to a multiple of {process_count * steps}",
+            "batch_size",
+        )
+
+
+def fitting_batch_size(
+    settings: TrainSettings, model: nn.Module, images_in_round: int, size: int
+) -> int:
+    """Limit the batch size to the images of a round, and check that a batch fits in memory.
+
+    A larger batch would only hold copies of the images.
+    """
+    # Each process divides its part of a batch into equal parts.
+    shares = distributed.world_size() * settings.accumulation_steps
+    batch_size = min(settings.batch_size, math.ceil(images_in_round / shares) * shares)
+    if batch_size < settings.batch_size:
+        console.warning(
+            "batch_size=%d is more than the %d images that a round shows: it is %d",
+            settings.batch_size,
+            images_in_round,
+            batch_size,
+        )
+    at_once = batch_size // shares
+    needed = at_once * activation_bytes(deepcopy(model), size)
+    device = next(model.parameters()).device
+    require_memory(f"the activations of batch_size={at_once}", needed, device)
+    return batch_size
+
+
+def activation_bytes(model: nn.Module, size: int) -> int:
+    """Measure the memory that a training step keeps for each image until its backward pass."""
+    totals = []
+    device = next(model.parameters()).device
+    for count in (1, 2):
+        kept: dict[int, int] = {}
+
+        def keep(tensor: Tensor, kept: dict[int, int] = kept) -> Tensor:
+            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
+        with eval_mode(model), torch.enable_grad(), hooks:
+            # The result holds the kept tensors, whose addresses would otherwise be used again.
+            result = model(torch.full((count, 3, size, size), 0.5, device=device))
+        totals.append(sum(kept.values()))
+        del result
+    # The difference leaves out the weights, which all images share.
+    return max(0, totals[1] - totals[0])
