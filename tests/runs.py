@@ -16,17 +16,8 @@ def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None 
     if data is None:
         data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
-    run.load()
     run.begin()
     return run
-
-
-def finish(run: Run) -> dict[str, float]:
-    """Train and score a loaded run, and return its scores."""
-    run.fit()
-    scores = run.score()
-    run.export()
-    return scores
 
 
 def completed_run(
@@ -35,5 +26,4 @@ def completed_run(
     data: DataSet | None = None,
 ) -> dict[str, float]:
     """Make, train and score a run, and return its scores."""
-    run = loaded_run(settings, folder, data)
-    return finish(run)
+    return loaded_run(settings, folder, data).train()

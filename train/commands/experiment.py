@@ -178,9 +178,7 @@ def _train_runs(
         mode = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"
         console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
-        run.fit()
-        run.score()
-        run.export()
+        run.train()
     if distributed.rank() == 0:
         summaries = [summarize(path) for path in settings_of_runs]
         console.debug("\n%s\n", format_table(summaries))

@@ -73,7 +73,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     # The nodes of a cluster have other devices, so their runs are not loaded here.
     for folder, settings in () if "launcher=slurm" in runs[0] else new_runs.values():
         data, initial = load_inputs(settings)
-        Run(settings, data, folder, initial).load()
+        Run(settings, data, folder, initial)
     # The names of the folders leave out settings that are the same in all runs.
     excluded = ",".join(map(quoted, shared_keys))
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{excluded}]")
@@ -188,9 +188,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
     settings.train.resume = checkpoints.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
     (run,) = load_runs({folder: settings}, command)
-    run.fit()
-    run.score()
-    run.export()
+    run.train()
 
 
 def _unescaped(override: str) -> str:

@@ -242,11 +242,8 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
     with keyed(**{"data.path": "photographs"}):
         data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
-    run.load()
     run.begin()
-    run.fit()
-    run.score()
-    run.export()
+    run.train()
     if has_report:
         console.info("%s", report_of([folder], folder))
     return run.trainer.selected.network

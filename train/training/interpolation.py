@@ -5,7 +5,7 @@ factor is chosen on validation images. They need no labels, because predictions
 are compared with those of the network before the training.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Float
@@ -46,16 +46,17 @@ def interpolate(
     unchanged and to the relit images. Return the interpolated weights on the CPU, and the factor,
     which is the smallest of equally good ones.
     """
+    device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
-    targets = predict(initial, validation)
+    targets = predict(initial, validation, device)
     # Key of the random stream of the light. All factors are tried in the same light.
     light_key = (seed, "validation")
     lowest_loss = float("inf")
     best_factor = FACTORS[0]
     for factor in FACTORS:
         selected.network.load_state_dict(mix(initial_weights, trained, factor))
-        unchanged = predict(selected, validation)
-        relit = predict(selected, validation, *light_key)
+        unchanged = predict(selected, validation, device)
+        relit = predict(selected, validation, device, *light_key)
         loss_unchanged = weights[0] * divergence(unchanged, targets)
         loss = loss_unchanged + weights[1] * divergence(relit, targets)
         console.debug(
@@ -98,15 +99,14 @@ def divergence(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N cla
     return float(kl_divergence(logits, targets).mean())
 
 
-@torch.no_grad()
 def predict(
-    model: MixedPrecision, split: Split, *light_key: int | str
+    model: Callable[[Tensor], Tensor], split: Split, device: torch.device, *light_key: int | str
 ) -> Float[Tensor, "N classes"]:
     """Compute the logits of a network for images, as they are or in the light of a projector.
 
-    Without a key for the random stream of the light, there is no projector.
+    Without a key for the random stream of the light, there is no projector. The logits are on the
+    CPU.
     """
-    device = next(model.parameters()).device
     batches = torch.arange(len(split)).split(BATCH)
     shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
     if light_key:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Int
@@ -24,7 +24,6 @@ from augment.network import (
     without_normalized_light,
 )
 from augment.plain_networks import say_inputs
-from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
@@ -45,8 +44,8 @@ from train.laboratory.laboratory import is_laboratory, write_laboratory
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
-from train.results.predictions import BATCH, Model, Predictor, compute_logits
-from train.results.scoring import Scores, evaluate_photographs, format_scores
+from train.results.predictions import Model, Predictor
+from train.results.scoring import evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.saved_networks import NORMALIZE_LIGHT, export
@@ -60,12 +59,7 @@ from train.training.initial import (
     choose_validation,
     load_initial,
 )
-from train.training.interpolation import (
-    INTERPOLATION,
-    agreement,
-    interpolate,
-    predict,
-)
+from train.training.interpolation import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.renders import build_service
@@ -81,14 +75,13 @@ NORM_IMAGES = 16
 class Run:
     """One training run, which trains a network and scores it.
 
-    The methods are called in this order: `load`, `fit`, `score`, `export`. Wrong
-    input raises an error in `load`, so that several runs can be checked before
-    the first one trains.
-    """
+    Wrong input raises an error when the run is made, so that several runs can be checked before
+    the first one trains. Then `begin` and `train` are called.
 
-    trainer: Trainer
-    log: RunLog | None
-    held_out: Tensor
+    Attributes:
+        scored_folders: Folders of photographs or renders on which the networks are scored, by name.
+        held_out: Whether each training image validates the network.
+    """
 
     def __init__(
         self,
@@ -98,29 +91,20 @@ class Run:
         initial: Initial | None = None,
         command: str = "",
     ):
-        """Store the arguments. The method `load` checks them."""
+        """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
         self.settings = settings
-        self.data = data
+        # Labels of the data become indices into the classes of the network.
+        self.data = _relabel(settings, data, initial)
         self.folder = folder
-        self.initial = initial
         self.command = command
-        self._scores: dict[str, float] = {}
-        # Folders of photographs or renders on which the networks are scored, by name.
+        self.initial = initial
         self.scored_folders = settings.evaluate.folders
-        # Number of CPU threads with which the run trains.
-        self._threads = 1
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
         self._initial_predictions: Tensor | None = None
-
-    def load(self) -> None:
-        """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
-        settings = self.settings
-        # Labels of the data become indices into the classes of the network.
-        self.data = _relabel(settings, self.data, self.initial)
         _require_label(settings, self.data)
-        for name, photographs in settings.evaluate.folders.items():
-            require_outside(self.folder / name, photographs)
+        for name, photographs in self.scored_folders.items():
+            require_outside(folder / name, photographs)
             with keyed("evaluate.photos"):
                 labels = choose_labels(photographs, self.data.classes, settings.label)
                 find_photographs(photographs, self.data.classes, labels)
@@ -128,23 +112,19 @@ class Run:
         # Settings of the run that is resumed. None for a new run.
         earlier = self._require_folder()
         self._is_resumed = earlier is not None
-        validation = choose_validation(settings, self.data, self.initial)
+        validation = choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, validation.fraction, seed=0)
         self.trainer = build_trainer(
-            settings,
-            self.data,
-            self.folder,
-            initial=self.initial,
-            validation=validation,
-            threads=self._choose_threads(earlier),
+            settings, self.data, folder, initial, validation, self._choose_threads(earlier)
         )
+        # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
             self.trainer.resume()
             self._warn_of_stretched_schedule(earlier.train.epochs)
         elif settings.train.resume:
-            console.info("nothing to resume in %s; starting at epoch 1", self.folder)
+            console.info("nothing to resume in %s; starting at epoch 1", folder)
 
     def begin(self) -> None:
         """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
@@ -160,52 +140,45 @@ class Run:
             remove_run(self.folder, with_others=not self.settings.train.resume)
         self._write_config()
 
-    def fit(self) -> None:
-        """Score the initial network, if the run has one, and train to the last epoch."""
-        # Another run that was loaded in between may have set another number of threads.
+    def train(self) -> dict[str, float]:
+        """Train to the last epoch, score the network, and return the final scores by name.
+
+        If the run has an initial network, it is scored, too.
+        """
+        # Another run that was made in between may have set another number of threads.
         torch.set_num_threads(self._threads)
+        trainer = self.trainer
         console.debug(
             "%d images, %d classes; %s, %s, threads: %d, processes: %d",
             (~self.held_out).sum(),
             len(self.data.classes),
-            self.trainer.device,
-            self.trainer.model.precision,
+            trainer.device,
+            trainer.model.precision,
             self._threads,
             distributed.world_size(),
         )
         is_first = distributed.rank() == 0
-        self.log = RunLog(self.folder, self.trainer.history) if is_first else None
+        log = RunLog(self.folder, trainer.history) if is_first else None
         if is_first:
             self._render_kept_aside()
-        if self.trainer.initial:
-            self._score_initial(self.trainer.initial)
-        split = self.data.train.to(self.trainer.device)
+        scores = self._score_initial(trainer.initial) if trainer.initial else {}
+        split = self.data.train.to(trainer.device)
         with keyed(**keys_of("train", self.settings.train)):
-            self.trainer.fit(split, self.held_out, self.log)
+            trainer.fit(split, self.held_out, log)
+        scores |= self._score()
+        if log:
+            scores |= self._score_photographs(trainer.selected, self.folder)
+            log.scalars(scores)
+            self._export()
+        return scores
 
-    def score(self) -> dict[str, float]:
-        """Score the network that the training selected, on the test images and on photographs."""
-        trainer = self.trainer
-        self._scores |= self._test_scores()
-        if self._initial_predictions is not None and CLASSIFIER in trainer.architecture:
-            self._scores["test/agreement"] = self._agreement(self._initial_predictions)
-        if trainer.initial and self.settings.train.consistency_weight:
-            self._scores |= self._relit_scores(trainer.initial)
-        if self.log:
-            for name in self.scored_folders:
-                scores = self._score_photographs(trainer.selected, name, self.folder)
-                console.debug("%s: %s", name, format_scores(scores))
-                self._scores |= _photograph_scores(name, scores)
-            self.log.scalars(self._scores)
-        return self._scores
-
-    def export(self) -> None:
+    def _export(self) -> None:
         """Write the trained weights of a classifier of the user to weights.pt.
 
         The user can load this file into the classifier. A line on the console
         says how. Nothing is written if the run trains a network of this library.
         """
-        if not self.log or CLASSIFIER not in self.trainer.architecture:
+        if CLASSIFIER not in self.trainer.architecture:
             return
         path = self.folder / WEIGHTS
         export(path, self.trainer.selected.network)
@@ -289,7 +262,7 @@ class Run:
             test_images=describe_test_images(self.settings, self.data),
         )
 
-    def _score_initial(self, model: MixedPrecision) -> None:
+    def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network on the test images and on photographs.
 
         If the data have no labels, the predictions of the initial network become
@@ -302,34 +275,29 @@ class Run:
             self.initial.network is not None or self.initial.name.startswith(PYTHON)
         )
         cache = TensorCache(None if has_own_code else cache_folder(settings.train.cache))
-        cached_model = CachedModel(model, self.trainer.device, cache)
-        predictions = self._predict_classes(cached_model, self.data.test)
+        cached = CachedModel(model, self.trainer.device, cache)
+        predictions = self._predict(cached, self.data.test)
         self._initial_predictions = predictions
         if not self.data.labeled:
-            self._label_with(cached_model, predictions)
+            # The loss computes such predictions for the training images itself.
+            labels = self.data.train.labels.clone()
+            labels[self.held_out] = self._predict(cached, self.data.train[self.held_out])
+            train = Split(self.data.train.images, labels)
+            test = Split(self.data.test.images, predictions)
+            self.data = replace(self.data, train=train, test=test)
         if distributed.rank() > 0:
-            return
+            return {}
         accuracy = (predictions == self.data.test.labels).float().mean().item()
         if self.data.labeled:
             images = describe_test_images(settings, self.data)
             name = settings.train.init_from
             console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
-        for name in self.scored_folders:
-            self._score_photographs(cached_model, name, self.folder / BEFORE)
-        self._scores["test/accuracy_before"] = accuracy
+        self._score_photographs(cached, self.folder / BEFORE)
+        return {"test/accuracy_before": accuracy}
 
-    def _label_with(self, model: Model, test_predictions: Int[Tensor, " N"]) -> None:
-        """Label the validation and test images with the predictions of the initial network.
-
-        The training images need no labels, because the loss computes these
-        predictions itself.
-        """
-        labels = self.data.train.labels.clone()
-        validation = self.data.train[self.held_out]
-        labels[self.held_out] = self._predict_classes(model, validation)
-        train = Split(self.data.train.images, labels)
-        test = Split(self.data.test.images, test_predictions)
-        self.data = replace(self.data, train=train, test=test)
+    def _predict(self, model: Model, split: Split, *light_key: int | str) -> Int[Tensor, " N"]:
+        """Predict the class of each image of a split, as it is or in the light of a projector."""
+        return predict(model, split, self.trainer.device, *light_key).argmax(1)
 
     def _render_kept_aside(self) -> None:
         """Render test images of other objects and projected patterns than those of the training.
@@ -351,29 +319,18 @@ class Run:
                 return
         self.scored_folders = {LABORATORY: folder}
 
-    def _predict_classes(self, model: Model, split: Split) -> Int[Tensor, " N"]:
-        """Predict the class of each image of a split."""
-        batches = torch.arange(len(split)).split(BATCH)
-        class_count = len(self.trainer.architecture["classes"])
-        classes = []
-        for images in progress(split.squares(batches), "predictions", len(batches)):
-            logits = compute_logits(model, images, class_count, self.trainer.device)
-            classes.append(logits.argmax(1))
-        return torch.cat(classes)
+    def _score(self) -> dict[str, float]:
+        """Score the selected network, and the one after the last epoch, on the test images.
 
-    def _test_scores(self) -> dict[str, float]:
-        """Measure the test accuracy of the network in best.pt, and of the one after the last epoch.
-
-        Afterwards, `self.trainer.selected` has the weights in best.pt. "test/epoch" is the epoch of
-        the network in best.pt.
+        Afterwards, `self.trainer.selected` has the weights of the selected network. "test/epoch" is
+        the epoch that it is from.
         """
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
-        last = evaluate(trainer.selected, test)["accuracy"]
-        selected = last
-        best = checkpoints.load(self.folder / run_folder.BEST)
+        last = selected = evaluate(trainer.selected, test)["accuracy"]
         if self.settings.train.interpolate:
-            best = self._interpolate(best)
+            self._interpolate()
+        best = trainer.best
         if best["epoch"] != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
@@ -391,88 +348,94 @@ class Run:
         }
         if INTERPOLATION in best:
             scores["test/interpolation"] = best[INTERPOLATION]
+        predictions = self._initial_predictions
+        has_consistency = bool(self.settings.train.consistency_weight)
+        if predictions is not None and (has_consistency or CLASSIFIER in trainer.architecture):
+            agreement = selected
+            if self.data.labeled:
+                before = Split(test.images, predictions.to(trainer.device))
+                agreement = evaluate(trainer.selected, before)["accuracy"]
+            scores["test/agreement"] = agreement
+            console.debug("agreement with %s: %.4f", self.settings.train.init_from, agreement)
+            if has_consistency:
+                scores |= self._relit_agreement(predictions, agreement)
         return scores
 
-    def _interpolate(self, best: dict[str, Any]) -> dict[str, Any]:
+    def _interpolate(self) -> None:
         """Interpolate between the weights before and after the training, and write best.pt.
 
         Weights that an earlier process of the run interpolated stay as they are.
         """
         trainer = self.trainer
-        if INTERPOLATION in best or trainer.initial is None:
-            return best
-        validation = self.data.train[self.held_out]
+        if INTERPOLATION in trainer.best or trainer.initial is None:
+            return
         recipe = self.settings.train
         weights, factor = interpolate(
             initial=trainer.initial,
             selected=trainer.selected,
-            trained=best["model"],
-            validation=validation,
+            trained=trainer.best["model"],
+            validation=self.data.train[self.held_out],
             seed=self.settings.seed,
             weights=(recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0),
         )
-        interpolated = best | {"model": weights, INTERPOLATION: factor}
+        trainer.best |= {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
-            checkpoints.save(self.folder / run_folder.BEST, interpolated)
-        return interpolated
+            checkpoints.save(self.folder / run_folder.BEST, trainer.best)
 
-    def _agreement(self, initial_predictions: Int[Tensor, " N"]) -> float:
-        """Measure for which fraction of the test images training did not change the prediction."""
-        # The predictions of the initial network serve as labels of data without labels. The
-        # test accuracy then is this fraction.
-        agreement = self._scores["test/accuracy"]
-        if self.data.labeled:
-            relabeled_test = Split(self.data.test.images, initial_predictions)
-            relabeled_test = relabeled_test.to(self.trainer.device)
-            agreement = evaluate(self.trainer.selected, relabeled_test)["accuracy"]
-        console.debug(
-            "agreement with %s on %d held-out images: %.4f",
-            self.settings.train.init_from,
-            len(initial_predictions),
-            agreement,
-        )
-        return agreement
+    def _relit_agreement(self, targets: Int[Tensor, " N"], unchanged: float) -> dict[str, float]:
+        """Measure on which fraction of the test images a projector does not change the prediction.
 
-    def _relit_scores(self, initial: MixedPrecision) -> dict[str, float]:
-        """Measure how the light of a projector changes predictions for the test images.
-
-        All predictions are compared with those of the initial network for the
-        images without a projector.
+        Predictions before and after the training are compared with `targets`, those of the initial
+        network without a projector.
         """
-        test = self.data.test
-        targets = predict(initial, test)
-        scores = {"test/agreement": agreement(predict(self.trainer.selected, test), targets)}
-        for name, model in (("before", initial), ("after", self.trainer.selected)):
-            logits = predict(model, test, self.settings.seed, "test")
-            scores[f"test/relit_agreement_{name}"] = agreement(logits, targets)
+        scores = {}
+        for name, model in (("before", self.trainer.initial), ("after", self.trainer.selected)):
+            relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
+            agreement = (relit == targets).double().mean().item()
+            scores[f"test/relit_agreement_{name}"] = agreement
         console.info(
             "agreement with the original on %d photographs kept aside: unchanged %.3f; "
             "in the light of a projector %.3f before, %.3f after",
-            len(test),
+            len(targets),
+            unchanged,
             *scores.values(),
         )
         return scores
 
-    def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
-        """Score a network on a folder of photographs, and write the scores."""
-        return evaluate_photographs(
-            Predictor(model, self.data.classes, self.data.size, self.trainer.device),
-            folder=self.scored_folders[name],
-            label=choose_labels(self.scored_folders[name], self.data.classes, self.settings.label),
-            out=folder / name,
-            skip_unreadable=self.settings.evaluate.skip_unreadable,
-        )
+    def _score_photographs(self, model: Model, out: Path) -> dict[str, float]:
+        """Score a network on each folder of photographs, and return the metrics by their names.
+
+        Several positive classes add names such as "photographs/orange/auc".
+        """
+        predictor = Predictor(model, self.data.classes, self.data.size, self.trainer.device)
+        values = {}
+        for name, folder in self.scored_folders.items():
+            scores = evaluate_photographs(
+                predictor,
+                folder=folder,
+                label=choose_labels(folder, self.data.classes, self.settings.label),
+                out=out / name,
+                skip_unreadable=self.settings.evaluate.skip_unreadable,
+            )
+            console.debug("%s: %s", name, format_scores(scores))
+            metrics_by_prefix = {name: scores.overall}
+            for label, metrics in scores.by_label.items():
+                metrics_by_prefix[f"{name}/{label}"] = metrics
+            for prefix, metrics in metrics_by_prefix.items():
+                for metric in ("top5", *METRICS):
+                    estimate = metrics.find(metric)
+                    if estimate is not None and estimate.value is not None:
+                        values[f"{prefix}/{metric}"] = estimate.value
+        return values
 
 
 def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
-    """Load several runs before the first one is trained, so that mistakes are reported at once.
+    """Make several runs before the first one is trained, so that mistakes are reported at once.
 
     All of them have the data set and the initial network of the first one.
     """
     data, initial = load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
-    for run in runs:
-        run.load()
     # The main run is the last one. The baselines write to subfolders of its folder.
     for run in reversed(runs):
         run.begin()
@@ -616,20 +579,3 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
     if class_count == len(data.classes):
         return kind
     return f"{kind} of {class_count} of the network's {len(data.classes)} classes"
-
-
-def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
-    """List the metrics on a folder of photographs under their names in metrics.jsonl.
-
-    Several positive classes add names such as "photographs/orange/auc".
-    """
-    metrics_by_prefix = {name: scores.overall}
-    for label, metrics in scores.by_label.items():
-        metrics_by_prefix[f"{name}/{label}"] = metrics
-    values = {}
-    for prefix, metrics in metrics_by_prefix.items():
-        for metric in ("top5", *METRICS):
-            estimate = metrics.find(metric)
-            if estimate is not None and estimate.value is not None:
-                values[f"{prefix}/{metric}"] = estimate.value
-    return values

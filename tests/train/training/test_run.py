@@ -22,7 +22,7 @@ from augment.losses import complementary_label
 from augment.scene.build import build_scene
 from renderer.errors import InputError
 from renderer.image import to_bytes
-from tests.runs import completed_run, finish, loaded_run
+from tests.runs import completed_run, loaded_run
 from tests.train.helpers import read_markdown
 from train import checkpoints, run_folder
 from train.command_settings import LabSettings
@@ -381,7 +381,7 @@ class TestThreads:
         settings = tiny(*WITHOUT_RENDERS, "train.images_per_epoch=16", *overrides)
         run = loaded_run(settings, folder)
         torch.set_num_threads(1)
-        finish(run)
+        run.train()
 
     def assert_count(self, folder: Path, expected: int) -> None:
         assert torch.get_num_threads() == expected
