@@ -158,7 +158,7 @@ def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photograp
 
 def test_a_teacher_that_shares_layers_trains_the_same_weights(network, photographs, monkeypatch):
     shared = harden(network, photographs)
-    monkeypatch.setattr("train.training.loop.share_layers", lambda *arguments: arguments[2])
+    monkeypatch.setattr("train.training.step.share_layers", lambda *arguments: arguments[2])
     apart = harden(network, photographs)
     assert torch.equal(shared[4].weight, apart[4].weight)
 
