@@ -10,6 +10,8 @@ from augment.parameter_settings import PARAMETER_NAMES, ParameterSettings
 from renderer.errors import MAX_SCALE, InputError
 from renderer.settings import Settings, setting
 
+# File with one JSON line for each attacked example, and a last line with the checks.
+LINES = "attack.jsonl"
 # Largest standard deviation of noise, in units of 1/255.
 MAX_NOISE = 255.0
 # Default of `AttackSettings.noise_margin`.

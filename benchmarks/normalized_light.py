@@ -26,11 +26,12 @@ from augment.network import Classifier
 from augment.settings import NormalizedLightSettings
 from benchmarks.splits import LABEL, TEST, VALIDATION, load, solids
 from train.command_settings import LabSettings
-from train.data.photographs import Photograph, find_photographs, load_photographs
+from train.data.photo import Photograph
+from train.data.photographs import find_photographs, load_photographs
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
 from train.results.metrics import Pooled, auc_and_recalls, metric_title
-from train.results.predictions import compute_logits, rank_classes
+from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
 from train.results.tables import Table, format_interval
 from train.run_folder import read_json

@@ -48,12 +48,8 @@ from train.hashing import content_hash
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
 from train.results.metrics import METRICS, Pooled, metric_title
-from train.results.predictions import (
-    PREDICTIONS,
-    Prediction,
-    Predictor,
-    write_predictions,
-)
+from train.results.predictions import PREDICTIONS, Prediction, write_predictions
+from train.results.scoring import Predictor
 from train.results.store import RunSummary, summarize
 from train.results.tables import Estimate, Table, format_interval
 from train.saved_networks import is_classifier, load_network, load_run

@@ -25,8 +25,7 @@ from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from tests.helpers import bright_or_dark
 from train import load_run
-from train.results.predictions import Predictor
-from train.results.scoring import evaluate_photographs, score
+from train.results.scoring import Predictor, evaluate_photographs, score
 
 NAN = math.nan
 SIZE = 8

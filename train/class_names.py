@@ -9,8 +9,14 @@ from augment.network import class_index, nearest
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.solids import HARD_NEGATIVES, SOLIDS
-from train.data.photographs import OTHER_PREFIX
-from train.settings import OTHER, ExperimentSettings, label_names, simplified, solid_name
+from train.settings import (
+    OTHER,
+    OTHER_PREFIX,
+    ExperimentSettings,
+    label_names,
+    simplified,
+    solid_name,
+)
 
 
 def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
@@ -172,8 +178,3 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         augment=replace(settings.augment, examples=examples),
         scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
     )
-
-
-def in_words(label: str) -> str:
-    """Write the label of an object in words: "other_sweet_pepper" becomes "sweet pepper"."""
-    return label.removeprefix(OTHER_PREFIX).replace("_", " ")

@@ -15,7 +15,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -23,7 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.command import program
-from train.fingerprints import fingerprints, is_changed
 from train.former_keys import rename_former_keys
 from train.run_folder import opened_text
 from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, mapped
@@ -65,7 +63,12 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
         facts["working_folder"] = _working_folder(folder, str(facts["command"]))
-    versions = {"python": platform.python_version(), "torch": str(torch.__version__)}
+    # These imports are here because results of runs are read without torch.
+    from torch import __version__ as torch_version
+
+    from train.fingerprints import fingerprints
+
+    versions = {"python": platform.python_version(), "torch": str(torch_version)}
     versions |= {name: version(name) for name in PACKAGES}
     content = asdict(settings)
     content |= {name: fact for name, fact in facts.items() if "${" not in str(fact)}
@@ -215,6 +218,8 @@ def require_same(
                 f"set {key} to the former value, or choose another folder with {elsewhere}",
             )
     hashes = config.get("inputs") or {}
+    from train.fingerprints import fingerprints, is_changed
+
     for path, fingerprint in fingerprints(settings).items():
         if is_changed(hashes.get(path, fingerprint), fingerprint):
             raise InputError(

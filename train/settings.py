@@ -30,6 +30,9 @@ from renderer.settings import (
 # Label of a hard negative (an object of another class than the positive class) for
 # which the classifier has no class.
 OTHER = "other"
+# A folder whose name begins with "other_" has photographs of a class that the
+# network lacks.
+OTHER_PREFIX = "other_"
 # Sub-folder of a training run with the scores on photographs, if the setting
 # evaluate.photos gives the folder of photographs no name.
 PHOTOGRAPHS = "photographs"
@@ -723,6 +726,11 @@ def solid_name(mesh: str) -> str:
 def simplified(name: str) -> str:
     """Write a name in lower case and NFC, with spaces for "_" and "-", to compare spellings."""
     return " ".join(composed(name).lower().replace("_", " ").replace("-", " ").split())
+
+
+def in_words(label: str) -> str:
+    """Write the label of an object in words: "other_sweet_pepper" becomes "sweet pepper"."""
+    return label.removeprefix(OTHER_PREFIX).replace("_", " ")
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
 from augment.attacks.attack import (
     AttackResult,
@@ -31,8 +32,6 @@ from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind
 from renderer.visibility.rasterizer import Rasterizer
 
-# File in which `save` writes one JSON line for each example, and a last line with the checks.
-LINES = "attack.jsonl"
 # `save` also classifies the attacked images after JPEG compression with this quality.
 JPEG_QUALITY = 90
 # Renderers that `save` may use to render the saved files again.

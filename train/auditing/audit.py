@@ -49,17 +49,16 @@ from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remed
 from train.class_names import class_name, class_of_meshes, require_others, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
-from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabeled
+from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
 from train.laboratory.laboratory import write_laboratory
 from train.results.overwrite import RESULTS, require_replaceable
 from train.results.page import PAGE
-from train.results.predictions import Predictor
-from train.results.scoring import evaluate_photographs
+from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer
 from train.saved_networks import load_chosen, load_network
-from train.settings import published, read_objects, simplified, solid_name
+from train.settings import OTHER_PREFIX, published, read_objects, simplified, solid_name
 from train.system.user_errors import keyed, writable_folder
 
 # Number of views of the meshes that are rendered in environment lighting.

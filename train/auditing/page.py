@@ -32,7 +32,6 @@ from train.auditing.screen import (
     screen_of_one,
     withstood_sentence,
 )
-from train.class_names import in_words
 from train.results import compare, plots, store
 from train.results.first_screen import (
     NETWORKS,
@@ -46,11 +45,11 @@ from train.results.first_screen import (
 from train.results.metrics import Units, leave_out, read_metric, weighted_means
 from train.results.page import scores_section, write_page
 from train.results.plots import Picture
-from train.results.predictions import PREDICTIONS, Prediction, read_predictions
-from train.results.scoring import SUMMARY
+from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
 from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
+from train.settings import in_words
 
 # Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {

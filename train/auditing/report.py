@@ -12,7 +12,7 @@ from train.auditing.lights import KINDS
 from train.auditing.page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.results.metrics import METRICS, read_metric
-from train.results.scoring import SUMMARY
+from train.results.predictions import SUMMARY
 from train.results.tables import Estimate
 from train.run_folder import read_json
 

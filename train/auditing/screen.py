@@ -11,7 +11,6 @@ from typing import Any
 
 from train.auditing.lights import KINDS, LightKind
 from train.auditing.plain_light import PlainViews
-from train.class_names import in_words
 from train.results import plots
 from train.results.first_screen import (
     ComparedImage,
@@ -21,6 +20,7 @@ from train.results.first_screen import (
 )
 from train.results.metrics import Pool
 from train.results.tables import Estimate, fraction, join_words
+from train.settings import in_words
 
 # Width of the picture that shows a view before and after an attack, in pixels.
 PAIR_WIDTH = 400

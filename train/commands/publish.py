@@ -10,7 +10,7 @@ from train.command_settings import PublishSettings
 from train.networks import PYTHON
 from train.results import scoring
 from train.results.overwrite import require_replaceable
-from train.results.predictions import Predictor
+from train.results.scoring import Predictor
 from train.results.store import summarize, trained_labels
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected, publish

@@ -4,7 +4,7 @@ import csv
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import prod
@@ -22,7 +22,8 @@ from renderer.errors import InputError, composed, single_line
 from renderer.io.images import read_square
 from renderer.memory import require_memory
 from train import console
-from train.settings import label_names
+from train.data.photo import Photograph, split_sources
+from train.settings import OTHER_PREFIX, label_names
 
 SUFFIXES = (
     ".jpg",
@@ -38,9 +39,6 @@ SUFFIXES = (
 )
 # macOS adds a folder of this name to zip archives. It has no photographs.
 MACOS_FOLDER = "__MACOSX"
-# A folder whose name begins with "other_" has photographs of a class that the
-# network lacks.
-OTHER_PREFIX = "other_"
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
 # class take as much time and memory as all photographs.
 MAX_LABELS = 50
@@ -48,33 +46,8 @@ MAX_LABELS = 50
 TABLE = "photos.csv"
 # pnb-lab writes a file of this name to its folder of renders.
 DESCRIPTION = "lab.json"
-# Separator of the names of sources in the column hard_negatives of photos.csv.
-SEPARATOR = ";"
 # End of the error message about files that cannot be read.
 SKIP_ADVICE = ", or set skip_unreadable=True to skip them"
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """An image file of a folder of photographs.
-
-    Attributes:
-        path: Path relative to the folder.
-        label: Class of the photographed object. It begins with "other_" if the
-            network lacks the class.
-        source: Name of the collection that the image comes from. None if it is
-            unknown.
-        hard_negatives: Names of other sources. If the image is a positive, it
-            is ranked against the negatives of its own source and of these
-            sources.
-        mesh: Name of the photographed object. None if it is unknown.
-    """
-
-    path: PurePosixPath
-    label: str
-    source: str | None
-    hard_negatives: tuple[str, ...] = ()
-    mesh: str | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -371,11 +344,6 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
             "with the columns path and source_tag, separated by commas, and one row per image",
         ) from error
     return rows
-
-
-def split_sources(cell: str) -> tuple[str, ...]:
-    """Split a cell of the column hard_negatives into the names of sources."""
-    return tuple(name.strip() for name in cell.split(SEPARATOR) if name.strip())
 
 
 def load_photographs(

@@ -22,8 +22,7 @@ from train.data.photographs import choose_labels, require_outside
 from train.device import MixedPrecision, choose_precision
 from train.results import scoring
 from train.results.overwrite import require_replaceable
-from train.results.predictions import Predictor
-from train.results.scoring import Scores
+from train.results.scoring import Predictor, Scores
 from train.run_folder import sole_writer
 from train.settings import published
 from train.system.user_errors import keyed, writable_folder

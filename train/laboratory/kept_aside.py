@@ -10,8 +10,7 @@ from typing import Any
 
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.command_settings import OTHER_PATTERNS, LabSettings
-from train.data.photographs import OTHER_PREFIX
-from train.settings import ExperimentSettings, label_names, simplified
+from train.settings import OTHER_PREFIX, ExperimentSettings, label_names, simplified
 
 # The generated solids for testing have the seeds 2001, 2002 and so on. Training uses
 # lower seeds, or draws seeds that are far larger.

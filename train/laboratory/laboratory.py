@@ -30,11 +30,11 @@ from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.solids import HARD_NEGATIVES
 from train.command_settings import LabSettings
-from train.data.photographs import DESCRIPTION, OTHER_PREFIX, TABLE
+from train.data.photographs import DESCRIPTION, TABLE
 from train.laboratory.lab_patterns import RESOLUTION
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.run_folder import LOCK, read_json, sole_writer
-from train.settings import label_names, read_object, solid_name
+from train.settings import OTHER_PREFIX, label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
 
 # Glob pattern of the renders in the folder of the test set. Their paths are

@@ -11,10 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
-from augment.progress import progress
 from augment.settings import MODES
 from renderer.errors import InputError
-from train.class_names import in_words
 from train.results.metrics import (
     METRICS,
     TOP_RANKS,
@@ -23,8 +21,7 @@ from train.results.metrics import (
     change,
     metric_title,
 )
-from train.results.predictions import PREDICTIONS, Prediction, read_predictions
-from train.results.scoring import CONTACT_SHEET
+from train.results.predictions import CONTACT_SHEET, PREDICTIONS, Prediction, read_predictions
 from train.results.store import (
     INITIAL,
     RunSummary,
@@ -38,7 +35,7 @@ from train.results.store import (
     seconds_table,
 )
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
-from train.settings import PHOTOGRAPHS
+from train.settings import PHOTOGRAPHS, in_words
 
 # `class_table` has no rows if there are more classes than this.
 MAX_CLASSES = 30
@@ -187,7 +184,7 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
             subsets.update(dict.fromkeys(evaluation.pools))
     rows: list[list[str]] = []
     shown: list[Estimate | None] = []
-    for subset in progress(subsets, "intervals"):
+    for subset in subsets:
         for method, evaluations in methods.items():
             metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
             shown += metrics
@@ -291,7 +288,7 @@ def difference_tables(
 ) -> list[Table]:
     """Make a table of the differences of the metrics for each pair of methods."""
     tables = []
-    for method, base in progress(choose_pairs(methods), "differences"):
+    for method, base in choose_pairs(methods):
         evaluations = methods[method]
         reference = methods[base]
         rows = []

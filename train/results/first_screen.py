@@ -12,12 +12,12 @@ from typing import NamedTuple
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.class_names import in_words
 from train.data.photographs import DESCRIPTION
 from train.results import compare, plots
 from train.results.plots import Picture
 from train.results.predictions import PREDICTIONS, Prediction, read_predictions
 from train.results.tables import Estimate, Table, describe_intervals, join_words
+from train.settings import in_words
 
 # Metric "recall at a false-positive rate of 10%". At an equal rate, the recall of two
 # networks can be compared.

@@ -67,6 +67,8 @@ TITLES = {
     "class_top5": "top-5, mean over classes",
 }
 
+# Words after the number of negatives, if there are several positive classes.
+COUNTED_EACH = ", once for each of these classes"
 # Operating points by label: thresholds on the log-odds above which an image counts as
 # a detection.
 Thresholds = Mapping[str, float]
@@ -829,3 +831,17 @@ def metric_title(name: str) -> str:
     # All other names have the form "recall_at/RATE".
     _, _, rate = name.partition("/")
     return f"recall at {float(rate):.0%} FPR"
+
+
+def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Read the operating points in the content of summary.json."""
+    entry = summary.get("operating_point", [])
+    return entry if isinstance(entry, list) else [entry]
+
+
+def describe_point(point: Mapping[str, Any]) -> str:
+    """Describe for which false-positive rate and on which images an operating point was chosen."""
+    images = f"{point['folder']}, {point['negatives']} negatives"
+    if point.get("in_sample"):
+        images = "these very images, in-sample"
+    return f"{point['false_positive_rate']:.1%} FPR on {images}"

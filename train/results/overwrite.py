@@ -5,17 +5,15 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from augment.attack_settings import LINES
 from augment.attacks import adversary
-from augment.attacks.files import LINES
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data import photographs
 from train.results.attack_tables import FIGURE, TABLE, TRANSFERS
 from train.results.page import PAGE
-from train.results.predictions import PREDICTIONS
+from train.results.predictions import CONTACT_SHEET, PREDICTIONS, ROC_FIGURE, ROC_TABLE, SUMMARY
 from train.results.relit import RELIT
-from train.results.scoring import CONTACT_SHEET, SUMMARY
-from train.results.sheet import ROC_FIGURE, ROC_TABLE
 from train.results.store import is_finished
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, FAILURE, METRICS, PUBLISHED, RENDERS, WEIGHTS

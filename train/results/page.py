@@ -18,7 +18,6 @@ from augment.progress import progress_message
 from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.class_names import in_words
 from train.laboratory.kept_aside import can_be_generated
 from train.results import compare, plots, store
 from train.results.epoch_metrics import attack_success
@@ -32,7 +31,7 @@ from train.results.first_screen import (
     is_laboratory,
 )
 from train.results.plots import Picture
-from train.results.scoring import CONTACT_SHEET
+from train.results.predictions import CONTACT_SHEET
 from train.results.sheet import evenly_spaced
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import (
@@ -45,7 +44,7 @@ from train.results.tables import (
 )
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS
-from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, published
+from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
 from train.system.user_errors import user_message
 
 # File name of the page.

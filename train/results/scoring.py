@@ -7,26 +7,46 @@ A label is the name of a positive class. The operating point of a label is a
 threshold on its log-odds. An image above the threshold counts as detected.
 """
 
+import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from augment.network import Label, OperatingPoint
+from augment.losses import log_odds
+from augment.network import (
+    Label,
+    NetworkCall,
+    OperatingPoint,
+    as_class_names,
+    compute_outputs,
+    eval_mode,
+)
 from augment.progress import progress
-from renderer.errors import InputError, require_choice
+from renderer.errors import InputError, require_choice, require_range
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
+from renderer.settings import MAX_SIZE
 from renderer.short_repr import ShortRepr
-from renderer.validation import as_folder
-from train.data.photographs import TABLE, require_outside
+from renderer.validation import as_folder, require_kind, require_whole
+from train.data.photo import Photograph
+from train.data.photographs import (
+    TABLE,
+    find_photographs,
+    load_photographs,
+    require_outside,
+    unsupported_files,
+)
 from train.results.metrics import (
+    COUNTED_EACH,
     FRACTION_METRICS,
     ROC_METRICS,
     TOP_RANKS,
@@ -34,15 +54,16 @@ from train.results.metrics import (
     Outcome,
     Pool,
     Pooled,
+    describe_point,
     metric_title,
     thresholds,
     within_rank,
 )
 from train.results.predictions import (
+    CONTACT_SHEET,
     PREDICTIONS,
-    FolderPredictions,
+    SUMMARY,
     Prediction,
-    Predictor,
     write_predictions,
 )
 from train.results.sheet import contact_sheet, write_roc
@@ -54,17 +75,196 @@ from train.results.tables import (
     format_fraction,
     format_interval,
 )
-from train.settings import GROUPS
+from train.settings import GROUPS, label_names
 
-SUMMARY = "summary.json"
-CONTACT_SHEET = "contact_sheet.png"
+# Number of images for which the model computes logits in one call.
+BATCH = 256
+# A PyTorch module, or a function, that maps images to logits.
+Model = Callable[[torch.Tensor], torch.Tensor]
 # Number of wrong predictions that are listed for the images of each class: the 5 most
 # common ones.
 WRONG_CLASSES = 5
-# Words after the number of negatives, if there are several positive classes.
-COUNTED_EACH = ", once for each of these classes"
 # Metrics that `format_overall` leaves out, because they matter less.
 DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
+
+
+@dataclass(frozen=True, repr=False)
+class FolderPredictions(ShortRepr):
+    """Predictions of a model for all photographs of a folder.
+
+    Attributes:
+        folder: Folder of the photographs.
+        predictions: Predictions of all photographs for the first positive
+            class, then for the next one, and so on. Those for one class are in
+            the order of `images`.
+        images: Pixels of the photographs, uint8 sRGB, shape
+            (N, 3, size, size).
+        labels: Names of the positive classes.
+        unreadable: Paths of the photographs that could not be read.
+        left_out: Paths of the files whose type is not supported.
+        images_hash: Hash of the labels and the photographs. If it is equal for
+            two networks, their metrics can be compared.
+    """
+
+    folder: Path
+    predictions: list[Prediction]
+    images: torch.Tensor
+    labels: list[str]
+    unreadable: list[str]
+    left_out: list[str]
+    images_hash: str
+
+    @property
+    def size(self) -> int:
+        """Pixels per side of the images that the model classified."""
+        return self.images.shape[-1]
+
+    @property
+    def photographs(self) -> list[Prediction]:
+        """One prediction for each photograph: the one for the first positive class."""
+        return self.predictions[: len(self.images)]
+
+
+@dataclass
+class Predictor:
+    """Model that predicts the classes of photographs.
+
+    Attributes:
+        model: Module or function that maps images to logits. The images are
+            float32 sRGB in [0, 1], shape (N, 3, size, size). The logits have
+            the shape (N, len(classes)). A module is called in eval mode. Its
+            mode is restored afterwards.
+        classes: Names of the classes of the model.
+        size: Pixels per side of the images.
+        device: Device of the model.
+    """
+
+    model: Model
+    classes: Sequence[str]
+    size: int = 32
+    device: str | torch.device = "cpu"
+
+    def __post_init__(self) -> None:
+        kinds = "a torch.nn.Module, or a function from images to logits"
+        require_kind("model", self.model, Callable, kinds)
+        self.classes = as_class_names("classes", self.classes)
+        require_whole("size", self.size)
+        require_range("size", self.size, 1, MAX_SIZE)
+
+    def predict(
+        self,
+        folder: Path,
+        label: Label,
+        skip_unreadable: bool = False,
+    ) -> FolderPredictions:
+        """Predict the classes of all photographs of a folder."""
+        folder = as_folder("folder", folder)
+        labels = label_names(label)
+        found = find_photographs(folder, self.classes, label)
+        photographs, images, unreadable = load_photographs(
+            folder,
+            found,
+            self.size,
+            skip_unreadable,
+        )
+        logits = compute_logits(self.model, images, len(self.classes), self.device)
+        return FolderPredictions(
+            folder=folder,
+            predictions=rank_classes(photographs, logits, self.classes, labels),
+            images=images,
+            labels=labels,
+            unreadable=unreadable,
+            left_out=[str(path) for path in unsupported_files(folder)],
+            images_hash=_hash(folder, photographs, labels),
+        )
+
+
+def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
+    """Hash the positive classes and the photographs with SHA-256."""
+    digest = hashlib.sha256("\n".join(labels).encode())
+    for photograph in photographs:
+        content = (folder / photograph.path).read_bytes()
+        digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
+    return digest.hexdigest()
+
+
+def compute_logits(
+    model: Model,
+    images: torch.Tensor,
+    classes: int,
+    device: str | torch.device,
+) -> torch.Tensor:
+    """Compute the logits of a model for images.
+
+    A module is called in eval mode. Its mode is restored afterwards. The images are 8-bit sRGB,
+    and the model gets them in [0, 1]. The logits are on the CPU, and raise InputError if they are
+    not finite.
+    """
+    if classes < 2:
+        raise InputError(
+            "the model has a single class, so its log-odds are infinite: "
+            "evaluate a model with at least two classes",
+        )
+    checked = partial(NetworkCall("model"), model)
+    with eval_mode(model):
+        logits = compute_outputs(checked, images, BATCH, device).cpu()
+    expected = (len(images), classes)
+    if logits.shape != expected:
+        raise InputError(
+            f"the model returned logits of shape {tuple(logits.shape)}, not {expected}: "
+            "evaluate a checkpoint that was trained on these classes",
+        )
+    if not logits.isfinite().all():
+        raise InputError(
+            "the model returned NaN or infinite logits: "
+            "evaluate a checkpoint of a run that converged",
+        )
+    return logits
+
+
+def rank_classes(
+    photographs: Sequence[Photograph],
+    logits: torch.Tensor,
+    classes: Sequence[str],
+    labels: Sequence[str],
+) -> list[Prediction]:
+    """Convert logits to predicted classes with their probabilities, ranks and log-odds.
+
+    All photographs come for the first positive class, then for the next one.
+    """
+    logits = logits.double()
+    probabilities = logits.softmax(dim=1).tolist()
+    # Classes are sorted by logits, because small probabilities may all round to 0.
+    # Column k of `class_at_rank` has the index of the class with rank k + 1.
+    class_at_rank = logits.argsort(dim=1, descending=True, stable=True)
+    # The inverse permutation has the rank of each class, from 1, shape (N, C).
+    ranks = (class_at_rank.argsort(dim=1) + 1).tolist()
+    predicted = class_at_rank[:, 0].tolist()
+
+    predictions = []
+    for label in labels:
+        label_index = classes.index(label)
+        label_odds = log_odds(logits, label_index).tolist()
+        for row, photograph in enumerate(photographs):
+            true_probability = None
+            true_rank = None
+            if photograph.label in classes:
+                true_index = classes.index(photograph.label)
+                true_probability = probabilities[row][true_index]
+                true_rank = ranks[row][true_index]
+            prediction = Prediction(
+                photograph=photograph,
+                label=label,
+                predicted=classes[predicted[row]],
+                probability=probabilities[row][predicted[row]],
+                true_probability=true_probability,
+                true_rank=true_rank,
+                label_probability=probabilities[row][label_index],
+                label_rank=ranks[row][label_index],
+                log_odds=label_odds[row],
+            )
+            predictions.append(prediction)
+    return predictions
 
 
 @dataclass(frozen=True)
@@ -323,20 +523,6 @@ def choose_operating_points(
             )
         )
     return points
-
-
-def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Read the operating points in the content of summary.json."""
-    entry = summary.get("operating_point", [])
-    return entry if isinstance(entry, list) else [entry]
-
-
-def describe_point(point: Mapping[str, Any]) -> str:
-    """Describe for which false-positive rate and on which images an operating point was chosen."""
-    images = f"{point['folder']}, {point['negatives']} negatives"
-    if point.get("in_sample"):
-        images = "these very images, in-sample"
-    return f"{point['false_positive_rate']:.1%} FPR on {images}"
 
 
 def format_scores(scores: Scores) -> str:

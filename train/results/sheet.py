@@ -14,13 +14,11 @@ from PIL import Image, ImageOps
 from renderer.io.files import atomic_write
 from renderer.io.tiles import PAPER, Tile, draw_grid
 from train.results.metrics import RATES, auc_and_recalls, roc_curve
-from train.results.predictions import Prediction, by_label
+from train.results.predictions import ROC_FIGURE, ROC_TABLE, Prediction, by_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROC_TABLE = "roc.csv"
-ROC_FIGURE = "roc.png"
 # Each section of the contact sheet, such as the false positives, shows at most 40
 # photographs.
 MAX_IMAGES = 40

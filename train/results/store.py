@@ -11,22 +11,24 @@ from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from augment.attacks.files import LINES
+from augment.attack_settings import LINES
 from augment.settings import MODES
 from renderer.errors import InputError, single_line
 from train import console, run_config, run_folder
 from train.results.metrics import (
+    COUNTED_EACH,
     METRICS,
     AreaUnderCurve,
     Thresholds,
+    describe_point,
     metric_title,
+    operating_points,
     read_metric,
 )
-from train.results.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
+from train.results.predictions import SUMMARY
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
-from train.saved_networks import load_selected
 from train.settings import UNLABELLED, label_names, published
 
 # Methods are named by numbers instead of by their settings if there are more than this.
@@ -241,6 +243,9 @@ def _read(folder: Path) -> RunSummary | None:
         scores = {path.name: PhotographScores.read(read_json(folder / SUMMARY))}
         return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
+        # This import is here because it imports torch, which other results do not need.
+        from train.saved_networks import load_selected
+
         stored = load_selected(folder)[1].get("scores", {})
         scores = {}
         for key, value in stored.items():

@@ -44,8 +44,7 @@ from train.laboratory.laboratory import is_laboratory, write_laboratory
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
-from train.results.predictions import Model, Predictor
-from train.results.scoring import evaluate_photographs, format_scores
+from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.saved_networks import NORMALIZE_LIGHT, export

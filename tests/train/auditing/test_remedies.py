@@ -16,7 +16,7 @@ from train.auditing.remedies import (
     normalizing,
     recommend,
 )
-from train.data.photographs import Photograph
+from train.data.photo import Photograph
 from train.results.compare import Evaluation, pools_of
 from train.results.metrics import Pooled
 from train.results.predictions import Prediction

@@ -10,7 +10,7 @@ import pytest
 
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
-from train.data.photographs import Photograph
+from train.data.photo import Photograph
 from train.results.compare import (
     class_table,
     format_comparison,

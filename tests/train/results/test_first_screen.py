@@ -9,7 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from train.data.photographs import DESCRIPTION, Photograph
+from train.data.photo import Photograph
+from train.data.photographs import DESCRIPTION
 from train.results.compare import Difference, Evaluation, pools_of
 from train.results.first_screen import (
     NETWORKS,
@@ -20,12 +21,8 @@ from train.results.first_screen import (
     gain_sentence,
 )
 from train.results.metrics import Pooled
-from train.results.predictions import (
-    PREDICTIONS,
-    Prediction,
-    rank_classes,
-    write_predictions,
-)
+from train.results.predictions import PREDICTIONS, Prediction, write_predictions
+from train.results.scoring import rank_classes
 from train.results.store import RunSummary
 
 # Classes of the images, and the classes that two networks predict.

@@ -11,7 +11,7 @@ from scipy.stats import binomtest, mannwhitneyu, ttest_1samp, ttest_ind
 from scipy.stats import t as student_t
 
 from benchmarks.coverage import METRICS, Setup, measure
-from train.data.photographs import Photograph
+from train.data.photo import Photograph
 from train.results.metrics import (
     RATES,
     Jackknife,
@@ -24,7 +24,7 @@ from train.results.metrics import (
     thresholds,
     weighted_means,
 )
-from train.results.predictions import rank_classes
+from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
 
 # The scores have few values, so that ties are common.

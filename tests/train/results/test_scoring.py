@@ -13,21 +13,17 @@ from PIL import Image
 from scipy.special import logsumexp, softmax
 
 from renderer.errors import InputError
-from train.data.photographs import Photograph
+from train.data.photo import Photograph
 from train.results.metrics import AT_THRESHOLD, METRICS
-from train.results.predictions import (
-    Prediction,
-    Predictor,
-    rank_classes,
-    read_predictions,
-    write_predictions,
-)
+from train.results.predictions import Prediction, read_predictions, write_predictions
 from train.results.scoring import (
+    Predictor,
     Scores,
     choose_operating_points,
     evaluate_photographs,
     format_overall,
     format_scores,
+    rank_classes,
     score,
     write,
 )

@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from dataclasses import asdict
 
 import pytest
@@ -95,3 +98,15 @@ def test_a_table_has_no_column_without_a_known_value(tables):
 def test_a_table_shows_the_settings_in_which_runs_differ(tables):
     _, *rows = tables["settings in which the methods differ"]
     assert rows == [["random, epochs=3", "3"], ["random, epochs=9", "9"]]
+
+
+def test_scores_of_a_run_are_read_and_compared_without_torch(tables, tmp_path):
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from train.results.compare import format_comparison, format_short_comparison\n"
+        "from train.results.store import finished_runs\n"
+        "runs = finished_runs([Path(sys.argv[1])])\n"
+        "assert len(format_short_comparison(runs)) < len(format_comparison(runs, []))\n"
+        "assert not {'torch', 'augment.attacks'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", program, tmp_path], check=True, cwd=os.getcwd())
