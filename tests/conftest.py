@@ -13,6 +13,7 @@ import torch
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+from renderer.io.mesh_file import warn_once
 from renderer.visibility.rasterizer import Rasterizer
 
 # Property tests draw the same examples everywhere. With `-m slow`, they draw 30 times as many, and
@@ -81,6 +82,12 @@ def no_network() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(socket.socket, "connect", refuse)
         yield
+
+
+@pytest.fixture(autouse=True)
+def warnings_of_this_test() -> None:
+    """Forget which warnings earlier tests have shown."""
+    warn_once.cache_clear()
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import io
 import re
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
@@ -121,12 +122,21 @@ class MeshFile:
 
     def warn(self, stacklevel: int) -> None:
         """Warn once of all that was ignored or assumed."""
-        clauses = list(self._assumptions)
+        if self._assumptions:
+            clauses = "; ".join(self._assumptions)
+            warnings.warn(f"{self.path}: {clauses}", stacklevel=stacklevel + 1)
         if self._ignored:
-            names = ", ".join(self._ignored)
-            clauses.append(f"ignored, as they change neither shape nor color: {names}")
-        if clauses:
-            warnings.warn(f"{self.path}: {'; '.join(clauses)}", stacklevel=stacklevel + 1)
+            kind = self.path.suffix.lower()
+            names = ", ".join(sorted(self._ignored))
+            text = f"ignored in {kind} files, as they change neither shape nor color: {names}"
+            warn_once(text, stacklevel + 1)
+
+
+# Python's own filter forgets what it has shown whenever a library changes the filters.
+@cache
+def warn_once(text: str, stacklevel: int) -> None:
+    """Warn, but only once in a process, so that the files of a set do not repeat a warning."""
+    warnings.warn(text, stacklevel=stacklevel + 1)
 
 
 def as_utf8(text: bytes) -> bytes:

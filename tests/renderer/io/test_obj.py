@@ -1,6 +1,7 @@
 """Spellings of .obj and .mtl files, and the files that they name."""
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -281,3 +282,14 @@ def test_files_outside_of_the_folder_are_refused(tmp_path, kind, written):
     text = f"mtllib {library}\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
     with pytest.raises(InputError, match="not below"):
         load(folder, text, m=f"newmtl red\nmap_Kd {name}\n")
+
+
+def test_what_all_files_of_a_set_ignore_is_said_once(tmp_path):
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("once")
+        for name, properties in (("a", "Ns 9\nKs 0 0 0"), ("b", "Ks 1 1 1\nNs 2"), ("c", "Ni 1")):
+            (tmp_path / f"{name}.mtl").write_text(f"newmtl m\nKd 1 0 0\n{properties}\n")
+            (tmp_path / f"{name}.obj").write_text(f"mtllib {name}.mtl\n{triangle}")
+            load_mesh(tmp_path / f"{name}.obj")
+    assert [str(item.message).partition("color: ")[2] for item in caught] == ["Ks, Ns", "Ni"]
