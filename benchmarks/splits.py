@@ -41,10 +41,10 @@ from augment.sources import build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.command_settings import LabSettings
+from train.data.cache import content_hash
 from train.data.photographs import TABLE
 from train.data.sets import Split, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
-from train.hashing import content_hash
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
 from train.results.metrics import METRICS, Pooled, metric_title

@@ -15,7 +15,7 @@ from torch import Tensor, cuda
 
 from renderer.errors import InputError, require_file
 from renderer.io.files import atomic_write
-from train.hashing import content_hash
+from train.data.cache import content_hash
 from train.networks import VERSION
 from train.run_folder import LAST, PREVIOUS
 

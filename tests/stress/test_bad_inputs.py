@@ -29,8 +29,8 @@ from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
 from train import checkpoints, run_folder
 from train.command import USER_ERROR
+from train.data.cache import content_hash
 from train.data.sets import load_folder, load_npz
-from train.hashing import content_hash
 
 from .conftest import MAX_SECONDS, RENDERER, TRAINING, run_here
 

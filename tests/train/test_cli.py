@@ -19,7 +19,7 @@ from train import command, console
 from train.command import USER_ERROR, Command
 from train.command_settings import LightSettings
 from train.commands.experiment import logged_to
-from train.hashing import content_hash
+from train.data.cache import content_hash
 from train.help import HelpText
 from train.run_folder import LAST, locked
 from train.system import user_errors as errors
@@ -244,7 +244,7 @@ def test_nothing_is_written_to_a_folder_without_a_run(call, capsys, tmp_path, ov
 @pytest.mark.parametrize(
     ("function", "has_trained"),
     [
-        ("train.training.run.load_data", False),
+        ("train.training.inputs.load_data", False),
         ("train.training.run.evaluate_photographs", True),
     ],
 )

@@ -9,6 +9,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -17,7 +18,6 @@ from torch import Tensor
 
 from renderer.io.files import atomic_write
 from train import console
-from train.hashing import content_hash
 
 # Each file of the cache begins with a SHA-256 checksum, which has 32 bytes.
 CHECKSUM_BYTES = 32
@@ -49,6 +49,36 @@ def source_key(*packages: Path) -> str:
             files.append((name, path))
     sources = [(name, path.read_bytes()) for name, path in sorted(files)]
     return content_hash([torch.__version__, np.__version__, sources])
+
+
+def content_hash(state: Any) -> str:
+    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint.
+
+    It depends on all keys, values, types and shapes.
+    """
+    digest = hashlib.sha256()
+    _update(digest, state)
+    return digest.hexdigest()
+
+
+def _update(digest: Any, value: Any) -> None:
+    """Add a value, with all values inside it, to a hash."""
+    match value:
+        case Tensor():
+            on_cpu = value.detach().cpu().contiguous()
+            digest.update(f"{on_cpu.dtype}{tuple(on_cpu.shape)}".encode())
+            # The bytes of the tensor, without a copy.
+            digest.update(on_cpu.flatten().view(torch.uint8).numpy().data)
+        case Mapping():
+            for key, item in value.items():
+                digest.update(f"{key!r}:".encode())
+                _update(digest, item)
+        case list() | tuple():
+            digest.update(f"[{len(value)}]".encode())
+            for item in value:
+                _update(digest, item)
+        case _:
+            digest.update(f"{value!r};".encode())
 
 
 class TensorCache:

@@ -28,9 +28,8 @@ from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid
 from renderer.visibility.rasterizer import choose
 from train import console
-from train.data.cache import TensorCache, source_key
+from train.data.cache import TensorCache, content_hash, source_key
 from train.data.sets import DataSet, Split
-from train.hashing import content_hash
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)

@@ -15,6 +15,7 @@ from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, single_line
 from train import console
+from train.data.cache import content_hash
 from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
 from train.data.photographs import (
     Photograph,
@@ -24,7 +25,6 @@ from train.data.photographs import (
     load_photographs,
     unsupported_files,
 )
-from train.hashing import content_hash
 
 # Folders with these names hold splits of a data set. All other folders hold the
 # images of a class.

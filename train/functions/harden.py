@@ -41,8 +41,8 @@ from train.settings import (
 )
 from train.system.folders import folder_or_temporary
 from train.system.user_errors import keyed
-from train.training.data import load_data
 from train.training.initial import initial_of
+from train.training.inputs import load_data
 from train.training.run import Run
 
 # Values of some settings of a group, such as "train", by name. None for the defaults.

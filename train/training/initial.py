@@ -22,10 +22,9 @@ from train.class_names import (
     with_class_names,
     with_classes_of_meshes,
 )
-from train.data.cache import TensorCache
+from train.data.cache import TensorCache, content_hash
 from train.data.sets import HELD_OUT, DataSet
 from train.device import MixedPrecision
-from train.hashing import content_hash
 from train.networks import CLASSIFIER, PYTHON, describe
 from train.saved_networks import (
     NORMALIZE_LIGHT,

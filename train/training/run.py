@@ -28,10 +28,9 @@ from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
-from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import choose_labels, find_photographs, require_outside
-from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
+from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import (
     MixedPrecision,
     choose_device,
@@ -48,20 +47,24 @@ from train.results.scoring import Model, Predictor, evaluate_photographs, format
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.saved_networks import NORMALIZE_LIGHT, export
-from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings, label_names
+from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.system.user_errors import keyed, keys_of
-from train.training.data import load_data
+from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.initial import (
     CachedModel,
     Initial,
     ValidationPart,
     choose_validation,
-    load_initial,
 )
-from train.training.interpolation import INTERPOLATION, interpolate, predict
+from train.training.inputs import (
+    build_service,
+    describe_test_images,
+    load_inputs,
+    relabel,
+    require_label,
+)
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
-from train.training.renders import build_service
 from train.training.run_log import RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -93,7 +96,7 @@ class Run:
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
         self.settings = settings
         # Labels of the data become indices into the classes of the network.
-        self.data = _relabel(settings, data, initial)
+        self.data = relabel(settings, data, initial)
         self.folder = folder
         self.command = command
         self.initial = initial
@@ -101,7 +104,7 @@ class Run:
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
         self._initial_predictions: Tensor | None = None
-        _require_label(settings, self.data)
+        require_label(settings, self.data)
         for name, photographs in self.scored_folders.items():
             require_outside(folder / name, photographs)
             with keyed("evaluate.photos"):
@@ -441,51 +444,6 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     return runs
 
 
-def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
-    """Load the data set of a run, and the initial network if the run has one."""
-    initial = load_initial(settings)
-    return load_data(settings, initial), initial
-
-
-def _require_label(settings: ExperimentSettings, data: DataSet) -> None:
-    """Check that the positive class is known, and that photographs can have it as a folder.
-
-    The sub-folders of photographs have names of classes, and no indices.
-    """
-    needs_label = settings.augment.renders or settings.train.ranking_weight > 0
-    if settings.label is None and needs_label:
-        choices = ", ".join(data.classes[:5])
-        raise InputError(
-            f"label is not set: set it to the class of the meshes, one of the {len(data.classes)} "
-            f"classes {choices}{', ...' if len(data.classes) > 5 else ''}",
-            "label",
-        )
-    if settings.label is None or not settings.evaluate.folders:
-        return
-    for label in label_names(settings.label):
-        name = class_name(data.classes, label, "label")
-        if name != label:
-            raise InputError(f"label={label} is an index: give the name, label={name}", "label")
-
-
-def _relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
-    """Convert the labels of the data to indices into the classes of the network.
-
-    A data set and the initial network can have different lists of classes. Without an initial
-    network, the network has the classes of the data.
-    """
-    if not data.labeled:
-        if not (initial and settings.train.distillation_weight):
-            raise InputError(
-                f"data.name={settings.data.name} has no labels, and requires a network to imitate: "
-                "set train.init_from and train.distillation_weight"
-            )
-        return replace(data, classes=initial.classes)
-    if initial and (data.rendered or initial.is_classifier):
-        return relabeled(data, initial.classes, f"data.name={settings.data.name}")
-    return data
-
-
 def build_trainer(
     settings: ExperimentSettings,
     data: DataSet,
@@ -562,19 +520,3 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
         )
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
     return {"name": initial.name, CLASSIFIER: True, **statistics}
-
-
-def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """Describe in words what the test accuracy of a run is measured on.
-
-    An example is "rendered solids of 5 of the network's 1000 classes".
-    """
-    if not data.labeled:
-        return f"the predictions of {settings.train.init_from} for held-out photographs"
-    kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
-    # Classes are counted in the training images, because the test images are not read
-    # before the end of the run.
-    class_count = len(data.train.labels.unique())
-    if class_count == len(data.classes):
-        return kind
-    return f"{kind} of {class_count} of the network's {len(data.classes)} classes"

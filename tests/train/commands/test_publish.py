@@ -13,7 +13,7 @@ from train import checkpoints, run_folder
 from train.command_settings import EvaluateSettings, PublishSettings
 from train.commands.evaluate import evaluate
 from train.commands.publish import publish_network
-from train.hashing import content_hash
+from train.data.cache import content_hash
 from train.results.store import summarize
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected

@@ -20,7 +20,7 @@ from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.run_folder import read_metrics
 from train.saved_networks import load_network, load_run
-from train.training.data import load_data
+from train.training.inputs import load_data
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32

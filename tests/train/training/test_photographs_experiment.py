@@ -21,7 +21,7 @@ from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.saved_networks import load_run
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
-from train.training.interpolation import FACTORS, INTERPOLATION, mix
+from train.training.averages import FACTORS, INTERPOLATION, mix
 from train.training.losses import TrainingLoss
 from train.training.relit_batches import RelitBatches
 

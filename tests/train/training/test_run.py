@@ -27,8 +27,8 @@ from tests.train.helpers import read_markdown
 from train import checkpoints, run_folder
 from train.command_settings import LabSettings
 from train.data import batches
+from train.data.cache import content_hash
 from train.data.sets import Split
-from train.hashing import content_hash
 from train.processes import Interrupted
 from train.results.compare import format_table
 from train.results.overwrite import remove_run
@@ -38,9 +38,8 @@ from train.run_folder import read_metrics
 from train.saved_networks import load_run
 from train.system.user_errors import user_message
 from train.training import loop
-from train.training.data import load_data
 from train.training.initial import choose_validation, load_initial
-from train.training.run import describe_test_images
+from train.training.inputs import describe_test_images, load_data
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 

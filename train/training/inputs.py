@@ -1,5 +1,6 @@
-"""The renders of a training run: their scene, their labels, and the service that renders them."""
+"""The inputs of a run: its data set, and the service that renders its training images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,15 +13,128 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice, require_range
+from renderer.settings import MAX_SIZE
 from train import console
-from train.class_names import require_others
+from train.class_names import class_name, require_others
+from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import find_photographs, load_photographs
-from train.data.sets import DataSet
+from train.data.rendered_shapes import load_shapes
+from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled, relabeled
 from train.device import choose_rasterizer
 from train.processes import main_process_first
-from train.settings import OTHER, ExperimentSettings, label_names
+from train.settings import MIN_SIZE, OTHER, ExperimentSettings, label_names
 from train.system.user_errors import keyed, keys_of
+from train.training.initial import Initial, load_initial
+
+# Pixels per side of the images if neither the setting data.size nor the network with
+# whose weights a run begins gives a size.
+SIZE = 32
+# Values of the setting data.name.
+SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
+
+
+def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
+    """Load the data set of a run, and the initial network if the run has one."""
+    initial = load_initial(settings)
+    return load_data(settings, initial), initial
+
+
+def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> DataSet:
+    """Load the data set of a run.
+
+    Without a size in the settings, the images get the size that `initial` takes.
+    """
+    name = settings.data.name
+    require_choice("data.name", name, SOURCES)
+    console.debug("data: %s", name)
+    with main_process_first(), keyed(**keys_of("data", settings.data)):
+        data = _load(name, settings, initial)
+    with keyed("data.path"):
+        require_range("image size", data.size, MIN_SIZE, MAX_SIZE)
+    return data
+
+
+def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
+    """Load a data set by its name."""
+    data = settings.data
+    if name == "cifar100":
+        return load_cifar100(data.path)
+    if name == "npz":
+        return load_npz(data.path)
+    size = data.size or (initial.size if initial else SIZE)
+    if name == "shapes":
+        cache = TensorCache(cache_folder(settings.train.cache))
+        return load_shapes(
+            train=data.train_per_class,
+            test=data.test_per_class,
+            size=size,
+            seed=data.seed,
+            cache=cache,
+        )
+    load_images = load_folder if name == "folder" else load_unlabeled
+    return load_images(
+        data.path,
+        size=size,
+        test_fraction=data.test_fraction,
+        skip_unreadable=settings.evaluate.skip_unreadable,
+        workers=data.workers,
+    )
+
+
+def require_label(settings: ExperimentSettings, data: DataSet) -> None:
+    """Check that the positive class is known, and that photographs can have it as a folder.
+
+    The sub-folders of photographs have names of classes, and no indices.
+    """
+    needs_label = settings.augment.renders or settings.train.ranking_weight > 0
+    if settings.label is None and needs_label:
+        choices = ", ".join(data.classes[:5])
+        raise InputError(
+            f"label is not set: set it to the class of the meshes, one of the {len(data.classes)} "
+            f"classes {choices}{', ...' if len(data.classes) > 5 else ''}",
+            "label",
+        )
+    if settings.label is None or not settings.evaluate.folders:
+        return
+    for label in label_names(settings.label):
+        name = class_name(data.classes, label, "label")
+        if name != label:
+            raise InputError(f"label={label} is an index: give the name, label={name}", "label")
+
+
+def relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
+    """Convert the labels of the data to indices into the classes of the network.
+
+    A data set and the initial network can have different lists of classes. Without an initial
+    network, the network has the classes of the data.
+    """
+    if not data.labeled:
+        if not (initial and settings.train.distillation_weight):
+            raise InputError(
+                f"data.name={settings.data.name} has no labels, and requires a network to imitate: "
+                "set train.init_from and train.distillation_weight"
+            )
+        return replace(data, classes=initial.classes)
+    if initial and (data.rendered or initial.is_classifier):
+        return relabeled(data, initial.classes, f"data.name={settings.data.name}")
+    return data
+
+
+def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
+    """Describe in words what the test accuracy of a run is measured on.
+
+    An example is "rendered solids of 5 of the network's 1000 classes".
+    """
+    if not data.labeled:
+        return f"the predictions of {settings.train.init_from} for held-out photographs"
+    kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
+    # Classes are counted in the training images, because the test images are not read
+    # before the end of the run.
+    class_count = len(data.train.labels.unique())
+    if class_count == len(data.classes):
+        return kind
+    return f"{kind} of {class_count} of the network's {len(data.classes)} classes"
 
 
 def build_service(
