@@ -177,6 +177,7 @@ TWO_CLASSES = [
         (["scene.light=graze"], "'graze' is not known"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
         (["label=ornage"], "'ornage' is not a class of the model"),
+        (["label=ornage", "augment=none"], "'ornage' is not a class of the model"),
         ([*TWO_CLASSES, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
         (
             [*TWO_CLASSES, "label=[orange,pear,orange]"],

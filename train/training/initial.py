@@ -174,7 +174,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     names = [] if settings.label is None else label_names(settings.label)
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
-    if len(names) == 1:
+    if len(names) == 1 and settings.augment.renders:
         _print_assumed_class(settings.scene.meshes, names[0])
     if not (may_have_index or settings.label_follows_from_meshes):
         return settings

@@ -95,11 +95,9 @@ def require_label(settings: ExperimentSettings, data: DataSet) -> None:
             f"classes {choices}{', ...' if len(data.classes) > 5 else ''}",
             "label",
         )
-    if settings.label is None or not settings.evaluate.folders:
-        return
-    for label in label_names(settings.label):
+    for label in () if settings.label is None else label_names(settings.label):
         name = class_name(data.classes, label, "label")
-        if name != label:
+        if name != label and settings.evaluate.folders:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
 
 
