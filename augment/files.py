@@ -170,7 +170,7 @@ def _read_torchscript(path: Path) -> Content:
         if advice is None:
             advice = (
                 "contains weights without their network: give its architecture and the weights, "
-                f"as in classifier=torchvision:resnet50 weights={path}"
+                f"as in network=torchvision:resnet50 weights={path}"
             )
         raise InputError(f"name={path} cannot be loaded, because it {advice}", "name")
     with warnings.catch_warnings():
@@ -380,8 +380,7 @@ def advice_for_pickles(path: Path) -> str | None:
     """
     if is_torchscript(path):
         return (
-            "is a TorchScript file, which contains its own network: "
-            f"set classifier={path} trust=true"
+            f"is a TorchScript file, which contains its own network: set network={path} trust=true"
         )
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)

@@ -229,14 +229,8 @@ LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
 
 @dataclass
 class SceneSettings(Settings):
-    """Objects, cameras, backgrounds and lighting of a scene."""
+    """Cameras, backgrounds and lighting of a scene."""
 
-    meshes: list[Any] = setting(
-        ["solid:orange:0"],
-        "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
-        "albedo_scale, color, gloss: [roughness, metallic, specular factor] or file, "
-        "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}.",
-    )
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
     views: int | None = setting(
         1, "Number of cameras per mesh, at equal azimuths.", minimum=1, maximum=MAX_VIEWS

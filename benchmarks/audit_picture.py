@@ -1,6 +1,6 @@
 """The picture of an audit page in README.md: the first screen, as Chromium shows it.
 
-    pnb-audit classifier=run:pretrained/none hardened=run:pretrained/best \\
+    pnb-audit network=run:pretrained/none hardened=run:pretrained/best \\
         meshes=solid:orange laboratory=pretrained/laboratory out=audit
     python -m benchmarks.audit_picture audit/report.html --out docs/audit.png
 """

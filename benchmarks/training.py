@@ -84,7 +84,7 @@ def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict
         subprocess.CalledProcessError: If the training fails.
     """
     command = [sys.executable, *launcher, "-m", "train"]
-    command += ["experiment=paper", "train.epochs=2", f"run={run}"]
+    command += ["experiment=paper", "train.epochs=2", f"out={run}"]
     command += overrides
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     epochs = [line for line in read_metrics(run) if "epoch" in line]
@@ -104,7 +104,7 @@ def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, 
         f"data.path={options.data}",
         "data.validation=0.05",
         f"label={options.label}",
-        f"scene.meshes={options.meshes}",
+        f"meshes={options.meshes}",
         f"train.images_per_epoch={options.images}",
         f"train.device={options.device}",
         f"model.depth={options.depth}",
@@ -289,7 +289,7 @@ def measure_speed(options: argparse.Namespace) -> Iterator[Row]:
         certain_run = train_certain_network(runs / "sure", options)
         attacked = [
             "augment=adversarial",
-            f"train.init_from={certain_run}",
+            f"network={certain_run}",
             "train.learning_rate=1e-6",
         ]
         # The first epoch of each variant warms up.
@@ -462,10 +462,10 @@ def measure_moved(options: argparse.Namespace) -> Iterator[Row]:
     settings = train_command.read(
         [
             "experiment=best",
-            "train.init_from=-",
-            "run=-",
+            "network=-",
+            "out=-",
             f"scene.views={options.views}",
-            f"scene.meshes={meshes}",
+            f"meshes={meshes}",
         ]
     )
     scene = build_scene(
@@ -553,7 +553,7 @@ def add_speed_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--meshes",
         default="[solid:orange:0,solid:orange:1]",
-        help="a list, as scene.meshes takes it",
+        help="a list, as meshes takes it",
     )
     add("--label", default="orange", help="class of the meshes")
     add("--images", type=int, default=512, help="number of images in an epoch that is timed")

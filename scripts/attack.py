@@ -31,13 +31,13 @@ main = Command(
         about="Attack a classifier through the lighting, the shape, the colors or the pixels of a "
         "mesh.",
         examples=[
-            "pnb-attack attack=lighting classifier=efficientnet_lite0 scene.meshes=[orange.glb]",
+            "pnb-attack attack=lighting network=efficientnet_lite0 meshes=[orange.glb]",
             "pnb-attack attack=lighting+geometry",
             "pnb-attack reload=runs/attacks/first/0_orange/example_000",
         ],
         common=[
             *(
-                "classifier",
+                "network",
                 "label",
                 "target",
                 "out",
@@ -45,7 +45,7 @@ main = Command(
                 "attack.optimizer",
                 "attack.margin",
             ),
-            *("scene.meshes", "scene.views", "scene.light", "scene.backgrounds"),
+            *("meshes", "scene.views", "scene.light", "scene.backgrounds"),
         ],
         groups=["attack"],
     ),

@@ -12,7 +12,7 @@ main = Command(
         about="Score a network on a folder of photographs.",
         examples=[
             "pnb-evaluate run=pretrained/best photos=photos",
-            "pnb-evaluate classifier=torchvision:resnet18 photos=photos",
+            "pnb-evaluate network=torchvision:resnet18 photos=photos",
         ],
     ),
 )

@@ -18,7 +18,7 @@ Every training run gets the further settings key=value of pnb-train.
 
 These are read from the environment:
   DATA      CIFAR-100, as data=npz reads it
-  MESHES    scene.meshes, a list
+  MESHES    meshes, a list
   PHOTOS    a folder of photographs on which the networks are scored
   EXCLUDE   sources of photographs that averages leave out; default []
   LAB       harden, best: a folder that pnb-lab wrote
@@ -36,7 +36,7 @@ sweep() {
     local experiment=$1
     shift
     "$python" -m train --multirun "experiment=$experiment" data=npz "data.path=$DATA" \
-        label=orange "scene.meshes=$MESHES" "sweep=$runs/$experiment" "$@"
+        label=orange "meshes=$MESHES" "sweep=$runs/$experiment" "$@"
 }
 
 # Print the tables of experiment $1 on the photographs $2 without the sources $3.
@@ -46,7 +46,7 @@ tables() {
     printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
     local list
     list=$(IFS=, && echo "${folders[*]%/}")
-    "$python" -m scripts.compare "runs=[$list]" "photographs=$photographs" "exclude=$exclude" -v
+    "$python" -m scripts.compare "runs=[$list]" "photos=$photographs" "exclude=$exclude" -v
 }
 
 [[ -n ${DATA:-} && -n ${MESHES:-} && -n ${PHOTOS:-} ]] || usage
@@ -54,8 +54,8 @@ python=${PYTHON:-python}
 runs=${RUNS:-runs/reproduce}
 exclude=${EXCLUDE:-[]}
 command=${1:-}
-from_network=("train.init_from=${BASE:-pretrained/none}" seed=0,1,2)
-from_network+=("evaluate.photos={photographs:$PHOTOS,laboratory:${LAB:-}}")
+from_network=("network=${BASE:-pretrained/none}" seed=0,1,2)
+from_network+=("photos={photographs:$PHOTOS,laboratory:${LAB:-}}")
 
 case $command in
 gpu)
@@ -76,7 +76,7 @@ gpu | cpu)
     "$python" -m benchmarks.training speed --data "$DATA" --meshes "$MESHES" --device "$device" \
         --csv "$runs/training_speed.csv"
     for experiment in "${experiments[@]}"; do
-        sweep "$experiment" augment=none,random,adversarial seed=0,1,2,3,4 "evaluate.photos=$PHOTOS" \
+        sweep "$experiment" augment=none,random,adversarial seed=0,1,2,3,4 "photos=$PHOTOS" \
             "train.device=$device" "$@"
         tables "$experiment" photographs "$exclude"
     done

@@ -278,7 +278,7 @@ SMALL = """
 data=shapes
 data.train_per_class=10
 data.test_per_class=4
-data.size=16
+size=16
 model.depth=10
 model.width=1
 train.epochs=2
@@ -306,7 +306,7 @@ augment.examples=null
 augment.regenerate_every=30
 augment.random_light.radius=1.0
 scene.views=1
-scene.meshes=['solid:orange',solid:orange:1]
+meshes=['solid:orange',solid:orange:1]
 train.images_per_epoch=60
 train.ema_decay=0.8
 train.distillation_weight=1.0
@@ -332,8 +332,8 @@ train.label_smoothing=0.1
 train.ema_decay=0.8
 train.flips=alternating
 scene.views=1
-scene.meshes=[solid:orange:0,solid:orange:1]
-scene.hard_negatives=[{mesh:'solid:ball:0',label:apple}]
+meshes=[solid:orange:0,solid:orange:1]
+hard_negatives=[{mesh:'solid:ball:0',label:apple}]
 """,
 }
 # Folders of the runs that were made, by the names of RUNS.
@@ -447,8 +447,8 @@ def test_weights(name, trained, verify):
 
 
 def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_path, verify):
-    initial = f"train.init_from={trained('demonstration')}"
-    arguments = [*SMALL.split(), *RUNS["harden"].split(), initial, f"run={tmp_path}/run"]
+    initial = f"network={trained('demonstration')}"
+    arguments = [*SMALL.split(), *RUNS["harden"].split(), initial, f"out={tmp_path}/run"]
     with monkeypatch.context() as patch:
 
         def save_and_stop(*arguments):
@@ -475,9 +475,9 @@ def trained(call, monkeypatch, tmp_path_factory) -> Callable[[str], Path]:
     def run(name: str) -> Path:
         if name not in FOLDERS:
             folder = tmp_path_factory.mktemp("frozen") / name
-            arguments = [*SMALL.split(), *RUNS[name].split(), f"run={folder}"]
+            arguments = [*SMALL.split(), *RUNS[name].split(), f"out={folder}"]
             if name != "demonstration":
-                arguments.append(f"train.init_from={run('demonstration')}")
+                arguments.append(f"network={run('demonstration')}")
             assert call("train", *arguments) == 0
             FOLDERS[name] = folder
         return FOLDERS[name]

@@ -41,7 +41,7 @@ class TrainCommand(Command):
         """Train one run. With --multirun, Hydra calls this method for each run."""
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:
-            config.run = job.runtime.output_dir
+            config.out = job.runtime.output_dir
             import_function("train.commands.sweep:run_in_sweep")(config)
             return
         if not config.train.resume:
@@ -72,13 +72,13 @@ main = TrainCommand(
         examples=[
             "pnb-train",
             "pnb-train train.epochs=10 scene.views=5",
-            "pnb-train experiment=best train.init_from=runs/first",
+            "pnb-train experiment=best network=runs/first",
             "pnb-train --multirun seed=0,1,2",
         ],
         common=[
-            *("run", "seed", "label", "train.init_from", "train.epochs", "train.batch_size"),
-            *("train.learning_rate", "train.device", "augment.examples", "scene.meshes"),
-            *("scene.views", "evaluate.photos"),
+            *("out", "seed", "label", "network", "train.epochs", "train.batch_size"),
+            *("train.learning_rate", "train.device", "augment.examples", "meshes"),
+            *("scene.views", "photos"),
         ],
         groups=["experiment", "data", "augment", "attack@augment.attack", "launcher"],
     ),

@@ -117,7 +117,7 @@ def require_others(
 
     With several positive classes, an object of one of them may be a hard negative for the others.
     The settings must then give its class as a label. The keys are such as
-    "scene.hard_negatives[0]", and labels such as "", "other" and "other_lemon" are of no class.
+    "hard_negatives[0]", and labels such as "", "other" and "other_lemon" are of no class.
     """
     for key, item in hard_negatives.items():
         is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
@@ -141,32 +141,31 @@ def with_classes_of_meshes(
 
     The label lists each class once, and each mesh in the copy has its class.
     """
-    items = settings.scene.meshes
-    names = classes_of_meshes(items, classes, "scene.meshes")
+    items = settings.meshes
+    names = classes_of_meshes(items, classes, "meshes")
     meshes = []
     for item, name in zip(items, names, strict=True):
         values = item if isinstance(item, dict) else {"mesh": item}
         meshes.append({**values, "label": name})
     negatives = [
-        with_class_name(item, classes, "scene.hard_negatives")
-        for item in settings.scene.hard_negatives
+        with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
     ]
     # A dictionary has each name once, in the order of the meshes.
     labels = list(dict.fromkeys(names))
     return replace(
         settings,
         label=labels[0] if len(labels) == 1 else labels,
-        scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
+        meshes=meshes,
+        hard_negatives=negatives,
     )
 
 
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
     """Replace the indices of classes in the settings of a run by the names of the classes."""
     names = [class_name(classes, name, "label") for name in label_names(settings.label)]
-    meshes = [with_class_name(item, classes, "scene.meshes") for item in settings.scene.meshes]
+    meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
     negatives = [
-        with_class_name(item, classes, "scene.hard_negatives")
-        for item in settings.scene.hard_negatives
+        with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
     ]
     # If `scene.views` is set, the number of examples follows from the number of objects. It
     # is then computed again, because `ExperimentSettings` removes a generated hard negative
@@ -176,5 +175,6 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         settings,
         label=names[0] if len(names) == 1 else names,
         augment=replace(settings.augment, examples=examples),
-        scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
+        meshes=meshes,
+        hard_negatives=negatives,
     )

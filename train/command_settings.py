@@ -26,6 +26,7 @@ from train.settings import (
     GROUPS,
     MAX_IMAGES,
     MAX_SEED,
+    MESHES,
     TIME_FOLDER,
     NetworkSettings,
     class_texts,
@@ -64,7 +65,7 @@ CLASSIFIERS = (
 class ClassifierSettings(Settings):
     """Settings that choose a classifier, and describe it if it is a network of the user."""
 
-    classifier: str | None = setting(None, f"The network: {CLASSIFIERS}.")
+    network: str | None = setting(None, f"The network: {CLASSIFIERS}.")
     weights: str | None = setting_like(NetworkSettings, "weights", None)
     classes: Any = setting_like(NetworkSettings, "classes", None)
     normalization: Any = setting_like(NetworkSettings, "normalization", None)
@@ -95,7 +96,7 @@ class AttackCommandSettings(AttackSettings):
     """Settings of an attack that only the command pnb-attack has."""
 
     relighting: RelightingSettings | None = setting(
-        None, "Attack on the light of a projector on `photographs`, without a mesh."
+        None, "Attack on the light of a projector on `unlabeled`, without a mesh."
     )
     shared: bool = setting(
         False,
@@ -145,10 +146,9 @@ class AttackSceneSettings(SceneSettings):
     )
 
     def __post_init__(self) -> None:
-        """Check all values, and that there is a mesh and a background."""
-        for name in ("meshes", "backgrounds"):
-            if not getattr(self, name):
-                raise InputError(f"{name} must not be empty: name one or more", name)
+        """Check all values, and that there is a background."""
+        if not self.backgrounds:
+            raise InputError("backgrounds must not be empty: name one or more", "backgrounds")
         super().__post_init__()
 
 
@@ -161,14 +161,14 @@ class TransferSettings(Settings):
     counts only images that it classified correctly before the attack.
     """
 
-    classifiers: list[Any] = setting(
+    networks: list[Any] = setting(
         [],
-        "Other networks: as `classifier`, or {classifier, weights}.",
+        "Other networks: as `network`, or {network, weights}.",
     )
     azimuths: list[float] = setting(
         [], "Rotations of the camera about the vertical.", "degrees", minimum=-360, maximum=360
     )
-    meshes: list[Any] = setting([], "Other meshes, as scene.meshes, in the same lighting.")
+    meshes: list[Any] = setting([], "Other meshes, as `meshes`, in the same lighting.")
 
 
 @dataclass
@@ -180,7 +180,7 @@ class AttackExperimentSettings(ClassifierSettings):
     gradient needs the silhouettes of objects.
     """
 
-    classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
+    network: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
     label: Any = setting(
         None,
         "Class of the meshes, by its name or index. null: the class that the name of each mesh's "
@@ -195,7 +195,8 @@ class AttackExperimentSettings(ClassifierSettings):
     )
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
-    photographs: str | None = setting(
+    meshes: list[Any] = setting(["solid:orange:0"], MESHES)
+    unlabeled: str | None = setting(
         None, "Folder of any photographs, which attack=relighting attacks instead of meshes."
     )
     reload: str | None = setting(
@@ -231,16 +232,18 @@ class AttackExperimentSettings(ClassifierSettings):
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
+        if not self.meshes:
+            raise InputError("meshes must not be empty: name one or more", "meshes")
         self._check_photographs()
         self._add_attacked_lights()
 
     def _check_photographs(self) -> None:
         """Check that the attack "relighting" has photographs, and that it is the only attack."""
-        if (self.attack.relighting is None) != (self.photographs is None):
-            given = "photographs" if self.attack.relighting is None else "attack=relighting"
-            other = "attack=relighting" if self.attack.relighting is None else "photographs"
+        if (self.attack.relighting is None) != (self.unlabeled is None):
+            given = "unlabeled" if self.attack.relighting is None else "attack=relighting"
+            other = "attack=relighting" if self.attack.relighting is None else "unlabeled"
             raise InputError(f"{given} is set without {other}: set both, or neither")
-        if self.photographs is not None and (self.attack.parameters or self.reload):
+        if self.unlabeled is not None and (self.attack.parameters or self.reload):
             raise InputError(
                 "attack=relighting attacks photographs alone: "
                 "attack meshes in a command of their own",
@@ -403,7 +406,7 @@ class AuditSettings(ClassifierSettings):
     `ObjectSettings`.
     """
 
-    classifier: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
+    network: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
     hardened: str | None = setting(
         None, "Another classifier to show beside it, such as run:runs/harden."
     )
@@ -413,8 +416,8 @@ class AuditSettings(ClassifierSettings):
         "file tells. Each class has an audit of its own.",
         is_text=True,
     )
-    meshes: list[Any] = setting([], "Meshes of the class. []: only `photographs` are audited.")
-    photographs: str | None = setting(
+    meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
+    unlabeled: str | None = setting(
         None,
         "Folder of any photographs, without labels: which ones keep their predicted class in the "
         "light of a projector? At most 100 times `budget` of them are attacked.",
@@ -447,10 +450,10 @@ class AuditSettings(ClassifierSettings):
     def __post_init__(self) -> None:
         """Check all values, and that there is something to audit: meshes or photographs."""
         super().__post_init__()
-        if not self.meshes and self.photographs is None:
+        if not self.meshes and self.unlabeled is None:
             raise InputError(
                 "meshes is empty: name one mesh or more, as in meshes=[solid:orange], or a folder "
-                "of photographs, as in photographs=FOLDER",
+                "of photographs, as in unlabeled=FOLDER",
                 "meshes",
             )
         for key in ("hard_negatives", "photos", "laboratory"):
@@ -484,9 +487,9 @@ class CompareSettings(Settings):
     )
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=GROUPS)
-    photographs: str = setting(
+    photos: str = setting(
         "photographs",
-        "Sub-folder of the scores to compare: its name in evaluate.photos.",
+        "Sub-folder of the scores to compare: its name in `photos`.",
     )
 
     def __post_init__(self) -> None:
@@ -513,10 +516,9 @@ class EvaluateSettings(ClassifierSettings):
         "is installed.",
     )
     run: str | None = setting(
-        None, "A run folder or a folder below pretrained/, instead of a classifier."
-    )
-    model: str | None = setting(
-        None, "python:package.module:function, if such a function made the run's network."
+        None,
+        "A run folder or a folder below pretrained/. Then `network` is not set, or is the "
+        "python:package.module:function that built the run's network.",
     )
     label: Any = setting(
         None,
@@ -552,16 +554,11 @@ class EvaluateSettings(ClassifierSettings):
         require_calibration(self.false_positive_rate, self.calibrate)
         if self.label is not None:
             label_names(self.label)  # This call only checks the label.
-        if (self.run is None) == (self.classifier is None):
+        builds_run = bool(self.network and self.network.startswith("python:"))
+        if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(
-                f"run={self.run} and classifier={self.classifier} do not name one network: "
-                "give one network by run=FOLDER, or by classifier=NAME"
-            )
-        if self.classifier and self.model:
-            raise InputError(
-                f"model={self.model} is for the network of run=FOLDER: "
-                "leave model out with classifier=NAME, or give run=FOLDER",
-                "model",
+                f"run={self.run} and network={self.network} do not name one network: "
+                "give one network by run=FOLDER, or by network=NAME"
             )
 
 
@@ -675,7 +672,9 @@ class PublishSettings(Settings):
         "for.",
         is_text=True,
     )
-    model: str | None = setting_like(EvaluateSettings, "model", None)
+    network: str | None = setting(
+        None, "python:package.module:function, if such a function built the run's network."
+    )
     trust: bool = setting_like(NetworkSettings, "trust", False)
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 

@@ -31,7 +31,7 @@ CONFIG = "config.yaml"
 PACKAGES = ("torchvision", "numpy")
 # Arguments that are left out when the command line of a run is recorded. Whoever
 # resumes the run gives other values.
-NOT_RECORDED = ("run=", "train.resume=")
+NOT_RECORDED = ("out=", "train.resume=")
 
 
 def read_config(path: Path) -> DictConfig:
@@ -100,8 +100,8 @@ def decisive_settings(settings: Any) -> dict[str, object]:
         nested: Any = OmegaConf.to_container(settings)
     else:
         nested = asdict(settings)
-    nested = _move_paths(nested, str(nested.get("run")), "<run>")
-    # Each key gets a dot at its end, so that "run" does not match "runs".
+    nested = _move_paths(nested, str(nested.get("out")), "<run>")
+    # Each key gets a dot at its end, so that "out" does not match "outer".
     circumstances = tuple(f"{key}." for key in CIRCUMSTANCES)
     decisive = {}
     for key, value in dotted(nested):
@@ -138,19 +138,19 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
 
     Return the configuration, and the recorded command followed by the new arguments.
     """
-    folder = Path(config.run).absolute()
+    folder = Path(config.out).absolute()
     recorded = _read_recorded(folder)
     names = [item.name for item in fields(ExperimentSettings)]
     settings = {name: recorded[name] for name in names if name in recorded}
     # If the folder was moved, the paths of its files have changed. A baseline, which was
     # trained for comparison, lies in a sub-folder of the recorded folder, and was not moved.
-    is_below_recorded = Path(recorded["run"]) in folder.parents
+    is_below_recorded = Path(recorded["out"]) in folder.parents
     if not is_below_recorded:
-        settings = _move_paths(settings, recorded["run"], str(folder))
+        settings = _move_paths(settings, recorded["out"], str(folder))
     merged = OmegaConf.create(settings)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
-        if key != "run":
+        if key != "out":
             value = OmegaConf.select(config, key)
             OmegaConf.update(merged, key, value, merge=False, force_add=True)
     words = [*shlex.split(str(recorded.get("command", ""))), *_recorded(overrides)]
@@ -164,9 +164,9 @@ def _read_recorded(folder: Path) -> dict[str, Any]:
     if (folder / CONFIG).is_file():
         recorded = OmegaConf.to_container(read_config(folder / CONFIG))
     is_training = isinstance(recorded.get("train"), dict)
-    if not is_training or not isinstance(recorded.get("run"), str):
+    if not is_training or not isinstance(recorded.get("out"), str):
         raise InputError(
-            f"run={folder} holds no run to resume: "
+            f"out={folder} holds no run to resume: "
             "give the folder of a training run, or leave train.resume out",
         )
     return recorded
@@ -187,9 +187,9 @@ def require_same_run(
         if finished:
             return False
         is_longer = key == "train.epochs" and isinstance(old, int) and new > old
-        return is_longer or key.startswith("evaluate.")
+        return is_longer or key.startswith(("evaluate.", "photos"))
 
-    return require_same(folder, settings, "run= (sweep=)", is_permitted)
+    return require_same(folder, settings, "out= (sweep=)", is_permitted)
 
 
 def require_same(

@@ -82,7 +82,7 @@ def _find_run(path: Path) -> Path | None:
 def load_chosen(settings: ClassifierSettings) -> Classifier:
     """Load the classifier that the settings of a command choose."""
     return load_network(
-        str(settings.classifier),
+        str(settings.network),
         settings.weights,
         settings.classes,
         settings.size,

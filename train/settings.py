@@ -34,7 +34,7 @@ OTHER = "other"
 # network lacks.
 OTHER_PREFIX = "other_"
 # Sub-folder of a training run with the scores on photographs, if the setting
-# evaluate.photos gives the folder of photographs no name.
+# photos gives the folder of photographs no name.
 PHOTOGRAPHS = "photographs"
 # Sub-folder of a training run with test renders, which the training does not use.
 KEPT_ASIDE = "kept_aside"
@@ -45,7 +45,7 @@ KEPT_ASIDE_PATTERNS = 5
 # Sub-folder for a first training on photographs, which the setting `photographs_first`
 # asks for.
 PHOTOGRAPHS_FIRST = "photographs_first"
-# Names that the setting evaluate.photos must not give to folders of photographs,
+# Names that the setting photos must not give to folders of photographs,
 # because a training run has other sub-folders or scores of these names.
 RESERVED = ("renders", "test", "before", KEPT_ASIDE, PHOTOGRAPHS_FIRST)
 # Default of model.name.
@@ -62,11 +62,11 @@ NEEDS_INITIAL_NETWORK = (
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
 # Value of data.name for photographs without classes.
-UNLABELLED = "unlabelled"
+UNLABELED = "unlabeled"
 # Choices of data.name.
-DATA_SETS = ("cifar100", "npz", "folder", UNLABELLED, "shapes")
+DATA_SETS = ("cifar100", "npz", "folder", UNLABELED, "shapes")
 # Values of data.name that need data.path.
-DATA_SETS_WITH_PATH = ("npz", "folder", UNLABELLED)
+DATA_SETS_WITH_PATH = ("npz", "folder")
 # Choices of train.schedule.
 SCHEDULES = ("step", "cosine", "one_cycle")
 # Choices of train.flips.
@@ -89,6 +89,12 @@ MIN_SIZE = 5
 MAX_IMAGES = 10**6
 MAX_WORKERS = 1024
 MAX_SEED = 2**63 - 1
+# Explanation of a list of meshes in settings.
+MESHES = (
+    "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
+    "albedo_scale, color, gloss: [roughness, metallic, specular factor] or file, "
+    "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}."
+)
 # Default name of an output folder: the time at which the command starts. Hydra
 # replaces "${now:...}".
 TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
@@ -96,7 +102,7 @@ TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
 # Settings and recorded facts that do not change the result of a training run, such as
 # its folder and its device. Two runs that differ only in these settings are equal.
 CIRCUMSTANCES = (
-    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
+    *("sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
     *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
@@ -112,11 +118,11 @@ INPUTS = (
         "augment.vary.camera.slides",
         "scene.projector.pattern",
         "scene.lamps.start",
-        "train.init_from",
+        "scene.backgrounds",
+        "scene.light",
     ),
-    *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
-    *("classifier", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
-    "photographs",
+    *("network", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
+    "unlabeled",
 )
 
 
@@ -128,15 +134,9 @@ class DataSettings(Settings):
     validation: float | None = setting(
         None,
         "Fraction of the training images of each class to validate on. "
-        "null: what train.init_from left out, otherwise 0.1.",
+        "null: what `network` left out, otherwise 0.1.",
     )
     path: str = setting("", "File or folder of the data.", may_be_empty=True)
-    size: int | None = setting(
-        None,
-        "Pixels per side. null: the size of train.init_from, otherwise 32.",
-        minimum=MIN_SIZE,
-        maximum=MAX_SIZE,
-    )
     test_fraction: float = setting(
         0.1,
         "Fraction of the images to test on, if the folder has no sub-folder `test`: "
@@ -173,12 +173,8 @@ class DataSettings(Settings):
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """Settings of the scene of training renders.
+    """Settings of the scene of training renders. The defaults are those of the paper."""
 
-    The defaults are those of the paper: two meshes in front of five backgrounds.
-    """
-
-    meshes: list[Any] = setting_like(SceneSettings, "meshes", ["solid:orange:0", "solid:orange:1"])
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
     views: int | None = setting(
         None,
@@ -186,21 +182,6 @@ class TrainingSceneSettings(SceneSettings):
         minimum=1,
         maximum=MAX_VIEWS,
     )
-    hard_negatives: list[Any] = setting(
-        [],
-        "Objects of other classes than the label, or of one of several labels. "
-        "A mapping {mesh, label} names its class. A file alone is of no class.",
-    )
-
-    @property
-    def objects(self) -> int:
-        """Number of objects to render: meshes of positive classes, and hard negatives.
-
-        Hard negatives alone are not rendered: without a mesh, the number is 0.
-        """
-        if not self.meshes:
-            return 0
-        return len(self.meshes) + len(self.hard_negatives)
 
 
 @dataclass
@@ -227,12 +208,6 @@ class ModelSettings(Settings):
 class TrainSettings(Settings):
     """Settings of the training of the network. The defaults are those of the paper."""
 
-    init_from: str | None = setting(
-        None,
-        "Network with whose weights the training starts: a run folder, a network's file, or a "
-        "classifier: efficientnet_lite0, torchvision:NAME, timm:NAME or "
-        "python:package.module:function. null: random weights.",
-    )
     epochs: int = setting(
         150,
         "Number of passes over the training images.",
@@ -315,21 +290,21 @@ class TrainSettings(Settings):
     )
     distillation_weight: float = setting(
         0.0,
-        "Weight of the divergence from the predictions of the network train.init_from. "
+        "Weight of the divergence from the predictions of `network`. "
         "On renders, this counts classes other than `label`.",
         minimum=0,
         maximum=MAX_SCALE,
     )
     consistency_weight: float = setting(
         0.0,
-        "Weight of the divergence of the predictions for augmented images from those of the "
-        "network train.init_from for the same images without augmentation.",
+        "Weight of the divergence of the predictions for augmented images from those of "
+        "`network` for the same images without augmentation.",
         minimum=0,
         maximum=MAX_SCALE,
     )
     interpolate: bool = setting(
         False,
-        "At the end, interpolate between the weights of train.init_from and the trained weights, "
+        "At the end, interpolate between the weights of `network` and the trained weights, "
         "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
     )
     ema_decay: float = setting(
@@ -340,12 +315,12 @@ class TrainSettings(Settings):
     )
     soup: bool = setting(
         False,
-        "Start each epoch with train.init_from again, and keep the mean of the networks of all "
+        "Start each epoch with `network` again, and keep the mean of the networks of all "
         "epochs (a model soup).",
     )
     eval_mode: bool | None = setting(
         None,
-        "Train in evaluation mode: with the running statistics of train.init_from and without "
+        "Train in evaluation mode: with the running statistics of `network` and without "
         "dropout. null: only a third-party classifier.",
     )
     precision: str = setting(
@@ -379,7 +354,7 @@ class TrainSettings(Settings):
     )
     resume: bool = setting(
         False,
-        "Resume from the last checkpoint in `run`. run=FOLDER train.resume=true is enough.",
+        "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough.",
     )
     cache: str | None = setting(
         "auto",
@@ -388,21 +363,8 @@ class TrainSettings(Settings):
     )
 
     def __post_init__(self) -> None:
-        """Check all values, and that settings that need an initial network have one."""
-        if self.init_from == "":
-            raise InputError(
-                "init_from is not set: give a run folder, or torchvision:NAME with weights=FILE",
-                "init_from",
-            )
+        """Check all values, and that attacked images have a loss."""
         super().__post_init__()
-        for name in NEEDS_INITIAL_NETWORK:
-            value = getattr(self, name)
-            if value and not self.init_from:
-                raise InputError(
-                    f"{name}={value} needs a network to begin with: set init_from to it, "
-                    f"or leave {name} out",
-                    name,
-                )
         if self.relight_steps and not self.consistency_weight:
             raise InputError(
                 f"relight_steps={self.relight_steps} attacks the images of the consistency loss, "
@@ -413,18 +375,11 @@ class TrainSettings(Settings):
 
 @dataclass
 class EvaluationSettings(Settings):
-    """Settings of the photographs and renders on which the trained network is scored.
+    """Settings of the images on which the trained network is scored, besides `photos`.
 
     The accuracy on the test set of the data is always computed.
     """
 
-    # The type is str | dict[str, str] | None, which OmegaConf does not support.
-    photos: Any = setting(
-        None,
-        "Folder of photographs: a folder per class, or images of `label`. "
-        "Several folders: {photographs: A, lab: B}. null: none.",
-        is_text=True,
-    )
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     laboratory_setups: int = setting(
         0,
@@ -436,7 +391,7 @@ class EvaluationSettings(Settings):
     )
 
     def __post_init__(self) -> None:
-        """Check all values, and that each folder of photographs can have a sub-folder of scores."""
+        """Check all values."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
             raise InputError(
@@ -445,32 +400,6 @@ class EvaluationSettings(Settings):
                 f"set it to {KEPT_ASIDE_PATTERNS} or {2 * KEPT_ASIDE_PATTERNS}, for example",
                 "laboratory_setups",
             )
-        photos = self.photos
-        if isinstance(photos, dict):
-            is_valid = all(isinstance(folder, str) for folder in photos.values())
-        else:
-            is_valid = photos is None or isinstance(photos, str)
-        if not is_valid:
-            raise InputError(
-                f"photos={photos} must be a folder, or a mapping of names to folders",
-                "photos",
-            )
-        for name in self.folders:
-            # Each name becomes the name of a sub-folder of the run.
-            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                raise InputError(
-                    f"photos has the name {name!r} for a folder: choose a name of letters, "
-                    f"digits, _ and - that is not one of {', '.join(RESERVED)}",
-                    "photos",
-                )
-
-    @property
-    def folders(self) -> dict[str, Path]:
-        """Folders of photographs, each with the name of the sub-folder of its scores as a key."""
-        named = self.photos if isinstance(self.photos, dict) else {}
-        if isinstance(self.photos, str):
-            named = {PHOTOGRAPHS: self.photos}
-        return {str(name): published(Path(folder)) for name, folder in named.items()}
 
 
 @dataclass(kw_only=True)
@@ -538,7 +467,35 @@ def class_texts(classes: Any) -> Any:
 class ExperimentSettings(NetworkSettings):
     """Settings of one training run: all settings of the command pnb-train."""
 
-    run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
+    network: str | None = setting(
+        None,
+        "Network with whose weights the training starts: a run folder, a network's file, or a "
+        "classifier: efficientnet_lite0, torchvision:NAME, timm:NAME or "
+        "python:package.module:function. null: random weights.",
+    )
+    size: int | None = setting(
+        None,
+        "Pixels per side. null: the size of `network`, otherwise 32.",
+        minimum=MIN_SIZE,
+        maximum=MAX_SIZE,
+    )
+    meshes: list[Any] = setting(["solid:orange:0", "solid:orange:1"], MESHES)
+    hard_negatives: list[Any] = setting(
+        [],
+        "Objects of other classes than the label, or of one of several labels. "
+        "A mapping {mesh, label} names its class. A file alone is of no class.",
+    )
+    # The type is str | dict[str, str] | None, which OmegaConf does not support.
+    photos: Any = setting(
+        None,
+        "Folder of photographs to score: a folder per class, or images of `label`. "
+        "Several folders: {photographs: A, lab: B}. null: none.",
+        is_text=True,
+    )
+    unlabeled: str | None = setting(
+        None, "Folder of any photographs to train on, without labels, for data=unlabeled."
+    )
+    out: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
     sweep: str = setting(
         "runs/sweep",
         "Folder of the runs of a --multirun, each named by its overrides.",
@@ -548,7 +505,7 @@ class ExperimentSettings(NetworkSettings):
     label: Any = setting(  # str | list[str], for which OmegaConf has no type
         None,
         "Positive class: the class of the meshes, whose recall and false positives are measured. "
-        "Or several: [orange, apple]. null: the classes that scene.meshes name or, without meshes, "
+        "Or several: [orange, apple]. null: the classes that meshes name or, without meshes, "
         "each class that has a sub-folder of photographs.",
         is_text=True,
     )
@@ -558,7 +515,7 @@ class ExperimentSettings(NetworkSettings):
     photographs_first: bool = setting(
         False,
         "First train with experiment=photographs, in the sub-folder `photographs`, and begin with "
-        "its result instead of train.init_from.",
+        "its result instead of `network`.",
     )
     data: DataSettings = setting(DataSettings, "The data set.")
     augment: AugmentationSettings = setting(
@@ -582,7 +539,14 @@ class ExperimentSettings(NetworkSettings):
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
+        if self.network == "":
+            raise InputError(
+                "network is not set: give a run folder, or torchvision:NAME with weights=FILE",
+                "network",
+            )
         super().__post_init__()
+        self._check_initial_network()
+        self._check_photographs()
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         if renders_meshes:
             self._check_silhouettes()
@@ -593,6 +557,40 @@ class ExperimentSettings(NetworkSettings):
         self._remove_generated_positives()
         if renders_meshes:
             self._count_examples()
+
+    def _check_initial_network(self) -> None:
+        """Check that settings of the training that need an initial network have one."""
+        for name in NEEDS_INITIAL_NETWORK:
+            value = getattr(self.train, name)
+            if value and not self.network:
+                raise InputError(
+                    f"train.{name}={value} needs a network to begin with: set network to it, "
+                    f"or leave train.{name} out",
+                    f"train.{name}",
+                )
+
+    def _check_photographs(self) -> None:
+        """Check the folders of photographs: each scored one can have a sub-folder of scores."""
+        if self.data.name == UNLABELED and not self.unlabeled:
+            raise InputError("unlabeled is not set: give a folder of photographs", "unlabeled")
+        photos = self.photos
+        if isinstance(photos, dict):
+            is_valid = all(isinstance(folder, str) for folder in photos.values())
+        else:
+            is_valid = photos is None or isinstance(photos, str)
+        if not is_valid:
+            raise InputError(
+                f"photos={photos} must be a folder, or a mapping of names to folders",
+                "photos",
+            )
+        for name in self.scored_folders:
+            # Each name becomes the name of a sub-folder of the run.
+            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
+                raise InputError(
+                    f"photos has the name {name!r} for a folder: choose a name of letters, "
+                    f"digits, _ and - that is not one of {', '.join(RESERVED)}",
+                    "photos",
+                )
 
     def _check_silhouettes(self) -> None:
         """Raise InputError if an attack on the pose lacks the gradient at silhouettes."""
@@ -605,7 +603,7 @@ class ExperimentSettings(NetworkSettings):
     def _count_examples(self) -> None:
         """Set the number of renders: one for each object, view and background."""
         backgrounds = len(self.scene.backgrounds)
-        self.augment.examples = self.views * self.scene.objects * backgrounds
+        self.augment.examples = self.views * self.object_count * backgrounds
         factors = "meshes × views × backgrounds"
         require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
 
@@ -617,23 +615,39 @@ class ExperimentSettings(NetworkSettings):
         """
         positives = {simplified(name) for name in label_names(self.label)}
         kept = []
-        for item in self.scene.hard_negatives:
+        for item in self.hard_negatives:
             is_positive = isinstance(item, str) and simplified(solid_name(item)) in positives
             if not is_positive:
                 kept.append(item)
-        self.scene.hard_negatives = kept
+        self.hard_negatives = kept
 
     @property
     def label_follows_from_meshes(self) -> bool:
         """Whether a label that is not set is the list of the classes of the meshes."""
-        has_meshes = bool(self.scene.meshes) and self.augment.mode != "folder"
+        has_meshes = bool(self.meshes) and self.augment.mode != "folder"
         return self.label is None and has_meshes and self.shows_positives
 
     @property
     def shows_positives(self) -> bool:
         """Whether the run trains on objects of the positive classes, or scores images of them."""
-        is_scored = bool(self.evaluate.photos) or self.evaluate.laboratory_setups > 0
+        is_scored = bool(self.photos) or self.evaluate.laboratory_setups > 0
         return self.augment.renders or self.train.ranking_weight > 0 or is_scored
+
+    @property
+    def scored_folders(self) -> dict[str, Path]:
+        """Folders of photographs, each with the name of the sub-folder of its scores as a key."""
+        named = self.photos if isinstance(self.photos, dict) else {}
+        if isinstance(self.photos, str):
+            named = {PHOTOGRAPHS: self.photos}
+        return {str(name): published(Path(folder)) for name, folder in named.items()}
+
+    @property
+    def object_count(self) -> int:
+        """Number of objects to render: meshes of positive classes, and hard negatives.
+
+        Hard negatives alone are not rendered: without a mesh, the number is 0.
+        """
+        return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
 
     @property
     def views(self) -> int:
@@ -645,22 +659,22 @@ class ExperimentSettings(NetworkSettings):
         scene = self.scene
         backgrounds = len(scene.backgrounds)
         try:
-            return count_views(self.augment.examples, scene.objects, backgrounds, scene.views)
+            return count_views(self.augment.examples, self.object_count, backgrounds, scene.views)
         except InputError as error:
             key = "augment" if error.argument == "examples" else "scene"
             raise error.within(key, [error.argument]) from None
 
     @property
-    def hard_negatives(self) -> dict[str, ObjectSettings]:
-        """Settings of each hard negative by its key, such as "scene.hard_negatives[0]".
+    def negative_objects(self) -> dict[str, ObjectSettings]:
+        """Settings of each hard negative by its key, such as "hard_negatives[0]".
 
         A hard negative that names no class gets the class "other".
         """
-        return read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
+        return read_objects(self.hard_negatives, OTHER, "hard_negatives")
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """Settings of each mesh and each hard negative by its key, such as "scene.meshes[0]".
+        """Settings of each mesh and each hard negative by its key, such as "meshes[0]".
 
         A mesh that names no class is of the positive class if there is one.
         With several positive classes, it is of the class that the name of its
@@ -668,8 +682,8 @@ class ExperimentSettings(NetworkSettings):
         """
         labels = label_names(self.label)
         default_label = labels[0] if len(labels) == 1 else ""
-        meshes = read_objects(self.scene.meshes, default_label, "scene.meshes")
-        objects = meshes | self.hard_negatives
+        meshes = read_objects(self.meshes, default_label, "meshes")
+        objects = meshes | self.negative_objects
         for key, item in objects.items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
@@ -681,7 +695,7 @@ class ExperimentSettings(NetworkSettings):
         if missing and len(labels) > 1:
             raise InputError(
                 f"label={self.label} has no mesh of {min(missing)}: "
-                "add a mesh of this class to scene.meshes",
+                "add a mesh of this class to meshes",
                 "label",
             )
         return objects

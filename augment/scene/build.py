@@ -39,7 +39,7 @@ LABEL = "the name of a class, or its index"
 MeshSource = str | Path | Mesh
 # Names of the fields of `SceneSettings` and `RendererSettings` that `build_scene` takes as keyword
 # arguments.
-SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
+SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"views"}
 RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 
@@ -76,7 +76,7 @@ def build_scene(
         shared: Whether all views of an object in front of a background are one
             example, for which an attack finds one lighting, shape and color. By
             default, each view is an example of its own.
-        scene: Further settings of the scene. Its `meshes` and `views` are
+        scene: Further settings of the scene. Its `views` are
             ignored.
         renderer: Settings of the renderer.
         attack: Settings of an attack that will follow. The attack may make

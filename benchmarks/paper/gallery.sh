@@ -30,8 +30,8 @@ picture() {
 }
 
 mkdir -p "${OUT:?name the folder of the pictures}"
-lamp=('scene.meshes=["solid:lamp:0"]' 'label=table lamp')
-orange=("scene.meshes=[{mesh: ${ORANGE:?name a mesh of an orange}, albedo_scale: 3}]" label=orange)
+lamp=('meshes=["solid:lamp:0"]' 'label=table lamp')
+orange=("meshes=[{mesh: ${ORANGE:?name a mesh of an orange}, albedo_scale: 3}]" label=orange)
 sky=(attack=skylight attack.skylight.step_size=0.2)
 evening=(attack.skylight.zenith=75 attack.skylight.turbidity=8 'scene.backgrounds=[0.0]')
 shape=(attack=geometry scene.vertices=10000)

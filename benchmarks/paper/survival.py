@@ -96,10 +96,10 @@ def attack_example(
     name, _, weights = options.classifier.partition("=")
     overrides = [
         f"attack={attack}",
-        f"scene.meshes=[{{{','.join(given_fields)}}}]",
+        f"meshes=[{{{','.join(given_fields)}}}]",
         f"scene.azimuth={360 * example / options.examples}",
         f"seed={options.seed + example}",
-        f"classifier={name}",
+        f"network={name}",
         "attack.verify=reload+mitsuba",
     ]
     if weights:

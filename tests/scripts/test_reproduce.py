@@ -97,10 +97,10 @@ def test_every_training_has_valid_settings(tmp_path, command, trainings):
         settings = train_command.read([first_of_sweep(word) for word in call[3:]])
         assert settings.data.path == "cifar100.npz"
         assert settings.train.checkpoint_every == 5
-        assert settings.scene.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}]
+        assert settings.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}]
         is_from_network = command in ("harden", "best")
         folders = ["photographs", "laboratory"] if is_from_network else ["photographs"]
-        assert [*settings.evaluate.folders] == folders
+        assert [*settings.scored_folders] == folders
 
 
 def first_of_sweep(word: str) -> str:
@@ -133,4 +133,4 @@ def test_the_tables_compare_all_runs_of_an_experiment(tmp_path, command, tables)
     for call, (experiment, images) in zip(calls, tables, strict=True):
         runs = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
         assert call[2] == f"runs=[{','.join(runs)}]"
-        assert call[3] == f"photographs={images}"
+        assert call[3] == f"photos={images}"

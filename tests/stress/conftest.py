@@ -30,7 +30,7 @@ TRAINING = (
     "data.path=data.npz",
     "data.validation=0.3",
     "compare=[]",
-    "evaluate.photos=photographs",
+    "photos=photographs",
     "model.depth=10",
     "model.width=1",
     "model.dropout=0.3",
@@ -42,7 +42,7 @@ TRAINING = (
     "train.cache=null",
     "augment.examples=4",
     "augment.attack.max_steps=2",
-    "scene.meshes=[mesh.obj]",
+    "meshes=[mesh.obj]",
     "scene.backgrounds=[0.2,0.8]",
     *RENDERER,
 )
@@ -173,6 +173,6 @@ def corpus(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("corpus")
     write_data(folder)
     write_scene_files(folder)
-    assert run_here("train", "run=finished", "train.epochs=2", *TRAINING, folder=folder) == 0
+    assert run_here("train", "out=finished", "train.epochs=2", *TRAINING, folder=folder) == 0
     assert run_here("publish", "run=finished", "out=published", folder=folder) == 0
     return folder

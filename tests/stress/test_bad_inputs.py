@@ -70,8 +70,8 @@ EVALUATE_RUN = (*EVALUATE, "run=finished")
 EVALUATE_PUBLISHED = (*EVALUATE, "run=published")
 ATTACK = (
     "attack",
-    "classifier=run:finished",
-    "scene.meshes=[mesh.obj]",
+    "network=run:finished",
+    "meshes=[mesh.obj]",
     "out=out",
     "device=cpu",
     "attack.max_steps=1",
@@ -81,7 +81,7 @@ ATTACK = (
 )
 LAMPS = "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"
 PROJECTOR = "scene.projector={pixels: 4, pattern: pattern.png}"
-RESUME = ("train", "run=finished", *TRAINING, "train.epochs=3", "train.resume=true")
+RESUME = ("train", "out=finished", *TRAINING, "train.epochs=3", "train.resume=true")
 COMPARE = ("compare", "runs=[finished]")
 # Commands by the files that they read.
 COMMANDS: dict[str, tuple[str, ...]] = {

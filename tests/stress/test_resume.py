@@ -31,7 +31,7 @@ TERMINATED_AND_KILLED = (signal.SIGTERM, signal.SIGKILL)  # Batch systems do thi
 
 def start(data: Path, run: Path, epoch: int) -> Process:
     """Start or continue a run in a process, and wait until it has done some epochs."""
-    process = start_command("-m", "train", f"run={run}", *COMMAND, folder=data)
+    process = start_command("-m", "train", f"out={run}", *COMMAND, folder=data)
     deadline = time.monotonic() + MAX_SECONDS
     while epochs_done(run) < epoch and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -72,7 +72,7 @@ def contents(run: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def uninterrupted(data, tmp_path_factory) -> dict[str, Any]:
     run = tmp_path_factory.mktemp("runs") / "uninterrupted"
-    assert run_here("train", f"run={run}", *COMMAND, folder=data) == 0
+    assert run_here("train", f"out={run}", *COMMAND, folder=data) == 0
     result = contents(run)
     assert len(result[METRICS]) == EPOCHS + 1
     assert result["half-written"] == []
@@ -85,7 +85,7 @@ def assert_resumed(data, uninterrupted, capfd) -> Callable[[Path], str]:
 
     def resumed(run: Path) -> str:
         capfd.readouterr()
-        assert run_here("train", f"run={run}", *COMMAND, folder=data) == 0
+        assert run_here("train", f"out={run}", *COMMAND, folder=data) == 0
         result = contents(run)
         names = result | uninterrupted
         different = [name for name in names if result.get(name) != uninterrupted.get(name)]

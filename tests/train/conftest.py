@@ -27,7 +27,7 @@ TINY = [
     "train.precision=float32",
     "train.device=cpu",
     "train.threads=1",
-    "evaluate.photos=null",
+    "photos=null",
     "seed=7",  # The attack moves the lights in every epoch with this seed.
     "augment.examples=4",
     "augment.warm_start=true",
@@ -80,7 +80,7 @@ def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
 def finished(tiny, photos, tmp_path_factory) -> Path:
     """Complete an adversarial run that is scored on photographs, and return its folder."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
-    settings = tiny(f"evaluate.photos={photos}")
+    settings = tiny(f"photos={photos}")
     completed_run(settings, folder)
     return folder
 

@@ -14,10 +14,9 @@ CLASSES = ["banana", "coffee mug", "lemon", "orange"]
 
 
 def settings(meshes: list, hard_negatives: list | None = None) -> ExperimentSettings:
-    overrides = ["experiment=classifier", "train.init_from=a", "data.path=b", "run=c"]
+    overrides = ["experiment=classifier", "network=a", "unlabeled=b", "out=c"]
     composed = train_command.read(overrides)
-    scene = replace(composed.scene, meshes=meshes, hard_negatives=hard_negatives or [])
-    return replace(composed, scene=scene)
+    return replace(composed, meshes=meshes, hard_negatives=hard_negatives or [])
 
 
 def test_label_lists_the_classes_of_labels_files_and_solids_once():
@@ -31,7 +30,7 @@ def test_label_lists_the_classes_of_labels_files_and_solids_once():
     assert named.label == ["banana", "coffee mug", "lemon"]
     labels = [item.label for item in named.objects.values()]
     assert labels == ["banana", "coffee mug", "banana", "lemon"]
-    assert named.scene.meshes[0]["albedo_scale"] == 2.0
+    assert named.meshes[0]["albedo_scale"] == 2.0
 
 
 def test_label_of_one_class_is_its_name():
@@ -42,7 +41,7 @@ def test_label_of_one_class_is_its_name():
 def test_generated_hard_negatives_of_these_classes_are_left_out():
     negatives = ["solid:fruit", "solid:lemon", {"mesh": "solid:orange", "label": 3}]
     named = class_names.with_classes_of_meshes(settings(["lemon.glb"], negatives), CLASSES)
-    assert named.scene.hard_negatives == [
+    assert named.hard_negatives == [
         "solid:fruit",
         {"mesh": "solid:orange", "label": "orange"},
     ]
@@ -55,8 +54,8 @@ def test_generated_hard_negatives_of_these_classes_are_left_out():
         ("bananas.glb", "such as banana"),
         ("absent.glb", "absent.glb does not exist"),
         ("solid:ornage", "solid:ornage is not a solid: choose one, such as orange"),
-        ({"mesh": "a.glb", "label": 4}, "scene.meshes[0].label: the label 4 is not a class"),
-        ({"mesh": "a.glb", "label": "mug"}, "scene.meshes[0].label: 'mug' is not a class"),
+        ({"mesh": "a.glb", "label": 4}, "meshes[0].label: the label 4 is not a class"),
+        ({"mesh": "a.glb", "label": "mug"}, "meshes[0].label: 'mug' is not a class"),
     ],
 )
 def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message, monkeypatch, tmp_path):

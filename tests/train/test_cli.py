@@ -61,7 +61,7 @@ def modification_times(folder: Path) -> dict[Path, int]:
 class TestTrainingOfTwoArms:
     @pytest.fixture
     def overrides(self, two_methods, photos) -> list[str]:
-        return ["run=here", *two_methods, f"evaluate.photos={photos}"]
+        return ["out=here", *two_methods, f"photos={photos}"]
 
     @pytest.fixture
     def printed(self, call, capsys, overrides):
@@ -102,15 +102,15 @@ class TestTrainingOfTwoArms:
     ("arguments", "start"),
     [
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist"),
-        (["run=file/run"], "run=PATH/file/run cannot be written to"),
-        (["run=odd"], "PATH/odd/train.log cannot be read or written"),
+        (["out=file/run"], "out=PATH/file/run cannot be written to"),
+        (["out=odd"], "PATH/odd/train.log cannot be read or written"),
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["compare=[non]"], "compare: "),
-        (["train.init_from=none"], "train.init_from=none"),
-        (["train.init_from=timm:"], "train.init_from=timm: "),
+        (["network=none"], "network=none"),
+        (["network=timm:"], "network=timm: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs the command sbatch"),
         (["--multirun", "seed=0,0"], "the sweep has two runs with the same settings"),
-        (["--multirun", "run=a", "seed=0,1"], "run="),
+        (["--multirun", "out=a", "seed=0,1"], "out="),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
@@ -133,7 +133,7 @@ def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
     tmp_path,
     two_methods,
 ):
-    assert call("train", "run=here", *two_methods, *SMALL, "scene.views=3") == USER_ERROR
+    assert call("train", "out=here", *two_methods, *SMALL, "scene.views=3") == USER_ERROR
     assert "augment.examples=4" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
 
@@ -141,9 +141,9 @@ def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
 @pytest.mark.parametrize("busy", ["here", "here/none"])
 def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_methods, busy):
     with locked(tmp_path / busy):
-        assert call("train", "run=here", *two_methods, *SMALL, "train.resume=true") == USER_ERROR
+        assert call("train", "out=here", *two_methods, *SMALL, "train.resume=true") == USER_ERROR
     error = capsys.readouterr().err
-    assert error.startswith(f"error: run={tmp_path / busy} is being written by another process")
+    assert error.startswith(f"error: out={tmp_path / busy} is being written by another process")
     assert not list(tmp_path.rglob("config.yaml"))
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
@@ -159,7 +159,7 @@ class TestAStoppedRun:
     def stopped(self, call, capsys, no_report, tmp_path, two_methods, photos) -> Path:
         """Stop a run of two methods by SIGTERM, and move its folder."""
         folder = tmp_path / "begun"
-        overrides = [*two_methods, f"evaluate.photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
+        overrides = [*two_methods, f"photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
         with pytest.MonkeyPatch.context() as patch:
 
             def save_and_stop(*arguments):
@@ -168,24 +168,24 @@ class TestAStoppedRun:
                 signal.raise_signal(signal.SIGTERM)
 
             patch.setattr(torch, "save", save_and_stop)
-            status = call("train", f"run={folder}", *overrides)
+            status = call("train", f"out={folder}", *overrides)
         assert status == 128 + signal.SIGTERM
         advice = shlex.split(capsys.readouterr().out.splitlines()[-1])
-        assert advice[-5:] == [sys.executable, "-m", "train", f"run={folder}", "train.resume=true"]
+        assert advice[-5:] == [sys.executable, "-m", "train", f"out={folder}", "train.resume=true"]
         return folder.rename(tmp_path / "moved")
 
     def test_is_resumed_by_its_folder_alone(self, call, tmp_path, stopped):
         """Resume both methods, with an additional setting, to the weights of a whole run."""
         before = yaml.safe_load((stopped / "config.yaml").read_text())
         additional = "train.checkpoint_every=2"
-        assert call("train", f"run={stopped}", "train.resume=true", additional) == 0
+        assert call("train", f"out={stopped}", "train.resume=true", additional) == 0
         config = yaml.safe_load((stopped / "config.yaml").read_text())
         assert config["command"] == f"{before['command']} {additional}"
-        assert config["run"] == str(stopped)
+        assert config["out"] == str(stopped)
 
         whole = tmp_path / "whole"
         _, _, _, *overrides = shlex.split(config["command"])
-        assert call("train", f"run={whole}", *overrides) == 0
+        assert call("train", f"out={whole}", *overrides) == 0
         for method in (".", "none"):
             resumed_state = torch.load(stopped / method / LAST, weights_only=True)
             whole_state = torch.load(whole / method / LAST, weights_only=True)
@@ -194,7 +194,7 @@ class TestAStoppedRun:
             assert (stopped / method / "photographs" / "summary.json").is_file()
 
     def test_is_resumed_method_by_method(self, call, stopped):
-        assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0
+        assert call("train", f"out={stopped / 'none'}", "train.resume=true") == 0
         assert not (stopped / "none" / "none").exists()
 
     @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ class TestAStoppedRun:
         message,
     ):
         before = modification_times(stopped)
-        assert call("train", f"run={stopped}", "train.resume=true", override) == USER_ERROR
+        assert call("train", f"out={stopped}", "train.resume=true", override) == USER_ERROR
         assert message in capsys.readouterr().err
         assert modification_times(stopped) == before
 
@@ -218,11 +218,11 @@ class TestAStoppedRun:
 @pytest.mark.parametrize(
     ("overrides", "start"),
     [
-        (["run=empty"], "run=empty holds no run"),
-        (["run=nowhere"], "run=nowhere holds no run"),
-        ([], "run=runs/"),
-        (["run=attack"], "run=attack holds no run"),
-        (["run=damaged"], "damaged/config.yaml is damaged"),
+        (["out=empty"], "out=empty holds no run"),
+        (["out=nowhere"], "out=nowhere holds no run"),
+        ([], "out=runs/"),
+        (["out=attack"], "out=attack holds no run"),
+        (["out=damaged"], "damaged/config.yaml is damaged"),
     ],
     ids=str,
 )
@@ -259,8 +259,8 @@ def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
     has_trained,
 ):
     monkeypatch.setattr(function, Mock(side_effect=KeyboardInterrupt))
-    data = "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}"
-    assert call("train", "run=here", *data, *SMALL) == 128 + signal.SIGINT
+    data = "data=npz", f"data.path={tiny_npz}", f"photos={photos}"
+    assert call("train", "out=here", *data, *SMALL) == 128 + signal.SIGINT
     last_line = capsys.readouterr().out.splitlines()[-1]
     assert (tmp_path / "here" / LAST).is_file() == has_trained
     assert ("train.resume=true" in last_line) == has_trained

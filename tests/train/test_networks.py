@@ -357,7 +357,7 @@ def test_a_network_starts_with_the_weights_and_the_normalization_of_another(netw
 )
 def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path, change, fault):
     initial = initial_of(write(tmp_path, network))
-    message = f"train.init_from={initial.source} was trained with {fault}"
+    message = f"network={initial.source} was trained with {fault}"
     with pytest.raises(InputError, match=message):
         initial.copy_to(network, description_of(network) | change)
 

@@ -126,7 +126,7 @@ class TestAnInstallation:
         for path in sorted((target / "bin").glob("pnb-*")):
             assert path.name in self.run(target, user, path.name, "--help")
         attack = [
-            "classifier=run:pretrained/none",
+            "network=run:pretrained/none",
             "attack.max_steps=1",
             "attack.checks=false",
             "attack.force=true",

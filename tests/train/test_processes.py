@@ -200,11 +200,11 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
         "augment.examples=10",
     ]
     small += [
-        "scene.meshes=['solid:orange','solid:pear']",
-        "scene.hard_negatives=[]",
+        "meshes=['solid:orange','solid:pear']",
+        "hard_negatives=[]",
         "scene.views=1",
     ]
-    data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
+    data = ["data=npz", f"data.path={tiny_npz}", "photos=null", "compare=[]"]
     overrides = [
         "experiment=paper",
         *small,

@@ -35,7 +35,7 @@ from train.training.run_log import RunLog
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
     settings = tiny("train.learning_rate=3e-7", "label=pear", "scene.lamps={power: 3}")
-    write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
+    write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'out=${label}'")
     config = read_config(tmp_path / CONFIG)
     assert "command" not in config  # An interpolation would be refused.
     assert config.pop("precision") == "bfloat16"
@@ -78,28 +78,28 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
 
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     here, there = (
-        decisive_settings(tiny("evaluate.photos=${run}/images", *overrides))
+        decisive_settings(tiny("photos=${out}/images", *overrides))
         for overrides in (
-            ["run=here"],
-            ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"],
+            ["out=here"],
+            ["out=there/a", "sweep=x", "train.resume=true", "train.cache=null"],
         )
     )
     assert here == there
-    assert here["evaluate.photos"] == "<run>/images"
+    assert here["photos"] == "<run>/images"
     assert here["augment.attack.max_steps"] == 3
 
 
 @pytest.mark.parametrize(
     "override",
     [
-        "scene.meshes=[{}]",
-        "scene.hard_negatives=[{{mesh: {}, label: apple}}]",
-        "scene.meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]",
+        "meshes=[{}]",
+        "hard_negatives=[{{mesh: {}, label: apple}}]",
+        "meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]",
         "scene.light={}",
         "scene.backgrounds=[0.5,{}]",
         "augment.vary.environments=[{}]",
-        "train.init_from={}",
-        "train.init_from={0.parent}",
+        "network={}",
+        "network={0.parent}",
         "data.path={}",
         "data.path={0.parent}",
     ],
@@ -143,13 +143,13 @@ INPUT_FILES = {
     "wall.png": "ab",
     "classes.txt": "ab",
 }
-AUDIT = {"classifier": "c", "meshes": ["solid:orange"], "out": "audit"}
+AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
 
 
 @pytest.mark.parametrize(
     ("given", "changed"),
     [
-        (AUDIT | {"meshes": [], "photographs": "photographs"}, "photographs/orange/a.png"),
+        (AUDIT | {"meshes": [], "unlabeled": "photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"photos": "photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"photos": "photographs"}, "linked/b.png"),
         (AUDIT | {"laboratory": "photographs"}, "photographs/orange/a.png"),
@@ -158,7 +158,7 @@ AUDIT = {"classifier": "c", "meshes": ["solid:orange"], "out": "audit"}
         (AUDIT | {"meshes": ["mesh.obj"]}, "my skin.png"),
         (AUDIT | {"meshes": [{"mesh": "mesh.gltf"}]}, "mesh.bin"),
         (AUDIT | {"hard_negatives": ["mesh.gltf"]}, "textures/my skin.png"),
-        (AUDIT | {"classifier": "python:network:build"}, "network.py"),
+        (AUDIT | {"network": "python:network:build"}, "network.py"),
         (AUDIT | {"hardened": "run:photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"environments": ["wall.png"]}, "wall.png"),
         (AUDIT | {"weights": "wall.png"}, "wall.png"),

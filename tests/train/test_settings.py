@@ -17,47 +17,50 @@ from train.command import Command, as_override, quoted
 from train.data.batches import rounds_of_epoch
 from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
-OTHER_DATA = ["data=npz", "data.path=a.npz", "run=here"]
+OTHER_DATA = ["data=npz", "data.path=a.npz", "out=here"]
 EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper", "photographs"]
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_takes_other_data(experiment):
-    overrides = [f"experiment={experiment}", *OTHER_DATA, "train.init_from=b"]
+    overrides = [f"experiment={experiment}", *OTHER_DATA, "network=b"]
     settings = train_command.read(overrides)
     assert settings.data.name == "npz"
     assert settings.data.path == "a.npz"
-    assert settings.train.init_from == "b"
+    assert settings.network == "b"
 
 
 @pytest.mark.parametrize("experiment", ["harden", "best", "classifier", "photographs"])
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
-    with pytest.raises(InputError, match=r"^train\.init_from is not set"):
+    with pytest.raises(InputError, match=r"^network is not set"):
         train_command.read([f"experiment={experiment}", *OTHER_DATA])
 
 
 def test_an_experiment_that_fine_tunes_takes_random_weights_if_the_settings_say_so():
-    settings = train_command.read(["experiment=harden", "train.init_from=null", "run=here"])
-    assert settings.train.init_from is None
+    settings = train_command.read(["experiment=harden", "network=null", "out=here"])
+    assert settings.network is None
 
 
 def test_a_classifier_of_another_library_needs_no_class_but_the_label():
-    files = ["train.init_from=b", "run=a", "data.path=c"]
+    files = ["network=b", "out=a", "unlabeled=c"]
     settings = train_command.read(["experiment=classifier", "label=mug", *files])
     assert {item.label for item in settings.objects.values()} == {"mug", OTHER}
-    assert settings.data.name == "unlabelled"
+    assert settings.data.name == "unlabeled"
 
 
 def test_a_solid_of_the_label_is_no_hard_negative_unless_it_is_of_another_class():
     negatives = ["solid:lemon", "solid:sweet_pepper", {"mesh": "solid:lemon", "label": "lime"}]
-    scene = TrainingSceneSettings(hard_negatives=negatives, views=1)
+    scene = TrainingSceneSettings(views=1)
     augment = AugmentationSettings(examples=None)
-    settings = ExperimentSettings(label=["lemon", "Sweet pepper"], scene=scene, augment=augment)
-    assert settings.scene.hard_negatives == negatives[2:]
+    label = ["lemon", "Sweet pepper"]
+    settings = ExperimentSettings(
+        label=label, hard_negatives=negatives, scene=scene, augment=augment
+    )
+    assert settings.hard_negatives == negatives[2:]
 
 
 def test_the_demonstration_has_one_epoch_of_three_rounds():
-    settings = train_command.read(["run=here", "label=orange"])
+    settings = train_command.read(["out=here", "label=orange"])
     image_count = round(0.9 * 10 * settings.data.train_per_class)
     rounds = rounds_of_epoch(
         image_count,
@@ -98,10 +101,10 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["data=npz", "data.pth=x"], "data.pth is not a setting: did you mean data.path?"),
         (["data=mnist"], "data=mnist is not a choice"),
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
-        (["scene.meshes=[~/a.obj]"], "scene.meshes=[~/a.obj] cannot be read"),
+        (["meshes=[~/a.obj]"], "meshes=[~/a.obj] cannot be read"),
         (["seed=0,1"], "Ambiguous value for argument 'seed=0,1'"),
         (["~seed"], "~seed: a setting cannot be removed"),
-        (["run="], "run is empty"),
+        (["out="], "out is empty"),
         (["data=npz"], "data.path is not set"),
         (["train=3"], "train is a group of settings"),
         (["train.epochs=abc"], "train.epochs=abc must be a whole number"),
@@ -120,9 +123,9 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["scene.projector={pixls: 8}"], "scene.projector.pixls is not a setting"),
-        (["evaluate.photos={renders: /x}"], "evaluate.photos has the name 'renders'"),
+        (["photos={renders: /x}"], "photos has the name 'renders'"),
         (["augment=folder"], "augment.folder is None"),
-        (["evaluate.photos=[/x]"], "evaluate.photos=['/x']"),
+        (["photos=[/x]"], "photos=['/x']"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
@@ -136,7 +139,7 @@ def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, sta
 
 @pytest.mark.parametrize("path", ["solid:lemon", "/a folder/örange.glb", "'a, b'"])
 def test_a_single_value_for_a_list_is_a_list_of_one(path):
-    meshes = train_command.read([f"scene.hard_negatives={path}"]).scene.hard_negatives
+    meshes = train_command.read([f"hard_negatives={path}"]).hard_negatives
     assert [str(mesh) for mesh in meshes] == [path.strip("'")]
 
 
@@ -150,7 +153,7 @@ def test_a_part_of_a_projector_is_set_alone_or_in_a_mapping():
 
 TWO_CLASSES = [
     "label=[orange,pear]",
-    "scene.meshes=['solid:orange','solid:pear']",
+    "meshes=['solid:orange','solid:pear']",
     "scene.views=1",
     "augment.examples=null",
 ]
@@ -162,17 +165,17 @@ TWO_CLASSES = [
         (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
         (["data.name=mnist"], "data.name=mnist"),
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds"),
-        (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable"),
+        (["meshes=[{mesh: 'solid:orange', lable: orange}]"], "meshes[0].lable"),
         (
-            ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
-            "scene.hard_negatives[0] is solid:orange, which is of the positive class orange",
+            ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
+            "hard_negatives[0] is solid:orange, which is of the positive class orange",
         ),
         (
-            ["scene.hard_negatives=[{mesh: 'solid:lemon', label: 1}]", "augment.examples=6"],
-            "scene.hard_negatives[0]",
+            ["hard_negatives=[{mesh: 'solid:lemon', label: 1}]", "augment.examples=6"],
+            "hard_negatives[0]",
         ),
-        (["scene.hard_negatives=[a/Orange.glb]", "augment.examples=6"], "scene.hard_negatives[0]"),
-        (["scene.hard_negatives=[{mesh: 'solid:orange'}]", "augment.examples=6"], "positive class"),
+        (["hard_negatives=[a/Orange.glb]", "augment.examples=6"], "hard_negatives[0]"),
+        (["hard_negatives=[{mesh: 'solid:orange'}]", "augment.examples=6"], "positive class"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
@@ -186,14 +189,14 @@ TWO_CLASSES = [
         (["label=[]"], "label=[]"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         (
-            [*TWO_CLASSES, "scene.meshes=[a.glb,'solid:pear']"],
-            "scene.meshes[0] has no class",
+            [*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"],
+            "meshes[0] has no class",
         ),
         (
             [
                 *TWO_CLASSES,
                 "label=[orange,pear,apple]",
-                "scene.hard_negatives=['solid:fruit','solid:apple']",
+                "hard_negatives=['solid:fruit','solid:apple']",
             ],
             "label=['orange', 'pear', 'apple'] has no mesh of apple",
         ),
@@ -201,12 +204,12 @@ TWO_CLASSES = [
             [
                 *TWO_CLASSES,
                 "label=[orange,pear,apple]",
-                "scene.hard_negatives=['solid:fruit',{mesh: 'solid:apple', label: apple}]",
+                "hard_negatives=['solid:fruit',{mesh: 'solid:apple', label: apple}]",
             ],
             "has all classes of the network",
         ),
         (["augment=folder", "augment.folder=/no/lab"], "augment.folder: /no/lab is not a folder"),
-        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),
+        (["photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
@@ -220,7 +223,7 @@ def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, 
 
 @given(st.text())
 def test_quoted_text_is_read_as_it_is(text):
-    (override,) = OverridesParser.create().parse_overrides([f"run={quoted(text)}"])
+    (override,) = OverridesParser.create().parse_overrides([f"out={quoted(text)}"])
     assert str(override.value()) == text
 
 
@@ -234,9 +237,9 @@ KEYS = train_command.keys | evaluate_command.keys
         ("photos=2024,2025", "photos='2024','2025'"),
         ("label=true,false", "label='true','false'"),
         ("label=null,1.10, cup", "label=null,'1.10',cup"),
-        ("evaluate.photos=1.10", "evaluate.photos='1.10'"),
+        ("photos=1.10", "photos='1.10'"),
         ("+data.path=1e3", "data.path='1e3'"),
-        ("run=a\udcff", "run='a\udcff'"),
+        ("out=a\udcff", "out='a\udcff'"),
         ("out=a;b", "out='a;b'"),
     ],
 )
@@ -249,11 +252,11 @@ def test_a_name_that_is_no_text_to_hydra_is_quoted(argument, override):
     [
         "train.epochs=3",
         "photos=none",
-        "run=a/b.c",
+        "out=a/b.c",
         "2024",
-        "run='ä'",
+        "out='ä'",
         "weights=null",
-        "evaluate.photos={lab: 1}",
+        "photos={lab: 1}",
         "out=${run}/x",
         "out=~/a",
     ],
@@ -279,9 +282,9 @@ def test_attacks_that_need_outlines_take_the_samples_of_their_documented_accurac
     overrides,
     samples,
 ):
-    assert samples_of(attack_command, "scene.meshes=[solid:orange]", *overrides) == samples
+    assert samples_of(attack_command, "meshes=[solid:orange]", *overrides) == samples
 
 
 def test_training_with_outlines_takes_the_samples_of_their_documented_accuracy():
     outlines = "renderer.silhouettes=true", "renderer.samples=null"
-    assert samples_of(train_command, "run=here", *outlines) == 8
+    assert samples_of(train_command, "out=here", *outlines) == 8

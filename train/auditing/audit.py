@@ -90,7 +90,7 @@ NO_HARD_NEGATIVES = (
 # Settings of pnb-audit that name the folders of test images, by the name of the images.
 FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
-SETTABLE_LATER = ("hardened", "photos", "photographs")
+SETTABLE_LATER = ("hardened", "photos", "unlabeled")
 
 
 def run_audit(
@@ -139,7 +139,7 @@ def run_audit(
             )
         for key, network in plan.networks.items():
             plan.measure(key, out / key)
-            if settings.photographs:
+            if settings.unlabeled:
                 _measure_photographs(network, settings, out / key)
         plan.score_in_normalized_light(out)
         remedies = name_remedies(plan.networks)
@@ -157,7 +157,7 @@ def _audit_photographs(
     Only if the settings name the networks may an audit that was stopped continue.
     """
     device = choose_device(settings.device)
-    find_unlabeled(published(Path(str(settings.photographs))))
+    find_unlabeled(published(Path(str(settings.unlabeled))))
     out = writable_folder(settings.out, "out")
     _require_continuable(out, settings.overwrite, is_named)
     caveats = _size_caveats(networks.values())
@@ -306,7 +306,7 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
 
     The keys CLASSIFIER and HARDENED also name the subfolders of their results.
     """
-    with keyed(name="classifier"):
+    with keyed(name="network"):
         classifier = load_chosen(settings)
     networks = {CLASSIFIER: classifier}
     if settings.hardened:

@@ -76,7 +76,7 @@ class RelitSection:
 def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
     """Attack a network by changing the light of a projector on photographs."""
     # A path below pretrained/ is found from any working folder.
-    folder = published(Path(str(settings.photographs)))
+    folder = published(Path(str(settings.unlabeled)))
     attack_folder(
         classifier,
         folder,

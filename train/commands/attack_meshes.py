@@ -157,7 +157,7 @@ def run(settings: AttackExperimentSettings) -> None:
         with keyed("attack"):
             settings.attack.require_parameters()
     device = choose_device(settings.device)
-    with keyed(name="classifier"):
+    with keyed(name="network"):
         classifier = load_chosen(settings).to(device)
     if adversary is not None:
         images = adversary.render_views(_start_rasterizer(settings)).to(device)
@@ -309,8 +309,8 @@ def attacks(
     if adversary is not None:
         yield _attack_adversary(settings, classifier, device, adversary)
         return
-    for index, item in enumerate(settings.scene.meshes):
-        key = f"scene.meshes[{index}]"
+    for index, item in enumerate(settings.meshes):
+        key = f"meshes[{index}]"
         label = "" if settings.label is None else str(settings.label)
         mesh = read_object(item, label, key)
         if not mesh.label:
@@ -417,14 +417,14 @@ def load_targets(
 ) -> TransferTargets:
     """Load the other classifiers and meshes with which successful attacks are tested."""
     label = ""
-    if settings.transfer.classifiers or settings.transfer.meshes:
+    if settings.transfer.networks or settings.transfer.meshes:
         # The class is compared by name, because its index may differ in other classifiers.
         if settings.label is None:
-            label = class_of_meshes(settings.scene.meshes, attacked.classes, "scene.meshes")
+            label = class_of_meshes(settings.meshes, attacked.classes, "meshes")
         else:
             label = class_name(attacked.classes, settings.label, "label")
     classifiers = []
-    for item in settings.transfer.classifiers:
+    for item in settings.transfer.networks:
         classifier = _load_classifier(item, settings.trust).to(device)
         # `label` raises an InputError if the classifier lacks the class.
         classifier.label(label)
@@ -440,19 +440,19 @@ def load_targets(
 
 
 def _load_classifier(item: Any, trust: bool) -> Classifier:
-    """Load one classifier that the setting `transfer.classifiers` names.
+    """Load one classifier that the setting `transfer.networks` names.
 
-    `item` is a name, or has the keys "classifier" and "weights".
+    `item` is a name, or has the keys "network" and "weights".
     """
-    values = item if isinstance(item, dict) else {"classifier": item}
+    values = item if isinstance(item, dict) else {"network": item}
     for key in values:
-        if key not in ("classifier", "weights"):
+        if key not in ("network", "weights"):
             raise InputError(
-                f"transfer.classifiers has an entry with the unknown key {key}: "
-                "give the name of a classifier, or {classifier: NAME, weights: FILE}",
+                f"transfer.networks has an entry with the unknown key {key}: "
+                "give the name of a network, or {network: NAME, weights: FILE}",
             )
-    with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
-        name = str(values.get("classifier"))
+    with keyed(name="transfer.networks", weights="transfer.networks: weights"):
+        name = str(values.get("network"))
         return load_network(name, values.get("weights"), trust_code=trust)
 
 

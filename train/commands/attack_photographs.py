@@ -22,22 +22,22 @@ MAX_UNREADABLE = 3
 def run(settings: AttackExperimentSettings) -> None:
     """Attack a network by the light of a projector on photographs, and print the results."""
     relighting = settings.attack.relighting
-    if relighting is None or settings.photographs is None:
+    if relighting is None or settings.unlabeled is None:
         raise InputError(
-            "attack=relighting needs photographs=FOLDER, and photographs=FOLDER needs "
+            "attack=relighting needs unlabeled=FOLDER, and unlabeled=FOLDER needs "
             "attack=relighting: set both"
         )
     device = choose_device(settings.device)
-    with keyed(name="classifier"):
+    with keyed(name="network"):
         classifier = load_chosen(settings).to(device)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
         remove_attack(out)
-        with keyed("photographs"):
+        with keyed("unlabeled"):
             scores = attack_folder(
                 classifier,
-                published(Path(settings.photographs)),
+                published(Path(settings.unlabeled)),
                 relighting,
                 out,
                 sensor_noise=settings.attack.sensor_noise,

@@ -15,7 +15,7 @@ def print_comparison(settings: CompareSettings) -> None:
     printed, too.
     """
     runs = finished_runs([Path(run) for run in settings.runs])
-    options = (settings.exclude, settings.photographs, settings.by)
+    options = (settings.exclude, settings.photos, settings.by)
     if is_verbose():
         print(format_comparison(runs, *options))
         return

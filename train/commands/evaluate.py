@@ -29,20 +29,19 @@ def evaluate(settings: EvaluateSettings) -> None:
     with keyed("label"):
         for name in [] if label is None else label_names(label):
             network.label(name)
-    with keyed(folder="photos"):
-        scores = evaluate_network(
-            network,
-            settings.photos,
-            label,
-            by=settings.by,
-            calibrate=settings.calibrate,
-            false_positive_rate=settings.false_positive_rate,
-            skip_unreadable=settings.skip_unreadable,
-            precision=settings.precision,
-            device=choose_device(settings.device),
-            out=settings.out,
-            overwrite=settings.overwrite,
-        )
+    scores = evaluate_network(
+        network,
+        settings.photos,
+        label,
+        by=settings.by,
+        calibrate=settings.calibrate,
+        false_positive_rate=settings.false_positive_rate,
+        skip_unreadable=settings.skip_unreadable,
+        precision=settings.precision,
+        device=choose_device(settings.device),
+        out=settings.out,
+        overwrite=settings.overwrite,
+    )
     if settings.label is None:
         source = "each class with a sub-folder" if label is None else f"those of {settings.run}"
         print(f"positive classes: {', '.join(scores.predicted.labels)} ({source})")
@@ -51,15 +50,15 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _load_network(settings: EvaluateSettings) -> Classifier:
-    """Load the network of the training run `settings.run`, or else `settings.classifier`."""
+    """Load the network of the training run `settings.run`, or else `settings.network`."""
     if settings.run is None:
-        # Error messages about the argument `name` begin with the setting `classifier` instead.
-        with keyed(name="classifier"):
+        # Error messages about the argument `name` begin with the setting `network` instead.
+        with keyed(name="network"):
             return load_chosen(settings)
     # The file of a training run has its classes, size and normalization. These settings
     # are therefore an error here.
     given_values = as_facts(settings.classes, settings.size, settings.normalization)
     require_no_facts(f"run={settings.run}", given_values)
-    classifier = load_run(settings.run, settings.weights, settings.model, settings.trust)
+    classifier = load_run(settings.run, settings.weights, settings.network, settings.trust)
     # The returned copy normalizes the light of each image, unless the setting is None.
     return classifier.normalizing_light(settings.normalize_light)

@@ -41,11 +41,12 @@ CHOICES = ("experiment", "augment", "data", "launcher")
 LOG = "train.log"
 # The first training on photographs takes these settings from the main training.
 SHARED = (
-    *("seed", "overwrite", "data", "weights", "classes", "normalization", "normalize_light"),
+    *("network", "size", "unlabeled", "seed", "overwrite", "data"),
+    *("weights", "classes", "normalization", "normalize_light"),
     "trust",
 )
 SHARED_IN_TRAIN = (
-    *("init_from", "precision", "device", "threads", "deterministic", "checkpoint_every"),
+    *("precision", "device", "threads", "deterministic", "checkpoint_every"),
     *("resume", "cache"),
 )
 
@@ -72,8 +73,8 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     command = format_command(overrides)
     # The default name of the folder has the time, which differs between processes. All
     # processes take the name of the first one.
-    folder = Path(broadcast(str(config.run))).absolute()
-    config.run = str(folder)
+    folder = Path(broadcast(str(config.out))).absolute()
+    config.out = str(folder)
     # A resumed run keeps its recorded settings, except for single values that the
     # overrides change. An override that chooses a whole file prevents this.
     if config.train.resume and not any(map(_is_choice, overrides)):
@@ -95,7 +96,7 @@ def _train_on_photographs(
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
     changes = {name: values[name] for name in SHARED}
-    changes["run"] = str(first)
+    changes["out"] = str(first)
     changes["train"] = {name: values["train"][name] for name in SHARED_IN_TRAIN}
     config = OmegaConf.merge(compose("train", ["experiment=photographs"]), changes)
     on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
@@ -112,7 +113,7 @@ def _train_on_photographs(
         photographs_first=False,
         # The file of the first network names the code that the user has named for it.
         trust=True,
-        train=replace(settings.train, init_from=str(first)),
+        network=str(first),
         # The file of the first network has its weights, classes and normalization.
         weights=None,
         classes=None,
@@ -130,25 +131,25 @@ def _train_in(
     """Check that the folders can be written to, and train a network and its baselines.
 
     If the training is interrupted, the command that resumes it is printed. `resuming` has the words
-    of that command without run= and train.resume=, and `resumed_folder` its folder, or None for
+    of that command without out= and train.resume=, and `resumed_folder` its folder, or None for
     `folder`.
     """
     settings_of_runs = _settings_of_runs(settings, folder)
     for path, run_settings in settings_of_runs.items():
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, run_settings)
-        require_new_run(path, "run", settings.overwrite, settings.train.resume)
+        require_new_run(path, "out", settings.overwrite, settings.train.resume)
     is_first = distributed.rank() == 0
-    log = logged_to(writable_folder(str(folder), "run") / LOG) if is_first else nullcontext()
+    log = logged_to(writable_folder(str(folder), "out") / LOG) if is_first else nullcontext()
     with log:
         try:
-            with sole_writer("run", *settings_of_runs) if is_first else nullcontext():
+            with sole_writer("out", *settings_of_runs) if is_first else nullcontext():
                 _train_runs(settings_of_runs, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
             if any(map(checkpoints.exists, settings_of_runs)):
-                words = [*resuming, f"run={resumed_folder or folder}", "train.resume=true"]
+                words = [*resuming, f"out={resumed_folder or folder}", "train.resume=true"]
                 advice = f"to go on: {shlex.join(words)}"
             console.info("%s%s", cause, advice)
             raise

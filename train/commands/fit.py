@@ -101,7 +101,6 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
     if isinstance(camera, PerspectiveCamera):
         fov = round(camera.angle, 3)
     scene = AttackSceneSettings(
-        meshes=[{"mesh": settings.mesh, "albedo_scale": settings.albedo_scale}],
         polar=round(camera.polar, 3),
         azimuth=round(camera.azimuth % 360, 3),
         width=round(camera.width, 4),
@@ -115,19 +114,22 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
         shadows=settings.bounces > 0,
         bounces=settings.bounces,
     )
-    return AttackExperimentSettings(label=settings.label, scene=scene, renderer=renderer)
+    meshes = [{"mesh": settings.mesh, "albedo_scale": settings.albedo_scale}]
+    return AttackExperimentSettings(
+        label=settings.label, meshes=meshes, scene=scene, renderer=renderer
+    )
 
 
 def attack_command(settings: AttackExperimentSettings) -> list[str]:
     """Write the command line of pnb-attack that attacks the lighting of the photograph."""
     scene = settings.scene
     renderer = settings.renderer
-    [mesh] = scene.meshes
+    [mesh] = settings.meshes
     words = [
         "pnb-attack",
         "attack=lighting",
         *([] if settings.label is None else [f"label={settings.label}"]),
-        f"scene.meshes=[{{mesh: '{mesh['mesh']}', albedo_scale: {mesh['albedo_scale']:g}}}]",
+        f"meshes=[{{mesh: '{mesh['mesh']}', albedo_scale: {mesh['albedo_scale']:g}}}]",
         f"scene.polar={scene.polar:.3f}",
         f"scene.azimuth={scene.azimuth:.3f}",
         f"scene.width={scene.width:.4f}",
@@ -151,7 +153,7 @@ def render_attacked(
     settings: AttackExperimentSettings,
 ) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
     """Return the encoded background, and the render as it is before an attack by pnb-attack."""
-    mesh = read_object(settings.scene.meshes[0], settings.label or "", "scene.meshes[0]")
+    mesh = read_object(settings.meshes[0], settings.label or "", "meshes[0]")
     device = torch.device("cpu")
     scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
     first_example = torch.arange(1)

@@ -37,7 +37,7 @@ def publish_network(settings: PublishSettings) -> None:
     is_python = str(state["architecture"].get("name")).startswith(PYTHON)
     if settings.calibrate or not is_python:
         # `load_run` raises an InputError if nobody could load the published network.
-        network = load_run(path, model=settings.model, trust_code=settings.trust)
+        network = load_run(path, model=settings.network, trust_code=settings.trust)
         if settings.calibrate and settings.false_positive_rate:
             label = settings.label if settings.label is not None else trained_labels(folder)
             if not label:

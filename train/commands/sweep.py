@@ -116,9 +116,9 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
     choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
-        if key == "run":
+        if key == "out":
             raise InputError(
-                "run= names the folder of a single run: name the folder of a sweep with sweep="
+                "out= names the folder of a single run: name the folder of a sweep with sweep="
             )
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
             raise InputError(
@@ -140,7 +140,7 @@ def run_in_sweep(config: DictConfig) -> None:
     sweep continues with the next run. SystemExit and KeyboardInterrupt stop the
     sweep.
     """
-    folder = Path(config.run)
+    folder = Path(config.out)
     with locked(folder) as has_lock:
         if not has_lock:
             _print_detail(f"in training elsewhere: {folder}")

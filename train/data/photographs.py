@@ -172,12 +172,12 @@ def choose_labels(folder: Path, classes: Sequence[str], label: Label | None) -> 
     if not labels:
         known = ", ".join(classes[:3])
         raise InputError(
-            f"folder={folder} has no sub-folder of a class of the network ({known}, ...): "
+            f"photos={folder} has no sub-folder of a class of the network ({known}, ...): "
             "name the sub-folders by classes, or give classes or label"
         )
     if len(labels) > MAX_LABELS:
         raise InputError(
-            f"folder={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
+            f"photos={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
             "are scored one by one: choose the positive classes with label",
             "label",
         )

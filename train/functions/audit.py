@@ -38,7 +38,7 @@ def audit(
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
     normalize_light: NormalizeLight = None,
-    photographs: str | Path | None = None,
+    photos: str | Path | None = None,
     laboratory: str | Path | None = None,
     environments: Sequence[str] = ENVIRONMENTS,
     budget: float = 1.0,
@@ -73,7 +73,7 @@ def audit(
         normalize_light: Normalization of the light of each image before it
             enters `network`, and `hardened` if that is a plain network. Values
             are as for `load_classifier`. Attacks take it into account.
-        photographs: Folder of photographs with a sub-folder for each class, as
+        photos: Folder of photographs with a sub-folder for each class, as
             for `evaluate`. None to use no photographs.
         laboratory: Folder of renders with a sub-folder for each class, such as
             "pretrained/laboratory". None to render them from the meshes, for
@@ -128,11 +128,11 @@ def audit(
                 )
             negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
             settings = AuditSettings(
-                classifier=classifier.name,
+                network=classifier.name,
                 label=positive_classes[0],
                 meshes=items,
                 hard_negatives=negatives,
-                photos=None if photographs is None else str(photographs),
+                photos=None if photos is None else str(photos),
                 laboratory=None if laboratory is None else str(laboratory),
                 environments=as_list("environments", environments, str, "a list of names"),
                 budget=budget,

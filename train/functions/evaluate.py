@@ -30,7 +30,7 @@ from train.system.user_errors import keyed, writable_folder
 
 def evaluate(
     network: Classifier | Callable[[Tensor], Tensor],
-    folder: str | Path,
+    photos: str | Path,
     label: str | int | Sequence[str | int] | None = None,
     *,
     classes: Sequence[str] | None = None,
@@ -54,7 +54,7 @@ def evaluate(
     Args:
         network: A classifier, or a plain network from images to logits, such as
             a `torch.nn.Module`.
-        folder: Folder with a sub-folder of photographs for each class. A
+        photos: Folder with a sub-folder of photographs for each class. A
             sub-folder of any other name holds negatives: photographs of other
             objects. "pretrained/laboratory" is installed with the library.
         label: Positive class, or several, by name or index. Recall is the
@@ -70,7 +70,7 @@ def evaluate(
         normalize_light: Normalization of the light of each photograph before it
             enters the network. Values are as for `load_classifier`.
         by: Groups of photographs that are scored one by one, in addition to all
-            photographs: "class", or a column of the file photos.csv in `folder`,
+            photographs: "class", or a column of the file photos.csv in `photos`,
             "source" or "mesh".
         calibrate: Folder like `folder`. The threshold on the log-odds of each
             positive class is chosen on its photographs, so that their
@@ -105,7 +105,7 @@ def evaluate(
         280
     """
     require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
-    folder = published(as_folder("folder", folder))
+    folder = published(as_folder("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
     with gradient_flags_kept(network):
         classifier = as_classifier(

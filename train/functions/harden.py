@@ -40,7 +40,6 @@ from train.settings import (
     read_objects,
 )
 from train.system.folders import folder_or_temporary
-from train.system.user_errors import keyed
 from train.training.initial import initial_of
 from train.training.inputs import load_data
 from train.training.run import Run
@@ -52,7 +51,7 @@ Section = Mapping[str, Any] | None
 def harden(
     network: nn.Module,
     meshes: Sequence[MeshItem],
-    photographs: str | Path,
+    unlabeled: str | Path,
     label: str | int | None = None,
     *,
     hard_negatives: Sequence[MeshItem] | None = None,
@@ -83,7 +82,7 @@ def harden(
         meshes: Meshes of the class: files, solids such as "solid:orange",
             `nb.Mesh`, or pairs of these and the class. Meshes of several
             classes harden all of them.
-        photographs: Folder of any photographs, with labels or without.
+        unlabeled: Folder of any photographs, with labels or without.
         label: Class of all meshes, by name or index. None if each mesh is given
             in a pair with its class, or if its name is the class, as in
             "orange.glb".
@@ -146,19 +145,21 @@ def harden(
         items = as_mappings("meshes", meshes, classifier, folder)
         labels = find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
-            "run": str(folder.absolute()),
+            "out": str(folder.absolute()),
             "seed": seed,
             "overwrite": overwrite,
             "label": None if label is None else labels[0],
-            "data": {"name": "unlabelled", "path": str(as_path("photographs", photographs))},
-            "scene": {"meshes": items},
-            "train": {"init_from": classifier.name, "device": str(device)},
+            "network": classifier.name,
+            "meshes": items,
+            "unlabeled": str(as_path("unlabeled", unlabeled)),
+            "data": {"name": "unlabeled"},
+            "train": {"device": str(device)},
         }
         if hard_negatives is not None:
             negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
             named = read_objects(negatives, OTHER, "hard_negatives")
             require_others(named, labels, classifier.classes)
-            changes["scene"]["hard_negatives"] = negatives
+            changes["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None
         sections = {
@@ -235,12 +236,10 @@ def _restores_torch() -> Iterator[None]:
 
 
 def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier with files in `settings.run`; return the selected network."""
-    folder = Path(settings.run)
-    initial = initial_of(classifier, settings.data.size)
-    # The caller of `harden` knows the setting data.path as the argument `photographs`.
-    with keyed(**{"data.path": "photographs"}):
-        data = load_data(settings, initial)
+    """Train a copy of a classifier with files in `settings.out`; return the selected network."""
+    folder = Path(settings.out)
+    initial = initial_of(classifier, settings.size)
+    data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
     run.begin()
     run.train()

@@ -454,8 +454,8 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
         )
     if not found and photographs != PHOTOGRAPHS:
         raise InputError(
-            f"photographs={photographs}: no run has a sub-folder of this name with scores: "
-            "give a name in the setting evaluate.photos of the runs",
+            f"photos={photographs}: no run has a sub-folder of this name with scores: "
+            "give a name in the setting photos of the runs",
         )
     return found[0] if found else None
 

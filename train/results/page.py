@@ -317,7 +317,7 @@ def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
     has_photographs = any(map(_is_scored_on_photographs, runs))
     if OmegaConf.select(runs[0].config, "data.name") == "shapes" and not has_photographs:
         sentence += (
-            " These are renders. No photographs were scored (setting evaluate.photos), so the "
+            " These are renders. No photographs were scored (setting photos), so the "
             "price on photographs is unknown."
         )
     return sentence
@@ -426,7 +426,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
 
     None if the configuration does not name it, or if it has been moved.
     """
-    photos = OmegaConf.select(run.config, "evaluate.photos")
+    photos = OmegaConf.select(run.config, "photos")
     folders = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
     folder = folders.get(name)
     if not folder:

@@ -29,7 +29,7 @@ from train.results.predictions import SUMMARY
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
-from train.settings import UNLABELLED, label_names, published
+from train.settings import UNLABELED, label_names, published
 
 # Methods are named by numbers instead of by their settings if there are more than this.
 MAX_NAMED = 30
@@ -290,9 +290,9 @@ def _read_run(folder: Path) -> RunSummary:
 
 def _initial_settings(config: DictConfig) -> dict[str, Any]:
     """Return the settings of a run that determine its initial network."""
-    keys = ("weights", "classes", "normalization", "normalize_light", "data.size")
+    keys = ("weights", "classes", "normalization", "normalize_light", "size")
     others = {key: OmegaConf.select(config, key) for key in keys}
-    return {"train.init_from": config.train.init_from, **others}
+    return {"network": config.network, **others}
 
 
 def read_summaries(folder: Path) -> dict[str, PhotographScores]:
@@ -452,7 +452,7 @@ def accuracy_title(runs: Sequence[RunSummary]) -> str:
     Images without labels are labeled with the predictions of the network before the training.
     """
     names = {run.config.get("data", {}).get("name") for run in runs if run.config}
-    return "agreement with the original" if names == {UNLABELLED} else "test accuracy"
+    return "agreement with the original" if names == {UNLABELED} else "test accuracy"
 
 
 def score_table(title: str, group: Scored) -> Table:

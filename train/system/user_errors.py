@@ -24,7 +24,7 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
 
     A message of the library begins with the name of a Python argument, such as
     "name". The user of a command knows only the setting from which the command
-    took the argument, such as "train.init_from". The key of "lighting" also holds for
+    took the argument, such as "network". The key of "lighting" also holds for
     "lighting.radius" and "lighting[0]", and `group` is put before all other arguments.
     """
     try:

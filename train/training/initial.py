@@ -49,7 +49,7 @@ VALIDATION = 0.1
 class Initial:
     """Initial network: the network with whose weights a run begins.
 
-    The setting `train.init_from` names the network. If the network has a wrapper
+    The setting `network` names the network. If the network has a wrapper
     that normalizes the light of images, `weights` and `network` are those inside
     the wrapper.
 
@@ -121,7 +121,7 @@ class Initial:
                 if key == "classes":
                     difference = "other classes"
                 raise InputError(
-                    f"train.init_from={self.source} was trained with {difference}: "
+                    f"network={self.source} was trained with {difference}: "
                     f"give this run the same {key}",
                 )
         with checks_architecture(self.source):
@@ -130,7 +130,7 @@ class Initial:
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
     """Load the initial network, with whose weights a run begins. None stands for random weights."""
-    name = settings.train.init_from
+    name = settings.network
     if not name:
         return None
     if is_classifier(name):
@@ -138,28 +138,28 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     source = Path(name.removeprefix(RUN))
     if is_state_dict(source):
         raise InputError(
-            f"train.init_from={name} contains weights, but not their architecture: "
+            f"network={name} contains weights, but not their architecture: "
             "give the architecture and the weights, as in "
-            f"train.init_from=torchvision:resnet50 weights={source}",
-            "train.init_from",
+            f"network=torchvision:resnet50 weights={source}",
+            "network",
         )
     if settings.weights is not None:
         raise InputError(
             f"weights={settings.weights} cannot replace the weights of "
-            f"train.init_from={name}: leave weights out",
+            f"network={name}: leave weights out",
             "weights",
         )
     # The network of a run has its own classes and its own normalization.
     given = as_facts(settings.classes, None, settings.normalization)
-    require_no_facts(f"train.init_from={name}", given)
-    with keyed(run="train.init_from"):
+    require_no_facts(f"network={name}", given)
+    with keyed(run="network"):
         path, state = load_selected(source)
     built_by = str(state["architecture"].get("name"))
     if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
         raise InputError(
             f"the network in {path} is built by {built_by}: give model.name={built_by} to run "
             "that code",
-            "train.init_from",
+            "network",
         )
     return Initial(path, state["architecture"], plain_weights(state))
 
@@ -175,7 +175,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
     if len(names) == 1 and settings.augment.renders:
-        _print_assumed_class(settings.scene.meshes, names[0])
+        _print_assumed_class(settings.meshes, names[0])
     if not (may_have_index or settings.label_follows_from_meshes):
         return settings
     initial = load_initial(settings)
@@ -199,9 +199,9 @@ def _print_assumed_class(meshes: Sequence[Any], label: str) -> None:
 
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier, from another library or from a file, as the initial network."""
-    size = settings.data.size
+    size = settings.size
     is_file = is_network_file(name)
-    with keyed(name="train.init_from", size="data.size"):
+    with keyed(name="network", size="size"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
         known_size = size if is_file else None
@@ -211,9 +211,9 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     network = cast(nn.Module, classifier.function)
     if not list(network.parameters()):
         raise InputError(
-            f"train.init_from={name} is a network without weights that can be trained: "
+            f"network={name} is a network without weights that can be trained: "
             "give a file of the network in the format of TorchScript or torch.export",
-            "train.init_from",
+            "network",
         )
     # The absolute path of a file is recorded, so that it is found from any folder.
     shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
@@ -270,7 +270,7 @@ def choose_validation(
         record["data"] = "shapes"
     if initial is None or _learned_from_other_kind(initial, data):
         return ValidationPart(fraction, record)
-    name = settings.train.init_from
+    name = settings.network
     left_out = _fraction_left_out(initial, record)
     if left_out is None:
         console.debug("validation: %s does not say whether it learned from these images, too", name)

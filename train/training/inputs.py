@@ -13,7 +13,7 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
-from renderer.errors import InputError, require_choice, require_range
+from renderer.errors import InputError, require_range
 from renderer.settings import MAX_SIZE
 from train import console
 from train.class_names import class_name, require_others
@@ -23,15 +23,13 @@ from train.data.rendered_shapes import load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled, relabeled
 from train.device import choose_rasterizer
 from train.processes import main_process_first
-from train.settings import MIN_SIZE, OTHER, ExperimentSettings, label_names
+from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
 from train.system.user_errors import keyed, keys_of
 from train.training.initial import Initial, load_initial
 
-# Pixels per side of the images if neither the setting data.size nor the network with
+# Pixels per side of the images if neither the setting `size` nor the network with
 # whose weights a run begins gives a size.
 SIZE = 32
-# Values of the setting data.name.
-SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 
 
 def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
@@ -46,9 +44,9 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
     Without a size in the settings, the images get the size that `initial` takes.
     """
     name = settings.data.name
-    require_choice("data.name", name, SOURCES)
     console.debug("data: %s", name)
-    with main_process_first(), keyed(**keys_of("data", settings.data)):
+    group = UNLABELED if name == UNLABELED else ""
+    with main_process_first(), keyed(group, **keys_of("data", settings.data)):
         data = _load(name, settings, initial)
     with keyed("data.path"):
         require_range("image size", data.size, MIN_SIZE, MAX_SIZE)
@@ -62,7 +60,7 @@ def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> D
         return load_cifar100(data.path)
     if name == "npz":
         return load_npz(data.path)
-    size = data.size or (initial.size if initial else SIZE)
+    size = settings.size or (initial.size if initial else SIZE)
     if name == "shapes":
         cache = TensorCache(cache_folder(settings.train.cache))
         return load_shapes(
@@ -72,9 +70,10 @@ def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> D
             seed=data.seed,
             cache=cache,
         )
-    load_images = load_folder if name == "folder" else load_unlabeled
+    is_labeled = name == "folder"
+    load_images = load_folder if is_labeled else load_unlabeled
     return load_images(
-        data.path,
+        data.path if is_labeled else str(settings.unlabeled),
         size=size,
         test_fraction=data.test_fraction,
         skip_unreadable=settings.evaluate.skip_unreadable,
@@ -97,7 +96,7 @@ def require_label(settings: ExperimentSettings, data: DataSet) -> None:
         )
     for label in () if settings.label is None else label_names(settings.label):
         name = class_name(data.classes, label, "label")
-        if name != label and settings.evaluate.folders:
+        if name != label and settings.scored_folders:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
 
 
@@ -111,7 +110,7 @@ def relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None
         if not (initial and settings.train.distillation_weight):
             raise InputError(
                 f"data.name={settings.data.name} has no labels, and requires a network to imitate: "
-                "set train.init_from and train.distillation_weight"
+                "set network and train.distillation_weight"
             )
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
@@ -125,7 +124,7 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
     An example is "rendered solids of 5 of the network's 1000 classes".
     """
     if not data.labeled:
-        return f"the predictions of {settings.train.init_from} for held-out photographs"
+        return f"the predictions of {settings.network} for held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
     # Classes are counted in the training images, because the test images are not read
     # before the end of the run.
@@ -151,7 +150,7 @@ def build_service(
     names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
-    is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1
+    is_ranked = bool(settings.hard_negatives) or len(names) > 1
     positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
         positive_classes = [class_index(data.classes, name, "label") for name in names]
@@ -163,7 +162,7 @@ def build_service(
         is_ranked = len(labels.unique()) > 1
     elif settings.augment.renders:
         positive_names = [data.classes[index] for index in positive_classes]
-        require_others(settings.hard_negatives, positive_names, data.classes)
+        require_others(settings.negative_objects, positive_names, data.classes)
         label_of_class = _class_indices(settings, data)
         # An object of no class of the network has a complementary label: the negative
         # number says only that it is not of a positive class.

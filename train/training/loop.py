@@ -103,8 +103,12 @@ class Trainer:
         service: AugmentationService,
         folder: Path,
         labeled: bool = True,
+        has_initial: bool = False,
     ):
-        """Check the settings, and build the optimizer."""
+        """Check the settings, and build the optimizer.
+
+        With `has_initial`, the present weights are those of an initial network.
+        """
         require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError(
@@ -137,7 +141,7 @@ class Trainer:
         self.model = model
         self.device = next(model.parameters()).device
         self.initial: MixedPrecision | None = None
-        if settings.init_from:
+        if has_initial:
             self.initial = deepcopy(model).eval().requires_grad_(False)
         self.averages = Averages(
             model,

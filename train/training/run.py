@@ -100,14 +100,14 @@ class Run:
         self.folder = folder
         self.command = command
         self.initial = initial
-        self.scored_folders = settings.evaluate.folders
+        self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
         self._initial_predictions: Tensor | None = None
         require_label(settings, self.data)
         for name, photographs in self.scored_folders.items():
             require_outside(folder / name, photographs)
-            with keyed("evaluate.photos"):
+            with keyed("photos"):
                 labels = choose_labels(photographs, self.data.classes, settings.label)
                 find_photographs(photographs, self.data.classes, labels)
         set_deterministic(settings.train.deterministic)
@@ -208,7 +208,7 @@ class Run:
             return None
         if not resumes:
             raise InputError(
-                f"run={self.folder} holds a run already: "
+                f"out={self.folder} holds a run already: "
                 "set train.resume=true to continue it, overwrite=true to replace it, "
                 "or run to another folder",
             )
@@ -292,7 +292,7 @@ class Run:
         accuracy = (predictions == self.data.test.labels).float().mean().item()
         if self.data.labeled:
             images = describe_test_images(settings, self.data)
-            name = settings.train.init_from
+            name = settings.network
             console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
         self._score_photographs(cached, self.folder / BEFORE)
         return {"test/accuracy_before": accuracy}
@@ -358,7 +358,7 @@ class Run:
                 before = Split(test.images, predictions.to(trainer.device))
                 agreement = evaluate(trainer.selected, before)["accuracy"]
             scores["test/agreement"] = agreement
-            console.debug("agreement with %s: %.4f", self.settings.train.init_from, agreement)
+            console.debug("agreement with %s: %.4f", self.settings.network, agreement)
             if has_consistency:
                 scores |= self._relit_agreement(predictions, agreement)
         return scores
@@ -481,7 +481,7 @@ def build_trainer(
     if initial:
         initial.copy_to(network, facts)
         if initial.network is None:
-            say_inputs(str(settings.train.init_from), network, data.size, initial.assumed)
+            say_inputs(str(settings.network), network, data.size, initial.assumed)
     light = settings.normalize_light or (initial.normalize_light if initial else None)
     if light is not None:
         facts[NORMALIZE_LIGHT] = light
@@ -504,7 +504,8 @@ def build_trainer(
     description = describe(without_normalized_light(network), **facts, validation=validation.record)
     service = build_service(settings, data, device)
     with keyed(**keys):
-        return Trainer(recipe, model, description, service, folder, data.labeled)
+        has_initial = initial is not None
+        return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
@@ -515,7 +516,7 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     name = shape.get("name", initial.name)
     if name != initial.name:
         raise InputError(
-            f"model.name={name} is not the architecture of train.init_from={initial.source}: "
+            f"model.name={name} is not the architecture of network={initial.source}: "
             "leave model.name out",
         )
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}

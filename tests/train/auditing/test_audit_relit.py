@@ -37,7 +37,7 @@ def photographs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def settings(photographs, tmp_path_factory) -> AuditSettings:
     out = tmp_path_factory.mktemp("audit") / "out"
-    return AuditSettings(classifier="first", photographs=str(photographs), out=str(out))
+    return AuditSettings(network="first", unlabeled=str(photographs), out=str(out))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_the_page_names_every_class_and_shows_pictures(page, settings):
 
 def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_path):
     name = "python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
-    named = replace(settings, classifier=name, out=str(tmp_path / "out"), budget=0.02)
+    named = replace(settings, network=name, out=str(tmp_path / "out"), budget=0.02)
     run_audit(named)
     path = tmp_path / "out" / "classifier" / RELIT_FOLDER / RELIT
     marked = path.read_text().replace('"predicted": "', '"predicted": "marked ')
@@ -80,22 +80,22 @@ def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_pat
 
 def test_the_budget_limits_the_photographs(photographs, tmp_path):
     out = tmp_path / "out"
-    few = AuditSettings(classifier="first", photographs=str(photographs), out=str(out), budget=0.03)
+    few = AuditSettings(network="first", unlabeled=str(photographs), out=str(out), budget=0.03)
     text = run_audit(few, {"classifier": NETWORKS["classifier"]}).path.read_text()
     scores = read_relit(out / "classifier" / RELIT_FOLDER)
     assert [item.path for item in scores.photographs] == ["0.png", "4.png", "9.png"]
     assert "holds 10 photographs" in text
 
 
-@pytest.mark.parametrize("values", [{}, {"photographs": "a", "hard_negatives": ["solid:ball"]}])
+@pytest.mark.parametrize("values", [{}, {"unlabeled": "a", "hard_negatives": ["solid:ball"]}])
 def test_an_audit_needs_meshes_or_photographs(values):
     with pytest.raises(InputError, match="meshes"):
-        AuditSettings(classifier="first", **values)
+        AuditSettings(network="first", **values)
 
 
 def test_a_missing_folder_is_an_error_before_anything_is_written(tmp_path):
     out = tmp_path / "out"
-    settings = AuditSettings(classifier="first", photographs=str(tmp_path / "no"), out=str(out))
+    settings = AuditSettings(network="first", unlabeled=str(tmp_path / "no"), out=str(out))
     with pytest.raises(InputError, match="not a folder"):
         run_audit(settings, {"classifier": NETWORKS["classifier"]})
     assert not out.exists()

@@ -18,7 +18,7 @@ from train.command import USER_ERROR
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
-    f"classifier=run:{PRETRAINED / 'none'}",
+    f"network=run:{PRETRAINED / 'none'}",
     "attack.force=true",
     "attack.max_steps=2",
     "attack.allow_negative=true",
@@ -118,7 +118,7 @@ class TestAnAttack:
 
 
 def test_the_class_is_that_of_the_name_of_each_mesh(run, tmp_path):
-    meshes = "scene.meshes=['solid:apple:0','solid:orange:0']"
+    meshes = "meshes=['solid:apple:0','solid:orange:0']"
     assert run("attack=pixels", meshes, "attack.force=true", *WITHOUT_CHECKS) == 0
     for folder, label in (("0_solid_apple_0", "apple"), ("1_solid_orange_0", "orange")):
         (line,) = read_lines(tmp_path / "out" / folder / "attack.jsonl")
@@ -137,7 +137,7 @@ class TestFilesOfAnAttack:
         shape = example / "mesh.glb"
         assert load_light(str(light)).shape == (49, 3)
         assert len(load_mesh(shape).faces) > 0
-        meshes = f"scene.meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
+        meshes = f"meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
         shown = meshes, f"scene.light={light}"
         assert run("attack=pixels", "out=again", "label=orange", *shown, *WITHOUT_CHECKS) == 0
         folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
@@ -178,7 +178,7 @@ class TestAnAdversary:
 
 
 def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
-    meshes = "scene.meshes=[solid:orange:0,solid:orange:0]"
+    meshes = "meshes=[solid:orange:0,solid:orange:0]"
     radii = "attack.radius_scales=[1,0.2]"
     assert run("attack=lighting", meshes, *WITHOUT_CHECKS, radii) == 0
 
@@ -210,7 +210,7 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
             "attack.checks=false",
             "attack.sensor_noise=0",  # The few steps do not find a margin for noise.
             "scene.views=2",
-            f"transfer.classifiers=[run:{PRETRAINED / 'none'},run:{PRETRAINED / 'best'}]",
+            f"transfer.networks=[run:{PRETRAINED / 'none'},run:{PRETRAINED / 'best'}]",
             "transfer.azimuths=[-20,0]",
             "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]",
         )
@@ -234,9 +234,9 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
 
 
 MISTAKES = [
-    (["classifier=resnet18"], "classifier=resnet18"),
-    (["transfer.classifiers=[resnet18]"], "transfer.classifiers=resnet18"),
-    (["transfer.classifiers=[{network: x}]"], "unknown key network"),
+    (["network=resnet18"], "network=resnet18"),
+    (["transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
+    (["transfer.networks=[{model: x}]"], "unknown key model"),
     (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
     (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
@@ -272,8 +272,8 @@ def test_a_zero_gradient_is_said_once_for_each_mesh(run, tmp_path, capsys):
         "        return torch.stack([nothing + 2, nothing], dim=1)\n"
         "    return constant, 8, ['orange', 'apple']\n"
     )
-    meshes = "scene.meshes=['solid:orange:0','solid:apple:0']"
-    network = "classifier=python:constant_network:load"
+    meshes = "meshes=['solid:orange:0','solid:apple:0']"
+    network = "network=python:constant_network:load"
     assert run("attack=skylight", meshes, network, "attack.verify=null") == 0
     captured = capsys.readouterr()
     assert (captured.out + captured.err).count(ZERO_GRADIENT) == 2

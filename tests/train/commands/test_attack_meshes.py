@@ -64,7 +64,7 @@ def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
 
 def test_exposure_multiplies_the_light_and_albedo_scale_the_surface():
     unchanged = "attack.max_steps=0", "attack.force=true"
-    whiter_mesh = "scene.meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]"
+    whiter_mesh = "meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]"
     same = attacked(*unchanged).images_before
     brighter = attacked(*unchanged, "scene.exposure=1.5").images_before
     whiter = attacked(*unchanged, whiter_mesh).images_before
@@ -127,24 +127,24 @@ class TestARasterizerThatDoesNotStart:
     ("arguments", "message"),
     [
         (["attack.restarts=2"], "restarts draws from the norm-balls"),
-        (["scene.meshes=[]"], r"^scene\.meshes must not be empty"),
+        (["meshes=[]"], r"^scene\.meshes must not be empty"),
         (["label=mango"], "'mango' is not a class of the model"),
         (
             ["target=[lime]", "scene.views=2", "attack.shared=true"],
             "names 1 classes for 2 views",
         ),
         (["target=[[lime]]"], "^target"),
-        (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
+        (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
         (
-            ["scene.meshes=[{mesh: a, props: [solid:cup]}]"],
+            ["meshes=[{mesh: a, props: [solid:cup]}]"],
             r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'",
         ),
         (
-            ["scene.meshes=[{mesh: a, props: [{mesh: b}]}]"],
-            r"scene.meshes\[0\].*at is not set",
+            ["meshes=[{mesh: a, props: [{mesh: b}]}]"],
+            r"meshes\[0\].*at is not set",
         ),
         (
-            ["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
+            ["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
             r"props\[0\]\.at=\[1\]: give two numbers",
         ),
     ],

@@ -33,7 +33,7 @@ def photographs(tmp_path_factory):
 
 
 def settings_of(*words):
-    name = "classifier=python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
+    name = "network=python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
     return main.read(list_parameters([name, *words]))
 
 
@@ -41,7 +41,7 @@ def settings_of(*words):
 def out(photographs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("attack") / "out"
     size = ["attack.relighting.passes=5", "attack.relighting.slides=2"]
-    run(settings_of("attack=relighting", f"photographs={photographs}", f"out={folder}", *size))
+    run(settings_of("attack=relighting", f"unlabeled={photographs}", f"out={folder}", *size))
     return folder
 
 
@@ -84,8 +84,8 @@ def test_pictures_show_the_photograph_and_its_lights(out, photographs):
     "words",
     [
         ["attack=relighting"],
-        ["photographs=folder"],
-        ["attack=relighting+lighting", "photographs=folder"],
+        ["unlabeled=folder"],
+        ["attack=relighting+lighting", "unlabeled=folder"],
     ],
 )
 def test_relighting_needs_photographs_alone(words):
@@ -95,4 +95,4 @@ def test_relighting_needs_photographs_alone(words):
 
 def test_earlier_results_are_not_replaced(out, photographs):
     with pytest.raises(InputError, match="overwrite"):
-        run(settings_of("attack=relighting", f"photographs={photographs}", f"out={out}"))
+        run(settings_of("attack=relighting", f"unlabeled={photographs}", f"out={out}"))

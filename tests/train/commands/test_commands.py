@@ -82,7 +82,7 @@ class TestEvaluation:
         assert found == pytest.approx(log_odds, abs=1e-4)
 
     def test_of_a_classifier_named_by_its_run_is_the_same(self, call, scores, here):
-        assert call(*EVALUATE_CLASSIFIER, "classifier=run:1.10", "out=classifier") == 0
+        assert call(*EVALUATE_CLASSIFIER, "network=run:1.10", "out=classifier") == 0
         same = (here / "classifier" / "predictions.csv").read_bytes()
         assert (scores / "predictions.csv").read_bytes() == same
 
@@ -165,11 +165,10 @@ MISTAKES = [
     ([*EVALUATE, "label=[]"], "label=[]"),
     ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear'"),
     (
-        [*EVALUATE, "classifier=python:own:build"],
-        "run=1.10 and classifier=python:own:build do not",
+        [*EVALUATE, "network=torchvision:resnet18"],
+        "run=1.10 and network=torchvision:resnet18 do not",
     ),
-    ([*EVALUATE_CLASSIFIER, "classifier=python:own:build", "model=python:a:b"], "model=python:a:b"),
-    ([*EVALUATE_CLASSIFIER, "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
+    ([*EVALUATE_CLASSIFIER, "network=python:nowhere:build"], "network=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b"),
     ([*EVALUATE, "out=file"], "out=file"),
     (["compare"], "runs is not set"),
@@ -206,7 +205,7 @@ def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
 
 @pytest.mark.parametrize(
     "command",
-    [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]],
+    [EVALUATE, ["attack", "network=run:1.10"], ["lab"]],
     ids=lambda given: given[0],
 )
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):

@@ -122,4 +122,4 @@ def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(
 def test_the_command_of_a_run_starts_as_the_run_did(monkeypatch, started, processes, words):
     monkeypatch.setattr(sys, "argv", [started])
     monkeypatch.setenv("WORLD_SIZE", str(processes))
-    assert format_command(["seed=1", "run=a", "train.resume=true"]) == words
+    assert format_command(["seed=1", "out=a", "train.resume=true"]) == words

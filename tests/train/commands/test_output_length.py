@@ -12,7 +12,7 @@ PRETRAINED = Path(__file__).parents[3] / "pretrained"
 MAX_LINES = 15
 SOLIDS = ",".join(f"solid:orange:{seed}" for seed in range(14))
 ATTACK = [
-    f"classifier=run:{PRETRAINED / 'none'}",
+    f"network=run:{PRETRAINED / 'none'}",
     "attack.max_steps=1",
     "attack.force=true",
     "attack.checks=false",
@@ -43,8 +43,8 @@ def sweep(made_up_run, tmp_path) -> list[Path]:
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(["attack", f"scene.meshes=[{SOLIDS}]", *ATTACK], marks=pytest.mark.slow),
-        ["attack", "scene.meshes=solid:orange:0", *ATTACK, *TRANSFER],
+        pytest.param(["attack", f"meshes=[{SOLIDS}]", *ATTACK], marks=pytest.mark.slow),
+        ["attack", "meshes=solid:orange:0", *ATTACK, *TRANSFER],
         ["compare", f"runs=[{','.join(f'sweep/{index}' for index in range(20))}]"],
         ["report", "runs=[sweep]", "out=page"],
         ["light", "light=grace", "height=4", "out=grace.hdr"],

@@ -35,7 +35,7 @@ from train.training.initial import load_initial, with_label
 from train.training.run import _network_shape
 
 OWN = [
-    f"classifier=torchvision:{NAME}",
+    f"network=torchvision:{NAME}",
     "weights=mine.pth",
     "classes=classes.txt",
     f"size={SIZE}",
@@ -125,7 +125,7 @@ def test_an_attack_finds_the_class_by_its_name_or_index(call, here):
             "attack.checks=false",
             "attack.verify=null",
         ]
-        scene = ["scene.meshes=solid:orange:0", "renderer.shadows=false", f"out={label}"]
+        scene = ["meshes=solid:orange:0", "renderer.shadows=false", f"out={label}"]
         assert call("attack", *OWN, *words, *scene) == 0
         (line,) = (here / str(label) / "0_solid_orange_0" / "attack.jsonl").read_text().splitlines()
         assert json.loads(line)["label"] == ["Orange"]
@@ -167,8 +167,8 @@ def harden(here, monkeypatch) -> Callable[..., Path]:
             "train.precision=float32",
         ]
         scene = [
-            "scene.meshes=solid:orange",
-            "scene.hard_negatives=solid:lemon",
+            "meshes=solid:orange",
+            "hard_negatives=solid:lemon",
             "scene.backgrounds=[0.2]",
         ]
         machine = [
@@ -179,12 +179,12 @@ def harden(here, monkeypatch) -> Callable[..., Path]:
             "evaluate.laboratory_setups=0",
         ]
         data = [
-            "data.path=photos",
+            "unlabeled=photos",
             "data.workers=0",
             "data.validation=0.2",
             "data.test_fraction=0.2",
         ]
-        words = ("experiment=classifier", f"run={folder}", *recipe, *scene, *machine, *data, *words)
+        words = ("experiment=classifier", f"out={folder}", *recipe, *scene, *machine, *data, *words)
         completed_run(train_command.read(list(words)), folder)
         return folder
 
@@ -193,10 +193,10 @@ def harden(here, monkeypatch) -> Callable[..., Path]:
 
 def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
     start = [
-        f"train.init_from=torchvision:{NAME}",
+        f"network=torchvision:{NAME}",
         "weights=mine.pth",
         "classes=classes.txt",
-        f"data.size={SIZE}",
+        f"size={SIZE}",
     ]
     folder = harden(*start, "label=Orange")
     images = renders()[0][:4]
@@ -211,12 +211,12 @@ def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
 
 def test_the_index_of_a_class_is_replaced_by_its_name(here, monkeypatch):
     monkeypatch.chdir(here)
-    network = [f"train.init_from=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt"]
-    meshes = "scene.meshes=[{mesh: 'solid:orange', label: 1}]"
-    words = ["experiment=classifier", *network, "data.path=photos", meshes, "label=1"]
+    network = [f"network=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt"]
+    meshes = "meshes=[{mesh: 'solid:orange', label: 1}]"
+    words = ["experiment=classifier", *network, "unlabeled=photos", meshes, "label=1"]
     settings = with_label(train_command.read(words))
     assert settings.label == CLASSES[1]
-    assert settings.scene.meshes[0]["label"] == CLASSES[1]
+    assert settings.meshes[0]["label"] == CLASSES[1]
 
 
 def save_torchscript(network: nn.Module) -> str:
@@ -231,9 +231,9 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
 ):
     monkeypatch.chdir(here)
     network = trained_network().eval()
-    words = [f"train.init_from={save_torchscript(network)}", f"normalization={normalization}"]
-    words += ["trust=true", "classes=classes.txt", f"data.size={SIZE}", "data.path=photos"]
-    scene = ["scene.meshes=[solid:orange]", "label=Orange"]
+    words = [f"network={save_torchscript(network)}", f"normalization={normalization}"]
+    words += ["trust=true", "classes=classes.txt", f"size={SIZE}", "unlabeled=photos"]
+    scene = ["meshes=[solid:orange]", "label=Orange"]
     settings = train_command.read(["experiment=classifier", *words, *scene])
     initial = load_initial(settings)
     shape = _network_shape(settings, initial)
@@ -266,16 +266,16 @@ def test_a_network_in_a_file_is_attacked_audited_and_hardened(
     """The class is given by its index. The hardened weights load into the network of the file."""
     monkeypatch.chdir(here)
     name = save(nn.Sequential(Normalize(MEAN, STD), trained_network()).eval())
-    network = [f"classifier={name}", "classes=classes.txt", f"size={SIZE}", "device=cpu"]
+    network = [f"network={name}", "classes=classes.txt", f"size={SIZE}", "device=cpu"]
     network += ["trust=true"]
     label = f"label={CLASSES.index('Orange')}"
-    scene = ["scene.meshes=solid:orange:0", "renderer.shadows=false", "attack.max_steps=1"]
+    scene = ["meshes=solid:orange:0", "renderer.shadows=false", "attack.max_steps=1"]
     assert call("attack", *network, label, *scene, "attack.checks=false", "out=attack") == 0
     meshes = ["meshes=solid:orange", "environments=[]", "budget=0.01", "laboratory=photos"]
     assert call("audit", *network, label, *meshes, "out=audit") == 0
     assert (here / "audit" / "report.html").is_file()
 
-    start = [f"train.init_from={name}", "classes=classes.txt", f"data.size={SIZE}", "trust=true"]
+    start = [f"network={name}", "classes=classes.txt", f"size={SIZE}", "trust=true"]
     folder = harden(*start, label)
     images = renders()[0][:4]
     original = load_original(name)

@@ -13,17 +13,17 @@ from train.results.overwrite import require_new_run, require_replaceable
 from train.run_config import write_config
 from train.run_folder import LAST
 
-# Arguments of each command except for out=, or run= of a training.
+# Arguments of each command except for out=.
 COMMANDS = {
     "attack": [
-        "classifier=run:network",
-        "scene.meshes=['solid:orange']",
+        "network=run:network",
+        "meshes=['solid:orange']",
         "attack.force=true",
         "device=cpu",
         "renderer.shadows=false",
     ],
     "audit": [
-        "classifier=run:network",
+        "network=run:network",
         "meshes=['solid:orange']",
         "hard_negatives=['solid:lemon']",
         "device=cpu",
@@ -80,8 +80,8 @@ def test_a_folder_with_results_of_any_command_is_refused_by_its_argument(tmp_pat
     write_results(tmp_path, command)
     with pytest.raises(renderer.InputError, match=r"^out=.*overwrite=true"):
         require_replaceable(tmp_path, "out", overwrite=False)
-    with pytest.raises(renderer.InputError, match=r"^run=.*"):
-        require_replaceable(tmp_path, "run", overwrite=False)
+    with pytest.raises(renderer.InputError, match=r"^out=.*"):
+        require_replaceable(tmp_path, "out", overwrite=False)
     require_replaceable(tmp_path, "out", overwrite=True)
 
 
@@ -96,18 +96,17 @@ def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it
 ):
     write_results(here / "out", other)
     before = contents(here)
-    argument = "run" if command == "train" else "out"
-    assert call(command, *COMMANDS[command], f"{argument}=out") == USER_ERROR
+    assert call(command, *COMMANDS[command], "out=out") == USER_ERROR
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if line.startswith("error: ")]
-    assert f"{argument}=" in error
+    assert "out=" in error
     assert "overwrite=true" in error
     assert contents(here) == before
 
 
 @pytest.mark.parametrize("command", ["attack", "audit", "evaluate", "publish"])
 def test_no_command_writes_into_the_folder_of_a_run(call, here, capsys, command):
-    (here / "network" / "config.yaml").write_text("train: {}\nrun: network\n")
+    (here / "network" / "config.yaml").write_text("train: {}\nout: network\n")
     before = contents(here / "network")
     assert call(command, *COMMANDS[command], "out=network") == USER_ERROR
     assert "overwrite=true" in capsys.readouterr().err
@@ -161,7 +160,7 @@ EPOCH_LINE = '{"epoch": 1, "train/loss": 1.0}\n'
 def test_a_run_that_ended_before_its_first_checkpoint_is_started_again(tmp_path, tiny):
     write_config(tmp_path, tiny())
     (tmp_path / "metrics.jsonl").write_text(EPOCH_LINE)
-    require_new_run(tmp_path, "run", overwrite=False, resume=False)
+    require_new_run(tmp_path, "out", overwrite=False, resume=False)
 
 
 @pytest.mark.parametrize("resume", [False, True])
@@ -169,5 +168,5 @@ def test_a_finished_run_is_replaced_by_overwrite_alone(tmp_path, tiny, resume):
     write_config(tmp_path, tiny())
     (tmp_path / "metrics.jsonl").write_text(EPOCH_LINE + '{"test/accuracy": 0.5}\n')
     with pytest.raises(renderer.InputError, match=r"metrics\.jsonl.*overwrite=true"):
-        require_new_run(tmp_path, "run", overwrite=False, resume=resume)
-    require_new_run(tmp_path, "run", overwrite=True, resume=False)
+        require_new_run(tmp_path, "out", overwrite=False, resume=resume)
+    require_new_run(tmp_path, "out", overwrite=True, resume=False)

@@ -36,7 +36,7 @@ SMALL = [
     "train.learning_rate=0.05",
     "train.precision=float32",
     "train.device=cpu",
-    "evaluate.photos=null",
+    "photos=null",
 ]
 
 
@@ -109,8 +109,8 @@ def require_same_weights(first: Path, second: Path) -> None:
         ),
         (["train.learning_rate=1e-3", "seed=-1"], "seed--1+train.learning_rate-1e-3"),
         (
-            ["scene.meshes=[a.glb,{mesh:b.glb,albedo_scale:2}]"],
-            "scene.meshes-_a.glb_mesh_b.glb_albedo_scale_2_",
+            ["meshes=[a.glb,{mesh:b.glb,albedo_scale:2}]"],
+            "meshes-_a.glb_mesh_b.glb_albedo_scale_2_",
         ),
     ],
 )
@@ -133,7 +133,7 @@ def name_of(values: dict[str, str]) -> str:
 
 CHARACTERS = st.characters(exclude_categories=["Cs"], exclude_characters="\n")
 VALUES = st.text(CHARACTERS, max_size=300)
-KEYS = st.sampled_from(["seed", "augment", "data.path", "scene.meshes"])
+KEYS = st.sampled_from(["seed", "augment", "data.path", "meshes"])
 RUNS = st.dictionaries(KEYS, VALUES)
 
 
@@ -253,8 +253,8 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
         ("augment=none,randm", "augment=randm is not a choice"),
         ("train.soup=false,true", "train.soup=True needs a network to begin with"),
         ("data.path=missing.npz", "data.path=missing.npz does not exist"),
-        ("train.init_from=null,missing.pt", "train.init_from"),
-        ("evaluate.photos=null,missing", "evaluate.photos: missing is not a folder"),
+        ("network=null,missing.pt", "network"),
+        ("photos=null,missing", "photos: missing is not a folder"),
         ("model.name=wideresnet,torchvision:resnet", "model.name"),
     ],
 )

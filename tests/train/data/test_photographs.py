@@ -142,7 +142,7 @@ def test_names_with_accents_are_equal_in_both_forms_of_unicode(tmp_path, of_clas
     assert class_folders(tmp_path, classes) == sorted([classes[0], classes[2]])
     assert class_index(classes, normalize(of_others, "açaí"), "label") == 1
     mesh = normalize(of_others, "crème_brûlée.glb")
-    assert classes_of_meshes([mesh], classes, "scene.meshes") == [classes[2]]
+    assert classes_of_meshes([mesh], classes, "meshes") == [classes[2]]
 
 
 def test_pipes_and_sockets_are_no_photographs(tmp_path):

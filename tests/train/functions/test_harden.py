@@ -105,11 +105,11 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     (tmp_path / "module_of_a_user.py").write_text(MODULE)
     overrides = [
         "experiment=classifier",
-        "train.init_from=python:module_of_a_user:make",
-        f"data.path={photographs}",
+        "network=python:module_of_a_user:make",
+        f"unlabeled={photographs}",
         "data.workers=0",
-        "scene.meshes=[solid:orange:0]",
-        "scene.hard_negatives=[solid:lemon]",
+        "meshes=[solid:orange:0]",
+        "hard_negatives=[solid:lemon]",
         "scene.views=1",
         "scene.backgrounds=[0.5]",
         "renderer.rasterizer=numpy",

@@ -11,8 +11,8 @@ from train.settings import ExperimentSettings
 @pytest.fixture
 def settings() -> ExperimentSettings:
     """Read the settings of the hardening of a classifier by an orange and other fruit."""
-    words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
-    meshes = "scene.meshes=[solid:orange:0,solid:orange]"
+    words = ("experiment=classifier", "network=pretrained/none", "unlabeled=photos")
+    meshes = "meshes=[solid:orange:0,solid:orange]"
     return train_command.read([*words, "label=orange", meshes])
 
 
@@ -34,8 +34,8 @@ def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path
 
 @pytest.mark.parametrize("label", ["mug", "golf ball", "cup", "sweet pepper"])
 def test_a_class_has_its_meshes_of_training_only_if_it_cannot_be_generated(label, tmp_path):
-    words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
-    mesh = f"scene.meshes=[{{mesh: own.glb, label: {label}}}]"
+    words = ("experiment=classifier", "network=pretrained/none", "unlabeled=photos")
+    mesh = f"meshes=[{{mesh: own.glb, label: {label}}}]"
     own = train_command.read([*words, f"label={label}", mesh])
     aside = kept_aside_settings(own, [label], 32, tmp_path)
     meshes = [item["mesh"] for item in aside.meshes if item["label"] == label]

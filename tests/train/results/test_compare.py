@@ -160,7 +160,7 @@ class TestAnotherFolderOfPhotographs:
         assert title in compare(folders, photographs="lab")
 
     def test_is_refused_if_no_run_has_it(self, folders):
-        with pytest.raises(InputError, match=r"^photographs=lib: no run has"):
+        with pytest.raises(InputError, match=r"^photos=lib: no run has"):
             compare(folders, photographs="lib")
 
     def test_excludes_only_sources_that_it_has(self, folders):
@@ -207,7 +207,7 @@ class TestAHardenedNetwork:
         oranges = {"random": [1, 1, -1, -1], "adversarial": [1, 1, 1, 1]}
         folders = []
         for method, scores in oranges.items():
-            folder = scored_run(method, {"web": (scores, [0, 2])}, "train.init_from=base")
+            folder = scored_run(method, {"web": (scores, [0, 2])}, "network=base")
             copytree(initial, folder / "before" / "photographs")
             log = folder / "metrics.jsonl"
             before = '"test/accuracy_before": 0.5, "test/epoch"'

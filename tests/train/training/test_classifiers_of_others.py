@@ -27,8 +27,8 @@ SIZE = 32
 SETTINGS = [
     "experiment=harden",
     "augment=none",
-    f"train.init_from=torchvision:{NAME}",
-    f"data.size={SIZE}",
+    f"network=torchvision:{NAME}",
+    f"size={SIZE}",
     "data.test_fraction=0.25",
     "data.validation=0.25",
     "train.device=cpu",
@@ -79,7 +79,8 @@ def tuned(weights, photos, tmp_path_factory) -> Callable[..., tuple[Path, dict[s
 
     def run(data: str, *overrides: str) -> tuple[Path, dict[str, float]]:
         folder = tmp_path_factory.mktemp("runs") / "run"
-        files = [f"data.path={photos}", f"weights={weights}", f"run={folder}"]
+        files = [f"data.path={photos}", f"unlabeled={photos}", f"weights={weights}"]
+        files.append(f"out={folder}")
         settings = train_command.read([*SETTINGS, f"data={data}", *files, *overrides])
         return folder, completed_run(settings, folder)
 
@@ -89,7 +90,7 @@ def tuned(weights, photos, tmp_path_factory) -> Callable[..., tuple[Path, dict[s
 @pytest.fixture(scope="module")
 def almost_fixed(tuned) -> tuple[Path, dict[str, float]]:
     """Train two epochs on unlabeled images, without changing the weights noticeably."""
-    return tuned("unlabelled", ALMOST_FIXED, "train.epochs=2")
+    return tuned("unlabeled", ALMOST_FIXED, "train.epochs=2")
 
 
 def normalized_logits(
@@ -120,14 +121,14 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     assert load_run(folder).size == SIZE
     torch.testing.assert_close(load_run(folder)(images), expected, rtol=1e-4, atol=1e-4)
 
-    init_from = [f"train.init_from={folder}", "weights=null"]
-    continued, _ = tuned("unlabelled", *init_from, ALMOST_FIXED)
+    initial = [f"network={folder}", "weights=null"]
+    continued, _ = tuned("unlabeled", *initial, ALMOST_FIXED)
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_run_says_the_size_of_its_images_and_that_their_normalization_is_assumed(tuned, caplog):
     _say_once.cache_clear()
-    tuned("unlabelled", ALMOST_FIXED)
+    tuned("unlabeled", ALMOST_FIXED)
     (line,) = [item.message for item in caplog.records if "pixels, " in item.message]
     assert f"torchvision:{NAME}" in line
     assert f"{SIZE} × {SIZE}" in line
@@ -141,7 +142,7 @@ class TestNormalizedLight:
     @classmethod
     def trained(cls, tuned) -> Path:
         """Train with images in normalized light, without changing the weights noticeably."""
-        folder, _ = tuned("unlabelled", ALMOST_FIXED, "normalize_light={white_balance: 1.0}")
+        folder, _ = tuned("unlabeled", ALMOST_FIXED, "normalize_light={white_balance: 1.0}")
         return folder
 
     @pytest.fixture
@@ -165,14 +166,12 @@ class TestNormalizedLight:
         assert state.keys() == load_torchvision(weights).state_dict().keys()
 
     def test_is_remembered_by_the_network_of_the_next_run(self, tuned, trained, expected):
-        continued, _ = tuned(
-            "unlabelled", f"train.init_from={trained}", "weights=null", ALMOST_FIXED
-        )
+        continued, _ = tuned("unlabeled", f"network={trained}", "weights=null", ALMOST_FIXED)
         images = self.images()
         torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
 
     def test_is_put_before_a_network_that_was_trained_without(self, tuned, weights, expected):
-        plain, _ = tuned("unlabelled", ALMOST_FIXED)
+        plain, _ = tuned("unlabeled", ALMOST_FIXED)
         network = load_network(f"run:{plain}", normalize_light={"white_balance": 1.0})
         torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
 
@@ -186,7 +185,7 @@ def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fix
 
 
 def test_batch_statistics_change_the_predictions_outside_of_eval_mode(tuned):
-    folder, _ = tuned("unlabelled", ALMOST_FIXED, "train.eval_mode=false")
+    folder, _ = tuned("unlabeled", ALMOST_FIXED, "train.eval_mode=false")
     assert read_metrics(folder)[0]["train/loss"] > 0.01
 
 
@@ -206,7 +205,7 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
     assert scores["test/agreement"] == 1
     assert scores["test/accuracy"] == scores["test/accuracy_before"]
 
-    files = ["data=folder", f"data.path={photos}", f"weights={weights}", "run=-"]
+    files = ["data=folder", f"data.path={photos}", f"weights={weights}", "out=-"]
     test = load_data(train_command.read([*SETTINGS, *files])).test
     classifier = load_classifier(f"torchvision:{NAME}", weights)
     class_of_label = torch.tensor([classifier.label("lemon"), classifier.label("orange")])
@@ -220,16 +219,16 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
     [
         ("label=ornage", "label: 'ornage' is not a class of the model"),
         ("weights=absent.pt", "absent.pt does not exist"),
-        ("train.init_from=torchvision:resnet18", r"weights=.*torchvision:resnet18 "),
-        ("train.init_from=pretrained/none", "weights=.*train.init_from=pretrained/none"),
+        ("network=torchvision:resnet18", r"weights=.*torchvision:resnet18 "),
+        ("network=pretrained/none", "weights=.*network=pretrained/none"),
         ("model.name=torchvision:resnet18", "^model.name=torchvision:resnet18"),
-        ("data.path=absent", "absent is not a folder"),
-        ("train.distillation_weight=0", "set train.init_from and train.distillation_weight"),
+        ("unlabeled=absent", "absent is not a folder"),
+        ("train.distillation_weight=0", "set network and train.distillation_weight"),
     ],
 )
 def test_settings_that_do_not_fit_the_network_are_refused_in_one_sentence(tuned, change, message):
     with pytest.raises(InputError, match=message) as caught:
-        tuned("unlabelled", "augment=random", change)
+        tuned("unlabeled", "augment=random", change)
     assert "\n" not in str(caught.value)
 
 
@@ -237,11 +236,11 @@ def test_a_file_of_weights_alone_is_no_network_to_start_from(tuned, tmp_path):
     weights = tmp_path / "weights.pt"
     torch.save({"layer.weight": torch.zeros(1)}, weights)
     with pytest.raises(InputError, match=f"torchvision:resnet50 weights={weights}$"):
-        tuned("unlabelled", "augment=random", f"train.init_from={weights}", "weights=null")
+        tuned("unlabeled", "augment=random", f"network={weights}", "weights=null")
 
 
 def test_photographs_that_stay_on_disk_train_and_score_a_network_of_their_size(tuned):
-    folder, scores = tuned("unlabelled", "data.size=96", "data.workers=2", ALMOST_FIXED)
+    folder, scores = tuned("unlabeled", "size=96", "data.workers=2", ALMOST_FIXED)
     assert read_metrics(folder)[0]["train/loss"] < 1e-6
     assert scores["test/agreement"] == 1
     assert load_run(folder)(torch.rand(1, 3, 96, 96)).shape == (1, 1000)
@@ -255,15 +254,15 @@ class TestATruncatedPhotograph:
             copy = tmp_path / f"{file.parent.name}_{file.name}"
             copy.write_bytes(file.read_bytes())
         (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 not much of a JPEG")
-        return f"data.path={tmp_path}"
+        return f"unlabeled={tmp_path}"
 
     def test_among_unlabeled_ones_is_refused(self, tuned, path):
         message = r"1 of 33 photographs .*broken\.jpg.*skip_unreadable"
         with pytest.raises(InputError, match=message):
-            tuned("unlabelled", path)
+            tuned("unlabeled", path)
 
     def test_is_skipped_and_counted_if_the_settings_say_so(self, tuned, path, caplog):
-        tuned("unlabelled", path, "evaluate.skip_unreadable=true")
+        tuned("unlabeled", path, "evaluate.skip_unreadable=true")
         assert "1 of 33 images" in caplog.text
         assert "broken.jpg" in caplog.text
 

@@ -75,19 +75,20 @@ def make_trainer(
     folder: Path,
     network: nn.Module | None = None,
     precision: str = "float32",
+    has_initial: bool = True,
     **settings,
 ) -> Trainer:
     """Make a trainer without renders."""
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)
     model = MixedPrecision(network, precision)
-    defaults = {"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"}
+    defaults = {"epochs": 3, "batch_size": 16, "learning_rate": 0.05}
     recipe = TrainSettings(**defaults | settings)
     no_labels = torch.zeros(0, dtype=torch.int64)
     no_renders = AugmentationService(
         AugmentationSettings(mode="none"), None, no_labels, 0, Phases()
     )
-    return Trainer(recipe, model, ARCHITECTURE, no_renders, folder)
+    return Trainer(recipe, model, ARCHITECTURE, no_renders, folder, has_initial=has_initial)
 
 
 def fit(trainer: Trainer, trained: Split, validated: Split) -> list[dict]:
@@ -471,7 +472,7 @@ class DivergingNetwork(nn.Module):
 )
 def test_a_run_that_diverges_ends_with_the_last_good_checkpoint(tmp_path, network):
     """The second epoch of three diverges."""
-    trainer = make_trainer(tmp_path, network, init_from=None)
+    trainer = make_trainer(tmp_path, network, has_initial=False)
     with pytest.raises(InputError, match=r"\blearning_rate=0.05\b.*\bweight_decay\b.*epoch 2\b"):
         fit_noise(trainer)
     assert load(tmp_path)["epoch"] == 1

@@ -19,7 +19,7 @@ from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.saved_networks import load_run
-from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
+from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, TrainSettings
 from train.training import run
 from train.training.averages import FACTORS, INTERPOLATION, mix
 from train.training.losses import TrainingLoss
@@ -58,10 +58,10 @@ def photographs(tmp_path_factory) -> Path:
 def small(weights, photographs) -> list[str]:
     """List the overrides of both experiments for a small network and few photographs."""
     return [
-        f"train.init_from=torchvision:{NAME}",
+        f"network=torchvision:{NAME}",
         f"weights={weights}",
-        f"data.path={photographs}",
-        f"data.size={SIZE}",
+        f"unlabeled={photographs}",
+        f"size={SIZE}",
         "data.test_fraction=0.25",
         "data.validation=0.25",
         "train.device=cpu",
@@ -81,7 +81,7 @@ def settings_of(small):
             *small,
             "train.epochs=2",
             "train.learning_rate=0.003",
-            f"run={folder}",
+            f"out={folder}",
             *overrides,
         ]
         return train_command.read(words)
@@ -177,14 +177,14 @@ def chain(small):
             "experiment=classifier",
             *small,
             "label='950'",
-            "scene.meshes=[solid:orange]",
-            "scene.hard_negatives=[solid:lemon]",
+            "meshes=[solid:orange]",
+            "hard_negatives=[solid:lemon]",
             "scene.backgrounds=[0.5]",
             "scene.views=1",
             "train.epochs=1",
             "evaluate.laboratory_setups=0",
             "photographs_first=true",
-            f"run={folder}",
+            f"out={folder}",
             *overrides,
         ]
         train(train_command.compose(words), words)
@@ -251,7 +251,7 @@ def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
     flat = torch.nn.Flatten()
     model = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
     teacher = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
-    settings = TrainSettings(init_from="x", distillation_weight=2.0, consistency_weight=0.5)
+    settings = TrainSettings(distillation_weight=2.0, consistency_weight=0.5)
     unchanged = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
     relit = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
     loss = TrainingLoss(model, settings, (), teacher, labeled=False)
@@ -277,7 +277,7 @@ def test_gradient_steps_lower_the_confidence_of_relit_batches():
     labels = torch.zeros(16, dtype=torch.int64)
     confidence = {}
     for steps in (0, 3):
-        settings = TrainSettings(init_from="x", consistency_weight=1.0, relight_steps=steps)
+        settings = TrainSettings(consistency_weight=1.0, relight_steps=steps)
         batches = RelitBatches(settings, network, network, seed=0)
         relit = batches.apply(images, labels, step=0)
         assert torch.equal(relit, batches.apply(images, labels, step=0))
@@ -301,9 +301,9 @@ def test_mixed_weights_are_the_ends_at_0_and_1():
     [
         {"consistency_weight": 1.0},
         {"interpolate": True},
-        {"init_from": "x", "relight_steps": 1},
+        {"relight_steps": 1},
     ],
 )
 def test_settings_that_need_others_are_an_error(values):
     with pytest.raises(InputError, match=r"need|attack"):
-        TrainSettings(**values)
+        ExperimentSettings(train=TrainSettings(**values))

@@ -105,7 +105,7 @@ def test_the_loss_is_the_smoothed_cross_entropy(model, images, smoothing):
 def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images, positive_classes):
     """All classes of data count, and on renders those that are not positive_classes."""
     is_render = torch.arange(6) < 2
-    settings = TrainSettings(init_from="base", distillation_weight=4.0)
+    settings = TrainSettings(distillation_weight=4.0)
     batch = (images, LABELS, is_render)
     alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
     loss, _ = TrainingLoss(model, settings, positive_classes, teacher).compute(*batch)
@@ -122,7 +122,7 @@ def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images,
 def test_unlabeled_images_have_the_teachers_answers_but_no_cross_entropy(model, teacher, images):
     """The ranking loss and the hits use the answers as labels."""
     is_render = torch.arange(6) < 2
-    settings = TrainSettings(init_from="base", distillation_weight=4.0, ranking_weight=2.0)
+    settings = TrainSettings(distillation_weight=4.0, ranking_weight=2.0)
     answers = torch.where(is_render, LABELS, teacher(images / 255).argmax(1))
     positive_classes = (int(answers[-1]),)
     with_labels = TrainingLoss(model.eval(), settings, positive_classes, teacher)

@@ -176,7 +176,7 @@ class TestASignalDuringTraining:
             "train.images_per_epoch=40",
             "train.resume=true",
             "train.distillation_weight=2",
-            f"train.init_from={finished}",
+            f"network={finished}",
             average,
         )
         whole = tmp_path / "whole"
@@ -287,7 +287,7 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(
 
 
 def test_a_new_run_in_the_same_folder_has_no_scores_of_the_earlier_one(tiny, photos, tmp_path):
-    completed_run(tiny(*WITHOUT_RENDERS, f"evaluate.photos={photos}"), tmp_path)
+    completed_run(tiny(*WITHOUT_RENDERS, f"photos={photos}"), tmp_path)
     assert summarize(tmp_path).photographs
     completed_run(tiny(*WITHOUT_RENDERS, "overwrite=true"), tmp_path)
     assert not summarize(tmp_path).photographs
@@ -447,17 +447,17 @@ def test_arms_with_and_without_renders_differ_in_their_renders_alone(tiny, tmp_p
 
 APPLE, ORANGE, PEAR = range(3)
 SEVERAL_CLASSES = [
-    "scene.meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange']",
-    "scene.hard_negatives=['solid:fruit', {mesh: 'solid:apple:2', label: apple}]",
+    "meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange']",
+    "hard_negatives=['solid:fruit', {mesh: 'solid:apple:2', label: apple}]",
     "augment.examples=16",
 ]
 ANOTHER_CLASS = [
     "experiment=best",
-    "train.init_from=null",
+    "network=null",
     "train.soup=false",
     "label=pear",
-    "scene.meshes=['solid:pear']",
-    "scene.hard_negatives=[{mesh: 'solid:apple', label: apple}]",
+    "meshes=['solid:pear']",
+    "hard_negatives=[{mesh: 'solid:apple', label: apple}]",
     "scene.views=2",
     "augment.examples=null",
     "augment.regenerate_every=30",
@@ -522,15 +522,15 @@ def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(
     completed_run(tiny(*WITHOUT_RENDERS), tmp_path / "base")
     settings = tiny(
         "label=[apple,pear]",
-        "scene.meshes=['solid:apple','solid:pear']",
+        "meshes=['solid:apple','solid:pear']",
         "augment=random",
         "augment.warm_start=false",
         "augment.examples=24",
         "train.ranking_weight=1",
         "train.epochs=6",
         "train.resume=true",
-        f"train.init_from={tmp_path / 'base'}",
-        f"evaluate.photos={tmp_path / 'photos'}",
+        f"network={tmp_path / 'base'}",
+        f"photos={tmp_path / 'photos'}",
     )
     folder = tmp_path / "run"
     with pytest.raises(Interrupted):
@@ -625,7 +625,7 @@ def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names
     photos,
     tmp_path,
 ):
-    named = f"evaluate.photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
+    named = f"photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
     scores = completed_run(tiny(*WITHOUT_RENDERS, named), tmp_path)
     assert scores == read_metrics(tmp_path)[-1]
     for name in ("lab", "wild-1"):
@@ -639,7 +639,7 @@ def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names
 def test_without_a_label_and_renders_photographs_are_scored_for_each_class_with_a_folder(
     tiny, photos, tmp_path
 ):
-    overrides = ["label=null", f"evaluate.photos={photos}"]
+    overrides = ["label=null", f"photos={photos}"]
     completed_run(tiny(*WITHOUT_RENDERS, *overrides), tmp_path)
     summary = json.loads((tmp_path / "photographs" / "summary.json").read_text())
     assert summary["label"] == ["apple", "orange"]
@@ -766,7 +766,7 @@ class TestValidationImages:
         caplog.clear()
         settings = tiny(
             *WITHOUT_RENDERS,
-            f"train.init_from={initial}",
+            f"network={initial}",
             f"data.validation={fraction}",
         )
         completed_run(settings, folder)
@@ -808,7 +808,7 @@ class TestValidationImages:
 
 
 def test_rendered_solids_are_new_to_a_network_of_other_images_alone(tiny, finished):
-    settings = tiny(f"train.init_from={finished}")
+    settings = tiny(f"network={finished}")
     initial = load_initial(settings)
     data = replace(load_data(settings), rendered=True)
     record = choose_validation(settings, data, initial).record
@@ -826,7 +826,7 @@ def test_the_test_accuracy_says_how_many_classes_it_covers(tiny):
 
 
 def test_the_initial_network_is_scored_on_the_same_images(tiny, finished, photos, tmp_path):
-    files = f"train.init_from={finished}", f"evaluate.photos={photos}"
+    files = f"network={finished}", f"photos={photos}"
     scores = completed_run(tiny(*WITHOUT_RENDERS, *files), tmp_path)
     accuracy = read_metrics(finished)[-1]["test/accuracy"]
     assert scores["test/accuracy_before"] == pytest.approx(accuracy)
@@ -841,7 +841,7 @@ def test_training_in_eval_mode_keeps_the_statistics_of_the_initial_network(
     finished,
     tmp_path,
 ):
-    overrides = "train.epochs=1", f"train.init_from={finished}", "train.eval_mode=true"
+    overrides = "train.epochs=1", f"network={finished}", "train.eval_mode=true"
     completed_run(tiny(*overrides), tmp_path)
     initial = checkpoints.load(finished / run_folder.BEST)["model"]
     trained = checkpoints.load(tmp_path / run_folder.BEST)["model"]

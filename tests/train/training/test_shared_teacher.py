@@ -11,7 +11,7 @@ from train.settings import TrainSettings
 from train.training.shared_teacher import SharedTeacher, share_layers
 
 SIZE = 4
-LAST_LAYER_ONLY = TrainSettings(init_from="a", freeze="all_but_last", eval_mode=True)
+LAST_LAYER_ONLY = TrainSettings(freeze="all_but_last", eval_mode=True)
 
 
 class Counted(nn.Module):
@@ -58,5 +58,5 @@ def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
 )
 def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, layers_after):
     pupil, teacher = pair(*layers_after)
-    values = {"init_from": "a", "freeze": "all_but_last", "eval_mode": True} | changes
+    values = {"freeze": "all_but_last", "eval_mode": True} | changes
     assert share_layers(TrainSettings(**values), pupil, teacher, SIZE) is teacher
