@@ -29,7 +29,7 @@ from train.command_settings import LabSettings
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
 from train.laboratory.laboratory import write_laboratory
-from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
+from train.results.compare import ALL, Evaluation, difference, mean_metric
 from train.results.metrics import Pooled, auc_and_recalls, metric_title
 from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
@@ -149,7 +149,7 @@ def evaluate(network: Classifier, folder: Path) -> Evaluation:
     logits = compute_logits(network, images, len(network.classes), "cpu")
     pooled = Pooled(rank_classes(photographs, logits, network.classes, [LABEL]))
     summary = RunSummary(folder, network.name, {}, {}, None)
-    return Evaluation(summary, pools_of(pooled))
+    return Evaluation(summary, pooled)
 
 
 def mean_auc(
@@ -166,7 +166,7 @@ def mean_auc(
     for network in networks:
         normalizing = network.normalizing_light(light)
         for part in PARTS:
-            pool = evaluate(normalizing, split / part).pools[ALL]
+            pool = evaluate(normalizing, split / part).pooled.all
             auc, *_ = auc_and_recalls(*pool.scores)
             areas.append(float(auc))
     print([round(area, 3) for area in areas], flush=True)

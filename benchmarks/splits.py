@@ -46,7 +46,7 @@ from train.data.photographs import TABLE
 from train.data.sets import Split, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.laboratory.laboratory import write_laboratory
-from train.results.compare import ALL, Evaluation, difference, mean_metric, pools_of
+from train.results.compare import ALL, Evaluation, difference, mean_metric
 from train.results.metrics import METRICS, Pooled, metric_title
 from train.results.predictions import PREDICTIONS, Prediction, write_predictions
 from train.results.scoring import Predictor
@@ -578,7 +578,7 @@ def pool(run: str, network: Classifier, predictions: list[Prediction]) -> Evalua
     """
     thresholds = {point.label: point.threshold for point in network.operating_points}
     pooled = Pooled(predictions, thresholds=thresholds)
-    return Evaluation(summarize_network(run), pools_of(pooled, "source", "mesh"))
+    return Evaluation(summarize_network(run), pooled)
 
 
 def summarize_network(run: str) -> RunSummary:
@@ -596,7 +596,7 @@ def score_rows(method: Method, images: str, scores: Scores) -> Iterator[list[str
         images: Name of the folder.
         scores: Scores of the method on the folder.
     """
-    for part in scores.evaluations[0].pools:
+    for part in scores.evaluations[0].pools("source", "mesh"):
         estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
         cells = [format_interval(estimate) for estimate in estimates]
         yield [method.name, images, Path(part.title()).stem, *cells]

@@ -42,7 +42,7 @@ from train.results.first_screen import (
     describe_place,
     describe_prediction,
 )
-from train.results.metrics import Units, leave_out, read_metric, weighted_means
+from train.results.metrics import Metrics, Units, leave_out, weighted_means
 from train.results.page import scores_section, write_page
 from train.results.plots import Picture
 from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
@@ -243,7 +243,7 @@ def _first_screen(
     pool = None
     if images is not None:
         (evaluation,) = _evaluations({name: folder / images})[name]
-        pool = evaluation.pools[compare.ALL]
+        pool = evaluation.pooled.all
     _, _, answer = write_answer(label, name, folder, folders).partition("? ")
     # "No: it recognizes 20% of orange" becomes "No".
     short_answer = answer.partition(":")[0]
@@ -267,16 +267,15 @@ def _compare(
         subjects=NETWORKS,
         place=describe_place(images, images.name),
     )
-    return compare_networks(
-        compared, choose_disagreements(original[1], hardened[1], images, [label])
-    )
+    before, after = (item.pooled.predictions for (item,) in evaluations.values())
+    return compare_networks(compared, choose_disagreements(before, after, images, [label]))
 
 
 def _evaluations(score_folders: Mapping[str, Path]) -> compare.Evaluations:
     """Read the predictions of several networks for the same images."""
     runs = {}
     for name, folder in score_folders.items():
-        scores = {folder.name: store.PhotographScores.read(read_json(folder / SUMMARY))}
+        scores = {folder.name: store.StoredScores.read(read_json(folder / SUMMARY))}
         runs[name] = [store.RunSummary(folder.parent, name, {"network": name}, scores, None)]
     # All networks were scored on the same images, so there is a single group.
     (group,) = store.group_by_images(runs).values()
@@ -358,12 +357,10 @@ def _find_rates(
     of_renders = [_recognized(subject, rate) for subject, rate in rates.items()]
     findings = []
     for name in images:
-        scores = read_json(folder / name / SUMMARY)
-        recall = read_metric(scores, "recall")
-        findings.append(_recognized(f"{label} in the {IN_WORDS[name]}", recall))
-        false_positive_rate = read_metric(scores, "false_positive_rate")
+        metrics = Metrics.read(read_json(folder / name / SUMMARY))
+        findings.append(_recognized(f"{label} in the {IN_WORDS[name]}", metrics.recall))
         subject = f"other objects for {label} in the {IN_WORDS[name]}"
-        findings.append(_not_mistaken(subject, false_positive_rate))
+        findings.append(_not_mistaken(subject, metrics.false_positive_rate))
     return _known(of_renders), _known(findings)
 
 

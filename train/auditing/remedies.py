@@ -140,7 +140,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
 
 def _metric_for(evaluations: Sequence[Evaluation]) -> str:
     """Choose top-1 accuracy for several positive classes, or else recall at 10% false positives."""
-    labels = {prediction.label for prediction in evaluations[0].pools[ALL].positives}
+    labels = {prediction.label for prediction in evaluations[0].pooled.all.positives}
     return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 

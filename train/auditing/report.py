@@ -11,7 +11,7 @@ from renderer.validation import as_path
 from train.auditing.lights import KINDS
 from train.auditing.page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.remedies import CLASSIFIER, HARDENED
-from train.results.metrics import METRICS, read_metric
+from train.results.metrics import METRICS, Metrics
 from train.results.predictions import SUMMARY
 from train.results.tables import Estimate
 from train.run_folder import read_json
@@ -164,5 +164,5 @@ def _read_attack(kind: str, path: Path) -> AttackCounts:
 
 def _read_scores(summary: Mapping[str, Any]) -> dict[str, Estimate]:
     """Read the metrics in the content of summary.json. Metrics that it lacks are left out."""
-    metrics = {name: read_metric(summary, name) for name in METRICS}
+    metrics = {name: Metrics.read(summary).find(name) for name in METRICS}
     return {name: estimate for name, estimate in metrics.items() if estimate is not None}

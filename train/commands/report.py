@@ -20,5 +20,5 @@ def report(settings: ReportSettings) -> None:
     if out.resolve() == parent.resolve():
         own_files = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]
     require_replaceable(out, "out", settings.overwrite, own_files)
-    page = write_report(folders, out)
+    page, _ = write_report(folders, out)
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")

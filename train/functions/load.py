@@ -7,7 +7,7 @@ from typing import Any
 from augment.network import Classifier
 from renderer.errors import InputError
 from renderer.validation import require_kind
-from train.results.metrics import METRICS, read_metric
+from train.results.metrics import METRICS, Metrics
 from train.results.tables import Estimate
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected
@@ -84,7 +84,7 @@ def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
         if not isinstance(metrics, Mapping):
             continue
         for metric in METRICS:
-            estimate = read_metric(metrics, metric)
-            if estimate is not None:
+            estimate = Metrics.read(metrics).find(metric)
+            if estimate is not None and estimate.value is not None:
                 results[f"{folder}/{metric}"] = estimate
     return results

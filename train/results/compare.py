@@ -16,12 +16,13 @@ from renderer.errors import InputError
 from train.results.metrics import (
     METRICS,
     TOP_RANKS,
+    Jackknife,
     Pool,
     Pooled,
     change,
     metric_title,
 )
-from train.results.predictions import CONTACT_SHEET, PREDICTIONS, Prediction, read_predictions
+from train.results.predictions import CONTACT_SHEET, Prediction
 from train.results.store import (
     INITIAL,
     RunSummary,
@@ -85,34 +86,34 @@ class Evaluation:
 
     Attributes:
         run: Run that trained the network.
-        pools: For each subset of the photographs, a pool: its predictions with
-            their metrics. `ALL` is the first subset.
+        pooled: The predictions, which are scored together and in groups.
     """
 
     run: RunSummary
-    pools: Mapping[Subset, Pool]
+    pooled: Pooled
+
+    def pools(self, *properties: str) -> dict[Subset, Pool]:
+        """Predictions for all images, and for the subsets by some properties."""
+        pools = {ALL: self.pooled.all}
+        for by in properties:
+            pools |= {Subset(by, name): pool for name, pool in self.pooled.groups(by).items()}
+        return pools
+
+    def rows(self, by: str) -> dict[Subset, Pool]:
+        """Predictions for each row of a table: all, several positive classes, and subsets."""
+        has_several_labels = len(self.pooled.by_label) > 1
+        return self.pools("label", by) if has_several_labels else self.pools(by)
+
+    def find(self, subset: Subset) -> Pool | None:
+        """Predictions for a subset. None if there are none."""
+        return self.pooled.groups(subset.by).get(subset.name)
 
 
 # Evaluations of the runs of each method, in the order of their seeds.
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
-def pools_of(pooled: Pooled, *properties: str) -> dict[Subset, Pool]:
-    """Return the predictions and metrics for all images and for subsets of the images."""
-    pools_of_property = {
-        "label": pooled.by_label,
-        "source": pooled.by_source,
-        "mesh": pooled.by_mesh,
-        "class": pooled.by_class,
-    }
-    pools = {ALL: pooled.all}
-    for by in properties:
-        for name, pool in pools_of_property[by].items():
-            pools[Subset(by, name)] = pool
-    return pools
-
-
-def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "source") -> Evaluations:
+def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
     """Read the predictions of runs that were scored on the same images.
 
     A published network has no file of predictions, and is left out. Sources in `exclude` do not
@@ -121,25 +122,11 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
-            if (scored.folder / PREDICTIONS).is_file():
-                evaluation = _read_evaluation(scored, exclude, by)
-                methods.setdefault(method, []).append(evaluation)
+            if scored.has_predictions:
+                pooled = scored.pooled(exclude)
+                _require_sources(exclude, pooled.predictions)
+                methods.setdefault(method, []).append(Evaluation(scored.run, pooled))
     return methods
-
-
-def _read_evaluation(scored: ScoredRun, exclude: Sequence[str], by: str) -> Evaluation:
-    """Read the predictions of one run for one folder of photographs."""
-    path = scored.folder / PREDICTIONS
-    scores = scored.scores
-    predictions = read_predictions(path, scores.labels)
-    pooled = Pooled(predictions, exclude, scores.thresholds)
-    _require_sources(exclude, predictions)
-    if by == "mesh" and not pooled.by_mesh:
-        raise InputError(
-            f"by=mesh needs the mesh of each photograph, but {path} has none: leave by=mesh out"
-        )
-    properties = ("label", by) if scores.by_label else (by,)
-    return Evaluation(scored.run, pools_of(pooled, *properties))
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
@@ -153,6 +140,16 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
         )
 
 
+def _require_meshes(methods: Evaluations, by: str) -> None:
+    """Check that the photographs have meshes if scores by mesh are asked for."""
+    for method, evaluations in methods.items():
+        if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
+            raise InputError(
+                f"by=mesh needs the mesh of each photograph, but the photographs of {method} have "
+                "none: leave by=mesh out"
+            )
+
+
 def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> Estimate | None:
     """Average a metric over the seeds of a method.
 
@@ -162,7 +159,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
     known: list[Estimate] = []
     values: list[float] = []
     for evaluation in evaluations:
-        pool = evaluation.pools.get(subset)
+        pool = evaluation.find(subset)
         metric = pool.metrics.find(name) if pool is not None else None
         if metric is not None and metric.value is not None:
             known.append(metric)
@@ -181,7 +178,7 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
     subsets: dict[Subset, None] = {}
     for evaluations in methods.values():
         for evaluation in evaluations:
-            subsets.update(dict.fromkeys(evaluation.pools))
+            subsets.update(dict.fromkeys(evaluation.rows(by)))
     rows: list[list[str]] = []
     shown: list[Estimate | None] = []
     for subset in subsets:
@@ -212,26 +209,26 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
     return pairs + [(method, trained[0]) for method in trained[1:]]
 
 
-def class_table(group: Scored) -> Table:
+def class_table(methods: Evaluations) -> Table:
     """Make a table of the top-1 and top-5 accuracy for the images of each class.
 
     The accuracies are among all classes of the network. The table has no rows if the networks have
     one such class, or more than MAX_CLASSES.
     """
-    methods = read_evaluations(group, by="class")
     header = ["class", "images", "network", "top-1", "top-5"]
     rows: list[list[str]] = []
-    image_counts: dict[Subset, int] = {}
+    image_counts: dict[str, int] = {}
     for evaluations in methods.values():
-        for subset, pool in evaluations[0].pools.items():
-            if subset.by == "class" and pool.classified:
-                image_counts[subset] = len(pool.classified)
+        for name, pool in evaluations[0].pooled.by_class.items():
+            if pool.classified:
+                image_counts[name] = len(pool.classified)
     if 1 < len(image_counts) <= MAX_CLASSES:
-        for subset, image_count in image_counts.items():
+        for name, image_count in image_counts.items():
             for method, evaluations in methods.items():
-                metrics = (mean_metric(evaluations, subset, name) for name in TOP_RANKS)
+                subset = Subset("class", name)
+                metrics = (mean_metric(evaluations, subset, metric) for metric in TOP_RANKS)
                 cells = map(format_interval, metrics)
-                rows.append([in_words(subset.name), str(image_count), method, *cells])
+                rows.append([in_words(name), str(image_count), method, *cells])
     return Table("by class, among all classes of the network", header, rows)
 
 
@@ -260,17 +257,21 @@ def difference(
     seeds, it is also over seeds. With one seed, it says nothing about other seeds. The value is
     `evaluations` minus `reference`. None if the metric of a run is unknown.
     """
-    pools = [evaluation.pools[subset] for evaluation in evaluations]
-    reference_pools = [evaluation.pools[subset] for evaluation in reference]
-    if any(name not in pool.jackknives for pool in (*pools, *reference_pools)):
+    after = _jackknives(evaluations, subset, name)
+    before = _jackknives(reference, subset, name)
+    if len(after) < len(evaluations) or len(before) < len(reference):
         return None
-    after = [pool.jackknives[name] for pool in pools]
-    before = [pool.jackknives[name] for pool in reference_pools]
     return Difference(
         **asdict(change(after, before, _have_equal_seeds(evaluations, reference))),
         before=fmean(run.value for run in before),
         after=fmean(run.value for run in after),
     )
+
+
+def _jackknives(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> list[Jackknife]:
+    """Collect the values of a metric without each unit, from the runs in which it is known."""
+    pools = [evaluation.find(subset) for evaluation in evaluations]
+    return [pool.jackknives[name] for pool in pools if pool and name in pool.jackknives]
 
 
 def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
@@ -293,7 +294,7 @@ def difference_tables(
         reference = methods[base]
         rows = []
         shown: list[Difference | None] = []
-        for subset in reference[0].pools:
+        for subset in reference[0].rows(by):
             if overall_only and not subset.is_overall:
                 continue
             differences = [difference(evaluations, reference, subset, name) for name in METRICS]
@@ -355,7 +356,8 @@ def format_comparison(
     overall = _title_of_all(exclude)
     group = _find_group(list(groups.values()), photographs)
     if group is not None:
-        evaluations = read_evaluations(group, exclude, by)
+        evaluations = read_evaluations(group, exclude)
+        _require_meshes(evaluations, by)
         tables.append(group_table(evaluations, overall, by))
         tables += difference_tables(evaluations, overall, by)
     tables.append(seconds_table(methods))
@@ -379,7 +381,8 @@ def format_short_comparison(
     if group is None and groups:
         # The first images on which runs were scored.
         group = next(iter(groups.values()))
-    evaluations = read_evaluations(group, exclude, by) if group else {}
+    evaluations = read_evaluations(group, exclude) if group else {}
+    _require_meshes(evaluations, by)
     if by != "source" and evaluations:
         return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
     titles = [title for title, members in groups.items() if members is group]
@@ -415,7 +418,7 @@ def _mean_stored_metric(scored_runs: Sequence[ScoredRun], name: str) -> Estimate
     """Average a metric over the stored scores of runs, which lack the file predictions.csv."""
     values = []
     for scored in scored_runs:
-        metric = scored.scores.metrics[name]
+        metric = scored.scores.overall.find(name)
         if metric is not None and metric.value is not None:
             values.append(metric.value)
     return Estimate(fmean(values)) if values else None

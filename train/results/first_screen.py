@@ -15,7 +15,7 @@ from renderer.io.images import read_square
 from train.data.photographs import DESCRIPTION
 from train.results import compare, plots
 from train.results.plots import Picture
-from train.results.predictions import PREDICTIONS, Prediction, read_predictions
+from train.results.predictions import Prediction
 from train.results.tables import Estimate, Table, describe_intervals, join_words
 from train.settings import in_words
 
@@ -164,7 +164,7 @@ class Compared(NamedTuple):
     @property
     def has_several_classes(self) -> bool:
         """Whether there are several positive classes."""
-        pool = self.after[0].pools[compare.ALL]
+        pool = self.after[0].pooled.all
         return len({prediction.label for prediction in pool.positives}) > 1
 
     def metric(self, title: str, note: str, name: str) -> ShownMetric | None:
@@ -249,7 +249,7 @@ def _describe_rows(label: str) -> str:
 
 def _describe_images(compared: Compared) -> str:
     """Say how many images and objects were scored, and which objects the training has shown."""
-    pool = compared.after[0].pools[compare.ALL]
+    pool = compared.after[0].pooled.all
     auc = pool.metrics.auc
     positives = f"{auc.positives:,} images of {compared.label} ({auc.positive_objects:,} objects)"
     if compared.has_several_classes:
@@ -399,8 +399,8 @@ def _rounded(value: float, decimals: int, sign: str = "") -> str:
 
 
 def choose_disagreements(
-    before: Path,
-    after: Path,
+    before: Sequence[Prediction],
+    after: Sequence[Prediction],
     images: Path,
     labels: Sequence[str],
     subjects: tuple[str, str] = NETWORKS,
@@ -412,8 +412,8 @@ def choose_disagreements(
     only the hardened network gets right, the second those that only the original does, at most
     PICTURES each.
     """
-    predictions_before = _read_predictions(before, labels)
-    predictions_after = _read_predictions(after, labels)
+    predictions_before = _one_for_each_image(before, labels)
+    predictions_after = _one_for_each_image(after, labels)
     image_count = len(predictions_before)
     gained = []
     lost = []
@@ -437,19 +437,19 @@ def choose_disagreements(
 Pair = tuple[Prediction, Prediction]
 
 
-def _read_predictions(folder: Path, labels: Sequence[str]) -> list[Prediction]:
-    """Read one prediction for each image from predictions.csv.
+def _one_for_each_image(
+    predictions: Sequence[Prediction], labels: Sequence[str]
+) -> list[Prediction]:
+    """Choose one prediction for each image, from those for each image and each positive class.
 
-    This file has a line for each image and each positive class. An image of another class keeps the
-    line of the first positive class.
+    An image of another class keeps the prediction for the first positive class.
     """
-    predictions = []
-    for prediction in read_predictions(folder / PREDICTIONS, labels):
+    chosen = []
+    for prediction in predictions:
         shown = prediction.photograph.label
-        chosen_label = shown if shown in labels else labels[0]
-        if prediction.label == chosen_label:
-            predictions.append(prediction)
-    return predictions
+        if prediction.label == (shown if shown in labels else labels[0]):
+            chosen.append(prediction)
+    return chosen
 
 
 def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:

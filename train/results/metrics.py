@@ -13,7 +13,7 @@ negative.
 
 import fractions
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
@@ -131,14 +131,14 @@ class Metrics:
         class_top5: Top-5 accuracy, computed like `class_top1`.
     """
 
-    n: int
-    recall: Proportion
-    top5: Proportion
-    false_positive_rate: Proportion
+    n: int = 0
+    recall: Proportion = field(default_factory=Proportion)
+    top5: Proportion = field(default_factory=Proportion)
+    false_positive_rate: Proportion = field(default_factory=Proportion)
     recall_at_threshold: Proportion | None = None
     false_positive_rate_at_threshold: Proportion | None = None
-    auc: AreaUnderCurve
-    recall_at: Mapping[str, Estimate]
+    auc: AreaUnderCurve = field(default_factory=AreaUnderCurve)
+    recall_at: Mapping[str, Estimate] = field(default_factory=dict)
     class_top1: Estimate | None = None
     class_top5: Estimate | None = None
 
@@ -148,14 +148,41 @@ class Metrics:
         A name is "auc", "top5" or "recall_at/0.05". None if it was not computed.
         """
         attribute, _, rate = name.partition("/")
-        if rate:
-            return self.recall_at[rate]
-        return getattr(self, attribute)
+        return self.recall_at.get(rate) if rate else getattr(self, attribute)
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the metrics to entries of summary.json. Metrics that are None are left out."""
         entries = asdict(self)
         return {name: entry for name, entry in entries.items() if entry is not None}
+
+    @classmethod
+    def read(cls, entries: Mapping[str, Any]) -> "Metrics":
+        """Read metrics from summary.json, or from the file of a published network.
+
+        A metric that an earlier version did not write is unknown. The number of images is not read,
+        because summary.json has another entry of this name.
+        """
+        kinds = {**dict.fromkeys(FRACTION_METRICS, Proportion), "auc": AreaUnderCurve}
+        found: dict[str, Any] = {}
+        for name in (*kinds, *TOP_RANKS):
+            if entries.get(name):
+                found[name] = _read_estimate(entries[name], kinds.get(name, Estimate))
+        # summary.json has all rates under one name. A published network has a name for each.
+        nested = entries.get("recall_at") or {}
+        of_rates = {rate: entries.get(f"recall_at/{rate}") or nested.get(rate) for rate in RATES}
+        found["recall_at"] = {
+            rate: _read_estimate(entry, Estimate) for rate, entry in of_rates.items() if entry
+        }
+        return cls(**found)
+
+
+def _read_estimate(entry: Mapping[str, Any], kind: type[Estimate]) -> Estimate:
+    """Read an estimate of a kind. Its value is needed; what an earlier version lacks is unknown."""
+    numbers = {item.name: entry[item.name] for item in fields(kind) if item.name in entry}
+    for name in ("value", "low", "high"):
+        if entry["value"] is not None:
+            numbers[name] = float(entry[name])
+    return kind(**numbers)
 
 
 class RocPredictions(NamedTuple):
@@ -399,6 +426,10 @@ class Pooled(ShortRepr):
     def all(self) -> Pool:
         """Predictions that are scored together: all, except those of excluded sources."""
         return pool(self._included, self.thresholds)
+
+    def groups(self, by: str) -> dict[str, Pool]:
+        """Groups by a property: "label", "source", "mesh" or "class". "all" is one group, ""."""
+        return {"": self.all} if by == "all" else getattr(self, f"by_{by}")
 
     @cached_property
     def by_label(self) -> dict[str, Pool]:
@@ -783,45 +814,6 @@ def _fraction_above(
     """Compute the fraction of the scores that exceed each threshold."""
     count_at_or_below = np.sort(scores).searchsorted(thresholds, "right")
     return (len(scores) - count_at_or_below) / len(scores)
-
-
-def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Find the entry of a metric in the content of a JSON file.
-
-    The metric "recall_at/0.05" is summary["recall_at"]["0.05"] in summary.json,
-    and summary["recall_at/0.05"] in the file of a published network.
-    """
-    if name in summary:
-        return summary[name] or {}
-    entry: Any = summary
-    for key in name.split("/"):
-        entry = entry.get(key, {})
-    return entry
-
-
-def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
-    """Read a metric from the content of summary.json. None if the file lacks it."""
-    entry = _find_entry(summary, name)
-    if not entry:
-        return None
-    numbers: dict[str, Any] = dict.fromkeys(("value", "low", "high"))
-    if entry.get("value") is not None:
-        numbers = {key: float(entry[key]) for key in numbers}
-    numbers["over"] = entry.get("over", "")
-    if "hits" in entry:
-        return Proportion(**numbers, hits=entry["hits"], n=entry["n"])
-    if "positives" in entry:
-        positives = entry["positives"]
-        negatives = entry["negatives"]
-        # Older versions of the library did not write the numbers of objects.
-        return AreaUnderCurve(
-            **numbers,
-            positives=positives,
-            positive_objects=entry.get("positive_objects", positives),
-            negatives=negatives,
-            negative_objects=entry.get("negative_objects", negatives),
-        )
-    return Estimate(**numbers)
 
 
 def metric_title(name: str) -> str:

@@ -73,10 +73,11 @@ CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validat
 
 
 @progress_message("report")
-def write_report(folders: Sequence[Path], out: Path) -> Path:
+def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen | None]:
     """Write the page of the runs and attacks in folders and below them.
 
-    A run or attack that cannot be read is listed on the page.
+    A run or attack that cannot be read is listed on the page. Return the path of the page and its
+    first screen, which is None if no two networks can be compared.
     """
     found = store.find(folders)
     methods = store.group_by_method(found.runs)
@@ -90,13 +91,14 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
             renders[method] = _read_renders(first, "epoch", "Renders")
             examples[method] = _read_renders(first, "attacks", "Renders before and after")
     groups = store.group_by_images(shown)
-    return write_page(
+    screen = _first_screen(groups)
+    path = write_page(
         out,
         "runs.html.jinja",
         about=_about(found, folders),
         methods=methods,
         title=_title(found, methods),
-        screen=_first_screen(groups),
+        screen=screen,
         lead=[*_accuracy_sentences(methods), *_relit_sentences(methods)],
         tables=[table for table in store.run_tables(methods, {}) if table.rows],
         captions=MODES,
@@ -109,6 +111,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         attacks=found.attacks,
         shown=[_attack_section(attack) for attack in found.attacks[:MAX_ATTACKS]],
     )
+    return path, screen
 
 
 def _about(found: store.Findings, folders: Sequence[Path]) -> str:
@@ -212,12 +215,9 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
     if that was measured.
     """
     try:
-        lines = [f"report: {write_report(folders, out)}"]
-        groups = store.group_by_images(store.group_by_method(store.find(folders).runs))
-        screen = _first_screen(groups)
-        if screen is not None:
-            lines = [" ".join([screen.answer, *screen.sentences]), *lines]
-        return "\n".join(lines)
+        path, screen = write_report(folders, out)
+        changed = [] if screen is None else [" ".join([screen.answer, *screen.sentences])]
+        return "\n".join([*changed, f"report: {path}"])
     except Exception as error:
         return f"no report: {user_message(error) or traceback.format_exc()}"
 
@@ -393,8 +393,8 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     labels = scored.scores.labels
     rows = {}
     if images is not None:
-        folder_before = group[base][0].folder
-        rows = choose_disagreements(folder_before, scored.folder, images, labels, subjects)
+        before, after = (group[name][0].pooled().predictions for name in (base, method))
+        rows = choose_disagreements(before, after, images, labels, subjects)
     compared = Compared(
         label=join_words([in_words(name) for name in labels], "or"),
         before=evaluations[base],
@@ -458,7 +458,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         if evaluations:
             rocs = _plot_rocs(evaluations, title)
             tables += _evaluation_tables(evaluations)
-            tables.append(compare.class_table(group))
+            tables.append(compare.class_table(evaluations))
     except InputError as error:
         problem = str(error)
     return {
@@ -478,12 +478,14 @@ def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None
     first_evaluation = next(iter(methods.values()))[0]
     name = images.partition(":")[0]
     pictures = []
-    for subset, pool in first_evaluation.pools.items():
+    for subset, pool in first_evaluation.rows("source").items():
         if not subset.is_overall:
             continue
         scores = {}
         for method, evaluations in methods.items():
-            scores[method] = [evaluation.pools[subset].scores for evaluation in evaluations]
+            scores[method] = [
+                pool_of.scores for item in evaluations if (pool_of := item.find(subset))
+            ]
         pictures.append(plots.roc(scores, f"{pool.label}, {name}"))
     return pictures
 
@@ -492,7 +494,7 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     """Make tables of the metrics of methods on the same images."""
     tables = [compare.overall_differences(methods)]
     first_evaluation = next(iter(methods.values()))[0]
-    if len(first_evaluation.pools) > 1:
+    if len(first_evaluation.rows("source")) > 1:
         tables.append(compare.group_table(methods))
     return tables
 

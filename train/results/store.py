@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any, NamedTuple, cast
@@ -18,14 +19,14 @@ from train import console, run_config, run_folder
 from train.results.metrics import (
     COUNTED_EACH,
     METRICS,
-    AreaUnderCurve,
+    Metrics,
+    Pooled,
     Thresholds,
     describe_point,
     metric_title,
     operating_points,
-    read_metric,
 )
-from train.results.predictions import SUMMARY
+from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
@@ -44,7 +45,7 @@ AFTER_HARDENING = "after hardening"
 
 
 @dataclass(frozen=True)
-class PhotographScores:
+class StoredScores:
     """Scores of a network on one folder of photographs.
 
     They are read from summary.json, or from the file of a published network.
@@ -53,7 +54,7 @@ class PhotographScores:
         images: Hash of the photographs. Two networks were scored on the same
             photographs if the hashes are equal.
         labels: Positive classes.
-        metrics: Each metric in `METRICS` by name. None if it is unknown.
+        overall: Metrics of all photographs.
         by_label: The metrics of each positive class by the name of the class.
             Empty if there is only one positive class.
         thresholds: Threshold on the log-odds of each positive class. Empty if
@@ -64,13 +65,13 @@ class PhotographScores:
 
     images: str
     labels: Sequence[str]
-    metrics: Mapping[str, Estimate | None]
-    by_label: Mapping[str, Mapping[str, Estimate | None]] = field(default_factory=dict)
+    overall: Metrics
+    by_label: Mapping[str, Metrics] = field(default_factory=dict)
     thresholds: Thresholds = field(default_factory=dict)
     operating_point: str = ""
 
     @classmethod
-    def read(cls, summary: Mapping[str, Any]) -> "PhotographScores":
+    def read(cls, summary: Mapping[str, Any]) -> "StoredScores":
         """Read scores from a mapping, also if an earlier version wrote it with fewer entries.
 
         A damaged mapping raises an error of any type.
@@ -79,11 +80,11 @@ class PhotographScores:
         points = operating_points(summary)
         by_label = {}
         if len(labels) > 1:
-            by_label = {label: _read_metrics(summary["by_label"][label]) for label in labels}
+            by_label = {label: Metrics.read(summary["by_label"][label]) for label in labels}
         return cls(
             images=str(summary.get("images") or summary),
             labels=labels,
-            metrics=_read_metrics(summary),
+            overall=Metrics.read(summary),
             by_label=by_label,
             thresholds={point["label"]: float(point["threshold"]) for point in points},
             operating_point=" or ".join(dict.fromkeys(map(describe_point, points))),
@@ -91,37 +92,20 @@ class PhotographScores:
 
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
-        has_several = len(self.labels) > 1
-        entries: dict[str, Any] = {
-            "images": self.images,
-            "label": [*self.labels] if has_several else self.labels[0],
-        }
-        entries |= _as_dictionaries(self.metrics)
+        label = [*self.labels] if self.by_label else self.labels[0]
+        entries = {"images": self.images, "label": label, **_flat(self.overall)}
         if self.thresholds:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point
-        if has_several:
-            by_label = {}
-            for label, metrics in self.by_label.items():
-                by_label[label] = _as_dictionaries(metrics)
-            entries["by_label"] = by_label
+        if self.by_label:
+            entries["by_label"] = {name: _flat(metrics) for name, metrics in self.by_label.items()}
         return entries
 
 
-def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
-    """Read the metrics on all photographs, or on those for one positive class."""
-    return {name: read_metric(summary, name) for name in METRICS}
-
-
-def _as_dictionaries(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to dictionaries, which the file of a published network can hold.
-
-    The dictionary of an unknown metric is empty.
-    """
-    dictionaries: dict[str, dict[str, Any]] = {}
-    for name, estimate in metrics.items():
-        dictionaries[name] = {} if estimate is None else asdict(estimate)
-    return dictionaries
+def _flat(metrics: Metrics) -> dict[str, Any]:
+    """Convert metrics to dictionaries by name. That of an unknown metric is empty."""
+    estimates = {name: metrics.find(name) for name in METRICS}
+    return {name: asdict(item) if item else {} for name, item in estimates.items()}
 
 
 @dataclass(frozen=True)
@@ -149,7 +133,7 @@ class RunSummary:
     folder: Path
     method: str
     settings: Mapping[str, object]
-    photographs: Mapping[str, PhotographScores]
+    photographs: Mapping[str, StoredScores]
     accuracy: float | None
     seed: int | None = None
     config: DictConfig = field(default_factory=lambda: OmegaConf.create())
@@ -174,7 +158,7 @@ class ScoredRun(NamedTuple):
     name: str
 
     @property
-    def scores(self) -> PhotographScores:
+    def scores(self) -> StoredScores:
         """Scores in this sub-folder."""
         return self.run.photographs[self.name]
 
@@ -182,6 +166,36 @@ class ScoredRun(NamedTuple):
     def folder(self) -> Path:
         """Path of this sub-folder."""
         return self.run.folder / self.name
+
+    @property
+    def has_predictions(self) -> bool:
+        """Whether the predictions are known. Those of a published network are not."""
+        return (self.folder / PREDICTIONS).is_file()
+
+    def pooled(self, exclude: Sequence[str] = ()) -> Pooled:
+        """Read the predictions, which are scored together without those of some sources."""
+        path = self.folder / PREDICTIONS
+        thresholds = tuple(self.scores.thresholds.items())
+        key = (path, path.stat().st_mtime_ns, tuple(self.scores.labels))
+        return _pool(*key, tuple(exclude), thresholds)
+
+
+@lru_cache(maxsize=64)
+def _pool(
+    path: Path,
+    modified: int,
+    labels: tuple[str, ...],
+    exclude: tuple[str, ...],
+    thresholds: tuple[tuple[str, float], ...],
+) -> Pooled:
+    """Read and pool predictions. Tables and pages of one command share the pools."""
+    return Pooled(_read_once(path, modified, labels), exclude, dict(thresholds))
+
+
+@lru_cache(maxsize=64)
+def _read_once(path: Path, modified: int, labels: tuple[str, ...]) -> Sequence[Prediction]:
+    """Read predictions.csv unless this process has read it at this time of modification."""
+    return read_predictions(path, labels)
 
 
 # The runs of each method with their scores on the same images.
@@ -240,7 +254,7 @@ def _read(folder: Path) -> RunSummary | None:
     name = str(Path(*path.parts[-2:]))
     settings = {"network": str(path)}
     if (folder / SUMMARY).is_file():
-        scores = {path.name: PhotographScores.read(read_json(folder / SUMMARY))}
+        scores = {path.name: StoredScores.read(read_json(folder / SUMMARY))}
         return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
         # This import is here because it imports torch, which other results do not need.
@@ -251,7 +265,7 @@ def _read(folder: Path) -> RunSummary | None:
         for key, value in stored.items():
             # Scores on photographs are mappings. The test accuracy is a number.
             if isinstance(value, dict):
-                scores[key] = PhotographScores.read(value)
+                scores[key] = StoredScores.read(value)
         return RunSummary(folder, name, settings, scores, stored.get("test/accuracy"))
     return None
 
@@ -295,11 +309,11 @@ def _initial_settings(config: DictConfig) -> dict[str, Any]:
     return {"network": config.network, **others}
 
 
-def read_summaries(folder: Path) -> dict[str, PhotographScores]:
+def read_summaries(folder: Path) -> dict[str, StoredScores]:
     """Read the scores on photographs in all sub-folders of a folder."""
     summaries = {}
     for path in sorted(folder.glob(f"*/{SUMMARY}")):
-        summaries[path.parent.name] = PhotographScores.read(read_json(path))
+        summaries[path.parent.name] = StoredScores.read(read_json(path))
     return summaries
 
 
@@ -393,8 +407,8 @@ def _title_of(group: Scored) -> str:
     # has chosen this name. Only a training run has epochs.
     of_training = [scored for scored in members if scored.run.epochs]
     first = of_training[0] if of_training else members[0]
-    auc = first.scores.metrics["auc"]
-    if not isinstance(auc, AreaUnderCurve):
+    auc = first.scores.overall.auc
+    if not auc.positives + auc.negatives:
         return first.name
     labels = first.scores.labels
     title = (
@@ -460,11 +474,11 @@ def score_table(title: str, group: Scored) -> Table:
     lines: dict[str, list[Line]] = {}
     for method, scored_runs in group.items():
         for scored in scored_runs:
-            metrics_of_row = {method: scored.scores.metrics}
+            metrics_of_row = {method: scored.scores.overall}
             for label, metrics in scored.scores.by_label.items():
                 metrics_of_row[f"{method}, {label_title(label)}"] = metrics
             for name, metrics in metrics_of_row.items():
-                line = (scored.run.seed, [metrics[metric] for metric in METRICS])
+                line = (scored.run.seed, [*map(metrics.find, METRICS)])
                 lines.setdefault(name, []).append(line)
     points = {scored.scores.operating_point for runs in group.values() for scored in runs}
     chosen = " or ".join(sorted(points - {""}))

@@ -17,7 +17,7 @@ from train.auditing.remedies import (
     recommend,
 )
 from train.data.photo import Photograph
-from train.results.compare import Evaluation, pools_of
+from train.results.compare import Evaluation
 from train.results.metrics import Pooled
 from train.results.predictions import Prediction
 from train.results.store import RunSummary
@@ -36,8 +36,7 @@ def evaluation(found: Sequence[int], labels: Sequence[str] = ("orange",)) -> Eva
             score = 2.0 if number in found else -2.0
             predictions.append(prediction(label, label, number, score))
         predictions += [prediction("other_ball", label, number, 0.0) for number in range(COUNT)]
-    pools = pools_of(Pooled(predictions))
-    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), pools)
+    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
 
 
 def prediction(shown: str, label: str, number: int, score: float) -> Prediction:
@@ -89,10 +88,9 @@ def test_the_cheapest_remedy_is_recommended_that_no_other_improves_on(
 
 
 def test_a_remedy_is_unknown_without_negatives():
-    pools = evaluation(FEW).pools
-    positives = [item for pool in pools.values() for item in pool.positives]
+    positives = evaluation(FEW).pooled.all.positives
     run = RunSummary(Path("run"), "network", {}, {}, None)
-    without = Evaluation(run, pools_of(Pooled(positives)))
+    without = Evaluation(run, Pooled(positives))
     assert recommend({ORIGINAL: [without], LIGHT_ALONE: [without]}) is None
 
 

@@ -16,6 +16,7 @@ from train.results.compare import (
     format_comparison,
     format_short_comparison,
     format_table,
+    read_evaluations,
 )
 from train.results.metrics import pool
 from train.results.page import write_report
@@ -113,7 +114,7 @@ def test_a_report_has_top_1_by_class_of_each_network(scored_run):
         folder = scored_run(method, STUDIO_AND_WEB)
         write_predictions(folder / "photographs" / "predictions.csv", with_pears(correct))
         group[method] = [ScoredRun(summarize(folder), "photographs")]
-    rows = class_table(group).rows
+    rows = class_table(read_evaluations(group)).rows
     assert [row[:3] for row in rows] == [
         ["orange", "11", "none"],
         ["orange", "11", "random"],
@@ -179,7 +180,7 @@ def runs_on_two_sets(scored_run) -> list[Path]:
 
 
 def test_only_scores_on_the_same_images_share_a_plot(runs_on_two_sets, tmp_path):
-    text = write_report(runs_on_two_sets, tmp_path / "out").read_text()
+    text = write_report(runs_on_two_sets, tmp_path / "out")[0].read_text()
     plots = re.findall(r'alt="ROC of [^;]*; AUC: ([^"]*)"', text)
     assert plots == ["none 0.250, random 0.750", "adversarial 1.000"]
     assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
@@ -258,7 +259,7 @@ class TestAHardenedNetwork:
         }
 
     def test_has_a_report_with_the_accuracy_before(self, hardened, tmp_path):
-        text = write_report(hardened, tmp_path / "out").read_text()
+        text = write_report(hardened, tmp_path / "out")[0].read_text()
         assert "from 50.0% to 76.5%" in text
         assert "the original network recognizes 25% of the images of orange" in text
 

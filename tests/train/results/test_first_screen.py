@@ -11,7 +11,7 @@ from PIL import Image
 
 from train.data.photo import Photograph
 from train.data.photographs import DESCRIPTION
-from train.results.compare import Difference, Evaluation, pools_of
+from train.results.compare import Difference, Evaluation
 from train.results.first_screen import (
     NETWORKS,
     Compared,
@@ -21,7 +21,7 @@ from train.results.first_screen import (
     gain_sentence,
 )
 from train.results.metrics import Pooled
-from train.results.predictions import PREDICTIONS, Prediction, write_predictions
+from train.results.predictions import Prediction
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
 
@@ -32,24 +32,21 @@ AFTER = ("banana", "banana", "spoon", "spoon", "banana", "banana")
 LABELS = ("banana", "mug")
 
 
-def write(folder: Path, predicted: tuple[str, ...]) -> Path:
-    """Write the predictions of a network for the images, and return their folder."""
+def predictions_of(predicted: tuple[str, ...]) -> list[Prediction]:
+    """Make the predictions of a network for the images."""
     predictions = []
     for label in LABELS:
         for number, (shown, name) in enumerate(zip(SHOWN, predicted, strict=True)):
             photograph = Photograph(PurePosixPath(f"{number}.png"), shown, f"source {number}")
             predictions.append(Prediction(photograph, label, name, 0.5, None, None, 0.1, 2, -1.0))
-    folder.mkdir()
-    write_predictions(folder / PREDICTIONS, predictions)
-    return folder
+    return predictions
 
 
 def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predicted(tmp_path):
     for number in range(len(SHOWN)):
         pixels = np.full((8, 8, 3), 20 * number, dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
-    before = write(tmp_path / "before", BEFORE)
-    after = write(tmp_path / "after", AFTER)
+    before, after = predictions_of(BEFORE), predictions_of(AFTER)
     rows = choose_disagreements(before, after, tmp_path, LABELS)
     gained, lost = rows.values()
     # The third image is wrong twice, and the last one is right twice.
@@ -84,7 +81,7 @@ def evaluation(predicted: tuple[str, ...], labels: tuple[str, ...]) -> Evaluatio
     ]
     logits = torch.tensor([[float(name == other) for other in classes] for name in predicted])
     pooled = Pooled(rank_classes(photographs, logits, classes, labels))
-    return Evaluation(RunSummary(Path("run"), "", {}, {}, None), pools_of(pooled))
+    return Evaluation(RunSummary(Path("run"), "", {}, {}, None), pooled)
 
 
 def compare_on(labels: tuple[str, ...]) -> Compared:

@@ -1,5 +1,6 @@
 """The report shows runs in every state, as a file and in a browser."""
 
+import csv
 import json
 import os
 import shlex
@@ -12,7 +13,9 @@ from PIL import Image
 
 from renderer.errors import InputError
 from train.results import plots
+from train.results.compare import format_comparison, format_short_comparison, format_table
 from train.results.page import report_of, write_report
+from train.results.store import summarize
 from train.run_config import write_config
 from train.run_folder import locked
 
@@ -110,7 +113,7 @@ def page(finished, made_up_run, tiny, tmp_path_factory) -> Path:
     other_attack = json.dumps(SUCCESSFUL_EXAMPLE | {"confidence": "high"})
     (folder / "other" / "attack.jsonl").write_text(other_attack)
     with locked(folder / "begun"):
-        return write_report([folder], folder / "out")
+        return write_report([folder], folder / "out")[0]
 
 
 def test_a_page_loads_nothing_from_elsewhere(page):
@@ -190,7 +193,7 @@ def test_runs_that_cannot_be_read_are_named_in_the_page(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
-    text = write_report([tmp_path], tmp_path).read_text()
+    text = write_report([tmp_path], tmp_path)[0].read_text()
     assert "/a</td><td" in text
     assert "/b</td><td" in text
 
@@ -204,6 +207,29 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback")
     assert last.startswith("ZeroDivisionError")
+
+
+def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
+    finished, tmp_path, monkeypatch
+):
+    parsed = []
+
+    def counted(file, **options):
+        parsed.append(file.name)
+        return reader(file, **options)
+
+    reader = csv.DictReader
+    monkeypatch.setattr(csv, "DictReader", counted)
+    folder = shutil.copytree(finished, tmp_path / "run")
+    for _ in range(2):
+        runs = [summarize(folder)]
+        format_table(runs)
+        format_short_comparison(runs)
+        format_comparison(runs, [])
+        report_of([folder], tmp_path)
+    tables = [str(path) for path in folder.rglob("predictions.csv")]
+    assert tables
+    assert sorted(name for name in parsed if name.endswith("predictions.csv")) == sorted(tables)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])

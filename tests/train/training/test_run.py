@@ -557,7 +557,7 @@ def assert_rows_of_labels(folder: Path, scores: dict[str, float]) -> None:
         assert row[4].startswith(f"{scores[f'photographs/{part}auc']:.3f}")
     _, _, *labels = [row[0].rpartition(", ")[2] for row in differences]
     assert labels == ["label=apple", "label=pear"]
-    page = write_report([folder], folder).read_text()
+    page = write_report([folder], folder)[0].read_text()
     assert page.count("<td>after hardening, label=pear</td>") == 1
 
 
