@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from statistics import fmean, stdev
@@ -93,19 +93,14 @@ class StoredScores:
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
         label = [*self.labels] if self.by_label else self.labels[0]
-        entries = {"images": self.images, "label": label, **_flat(self.overall)}
+        entries = {"images": self.images, "label": label, **self.overall.to_summary()}
         if self.thresholds:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point
         if self.by_label:
-            entries["by_label"] = {name: _flat(metrics) for name, metrics in self.by_label.items()}
+            by_label = {name: metrics.to_summary() for name, metrics in self.by_label.items()}
+            entries["by_label"] = by_label
         return entries
-
-
-def _flat(metrics: Metrics) -> dict[str, Any]:
-    """Convert metrics to dictionaries by name. That of an unknown metric is empty."""
-    estimates = {name: metrics.find(name) for name in METRICS}
-    return {name: asdict(item) if item else {} for name, item in estimates.items()}
 
 
 @dataclass(frozen=True)
