@@ -364,7 +364,7 @@ class Classifier(nn.Module):
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
-            remedy = f"set label to one of {known}" if known else "store one with pnb-publish"
+            remedy = f"set label to one of {known}" if known else "store one with nb.publish"
             raise InputError(
                 f"classifier {self.name} has no operating point for label={label}: {remedy}",
             )

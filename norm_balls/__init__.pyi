@@ -82,5 +82,6 @@ from train import evaluate as evaluate
 from train import harden as harden
 from train import load as load
 from train import load_run as load_run
+from train import publish as publish
 
 __version__: str

@@ -481,7 +481,8 @@ LIGHTS = [
         None,
         6,
     ),
-    *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT, "light.exr"),
+    *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT, "light.png"),
+    *calls_of("height", lambda x: renderer.save_light("l.exr", LIGHT, height=x), 0, 2.5, None),
     *calls_of(
         "directions",
         lambda x: harmonics.basis(x, 2),

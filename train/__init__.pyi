@@ -7,7 +7,8 @@ from train.command_settings import LabSettings as LabSettings
 from train.functions.audit import audit as audit
 from train.functions.evaluate import evaluate as evaluate
 from train.functions.harden import harden as harden
-from train.functions.load import load as load
+from train.publication import load as load
+from train.publication import publish as publish
 from train.saved_networks import load_run as load_run
 from train.settings import DataSettings as DataSettings
 from train.settings import EvaluationSettings as EvaluationSettings

@@ -44,7 +44,6 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from renderer.errors import InputError
 from renderer.settings import Settings
-from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
 from train.system.memory import reuse_freed_memory
 from train.system.verbosity import take_flag
@@ -150,8 +149,7 @@ class Command:
         # Hydra's parser of options wants --multirun before the settings.
         ordered = sorted(arguments, key=lambda argument: argument not in SWEEP_FLAGS)
         keys = self.keys
-        present = [replace_former_key(argument) for argument in self.rewrite(ordered)]
-        return [as_override(argument, keys) for argument in present]
+        return [as_override(argument, keys) for argument in self.rewrite(ordered)]
 
     def run(self, config: DictConfig) -> None:
         """Run the command, and report errors. Hydra calls this method."""

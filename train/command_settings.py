@@ -635,55 +635,6 @@ class FitSettings(Settings):
 
 
 @dataclass
-class LightSettings(Settings):
-    """Settings of the command pnb-light, which writes a lighting as an environment map."""
-
-    light: str = setting(
-        REQUIRED,
-        "grace, eucalyptus, st_peters, uniform, a map (.npy, .hdr, .exr) or coefficients (.json).",
-    )
-    out: str = setting(
-        REQUIRED,
-        "File of the map: .hdr, .exr or .npy. It has no negative radiance and the same mean.",
-    )
-    height: int = setting(
-        256,
-        "Number of rows. There are twice as many columns.",
-        minimum=1,
-        maximum=8192,  # A map with this height needs 3 GB of memory.
-    )
-    overwrite: bool = setting(False, "Replace a file that exists.")
-
-
-@dataclass
-class PublishSettings(Settings):
-    """Settings of the command pnb-publish, which writes the network of a run for other users."""
-
-    run: str = setting(REQUIRED, "A finished run folder, or a published network.")
-    out: str = setting(REQUIRED, "Folder of the weights.")
-    false_positive_rate: float | None = setting_like(EvaluateSettings, "false_positive_rate", None)
-    calibrate: str | None = setting(
-        None,
-        "Folder of photographs as for pnb-evaluate. null: the threshold that it has, if any.",
-    )
-    label: Any = setting(
-        None,
-        "Class of the threshold, or several, each with its own. null: what the run was trained "
-        "for.",
-        is_text=True,
-    )
-    network: str | None = setting(
-        None, "python:package.module:function, if such a function built the run's network."
-    )
-    trust: bool = setting_like(NetworkSettings, "trust", False)
-    overwrite: bool = setting(False, "Replace results in the folder `out`.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_calibration(self.false_positive_rate, self.calibrate)
-
-
-@dataclass
 class ReportSettings(Settings):
     """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
 

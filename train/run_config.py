@@ -22,7 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.command import program
-from train.former_keys import rename_former_keys
 from train.run_folder import opened_text
 from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, mapped
 
@@ -40,8 +39,7 @@ def read_config(path: Path) -> DictConfig:
     The file may come from someone else. YAML aliases are refused, because a few
     nested aliases can stand for more values than fit into memory.
     Interpolations such as "${oc.env:HOME}" are refused, because they can reveal
-    environment variables. Settings that had other names in earlier versions get
-    their present names.
+    environment variables.
     """
     # `opened_text` turns any error in its block into an InputError that names the file.
     with opened_text(path) as text:
@@ -51,7 +49,6 @@ def read_config(path: Path) -> DictConfig:
         plain = yaml.safe_load(text)
         if not isinstance(plain, dict):
             raise ValueError("it holds no keys")
-        rename_former_keys(plain)
         return OmegaConf.create(plain)
 
 

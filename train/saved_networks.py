@@ -229,7 +229,7 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name.removeprefix(LIGHT_PREFIX): value for name, value in weights.items()}
 
 
-def publish(path: Path, state: Mapping[str, Any]) -> None:
+def write_published(path: Path, state: Mapping[str, Any]) -> None:
     """Write the network of a checkpoint in half precision, as a file for other users.
 
     The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
@@ -245,7 +245,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def _load_published(path: Path) -> dict[str, Any]:
-    """Read a file that `publish` wrote. The weights, in single precision, are in "model"."""
+    """Read a file of `write_published`. The weights, in single precision, are in "model"."""
     weights: dict[str, Tensor] = {}
     try:
         with safe_open(path, "pt") as file:

@@ -10,12 +10,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from renderer.errors import MAX_SCALE, InputError, require_bounded, require_file
+from renderer.errors import MAX_SCALE, InputError, require_bounded, require_file, require_range
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
-from renderer.validation import as_path, as_tensor, require_kind
+from renderer.light.environment import SUFFIXES, to_map, write_map
+from renderer.light.harmonics import irradiance_error
+from renderer.validation import as_path, as_tensor, require_kind, require_whole
 
 # Exceptions that are raised if a .json file is damaged, or does not describe a light.
 _DAMAGED_FILE_ERRORS = (
@@ -27,28 +29,40 @@ _DAMAGED_FILE_ERRORS = (
     RecursionError,
     OSError,
 )
+# Largest number of rows of a written map, which needs 3 GB of memory.
+MAX_MAP_HEIGHT = 8192
 # Type of the basis that `read_light` returns.
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
 def save_light(
-    path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS
-) -> None:
-    """Write a light to a .json file.
+    path: str | Path,
+    coefficients: Tensor,
+    basis: Harmonics | LocalBasis = HARMONICS,
+    height: int = 256,
+) -> float:
+    """Write a light to a .json file, or environment lighting as a map for other software.
 
-    `read_light` reads exactly the same float32 numbers. For a projector, its
-    pattern is also written to an 8-bit .png file with the same name. White in
-    this image is the largest coefficient, the attribute `power` of the projector.
+    From a .json file, `load_light` reads exactly the same float32 numbers. For a
+    projector, its pattern is also written to an 8-bit .png file with the same
+    name. White in this image is the largest coefficient, the attribute `power` of
+    the projector. A map (.hdr, .exr or .npy) has no negative radiance and the same
+    mean, so its irradiance can differ from that of the light.
 
     Args:
-        path: Path of the .json file.
+        path: Path of a .json file or, for spherical harmonics, of a map.
         coefficients: RGB coefficients of the light, shape (size, 3) with the
             number `basis.size` of functions of the basis.
         basis: Basis of the light. The default is spherical harmonics of degree 6.
+        height: Number of rows of a map, which has twice as many columns.
+
+    Returns:
+        Relative error of the irradiance of the written light, root mean square over
+        all normals. It is 0 for a .json file.
 
     Raises:
-        InputError: If the file is not a .json file or cannot be written, or the
-            coefficients have another shape or hold NaN.
+        InputError: If the suffix is of no such file, if the file cannot be written,
+            or if the coefficients have another shape or hold NaN.
 
     Example:
         >>> import torch
@@ -57,12 +71,15 @@ def save_light(
         >>> nb.save_light("light.json", light)
         >>> torch.equal(nb.load_light("light.json"), light)
         True
+        >>> nb.save_light("light.hdr", light) < 0.01
+        True
     """
     path = as_path("path", path)
-    if path.suffix != ".json":
+    is_map = path.suffix.lower() in SUFFIXES and isinstance(basis, Harmonics)
+    if path.suffix != ".json" and not is_map:
         raise InputError(
-            f"path={path} is not a .json file: give a .json file, and let pnb-light write it as a "
-            "map (.hdr, .exr, .npy)"
+            f"path={path} is neither a .json file nor, for spherical harmonics, a map: "
+            f"use one of the suffixes .json, {', '.join(SUFFIXES)}"
         )
     expected = "Harmonics(degree), or lamps or a projector"
     require_kind("basis", basis, Harmonics | LocalBasis, expected)
@@ -74,6 +91,12 @@ def save_light(
             f"coefficients has shape {shape}, but {basis} needs the shape {(basis.size, 3)}: "
             "give coefficients of this shape"
         )
+    if isinstance(basis, Harmonics) and is_map:
+        require_whole("height", height)
+        require_range("height", height, 1, MAX_MAP_HEIGHT)
+        physical = basis.project_nonnegative(coefficients)
+        write_map(path, to_map(physical, height).clamp(min=0))
+        return float(irradiance_error(physical, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
     try:
@@ -83,6 +106,7 @@ def save_light(
             write_image(path.with_suffix(".png"), image)
     except OSError as error:
         raise InputError(f"light {path} cannot be written: {error}") from error
+    return 0.0
 
 
 def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, Tensor]:

@@ -15,6 +15,7 @@ import torch
 import trimesh
 from PIL import Image
 
+import norm_balls as nb
 from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
 from renderer.light.lamps import Lamps
@@ -174,5 +175,5 @@ def corpus(tmp_path_factory) -> Path:
     write_data(folder)
     write_scene_files(folder)
     assert run_here("train", "out=finished", "train.epochs=2", *TRAINING, folder=folder) == 0
-    assert run_here("publish", "run=finished", "out=published", folder=folder) == 0
+    nb.publish(folder / "finished", folder / "published")
     return folder

@@ -17,7 +17,7 @@ import yaml
 from renderer.errors import InputError
 from train import command, console
 from train.command import USER_ERROR, Command
-from train.command_settings import LightSettings
+from train.command_settings import CompareSettings
 from train.commands.experiment import logged_to
 from train.data.cache import content_hash
 from train.help import HelpText
@@ -266,7 +266,7 @@ def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
     assert ("train.resume=true" in last_line) == has_trained
 
 
-LIGHT = Command("light", LightSettings, "builtins:print", HelpText("Write a light."))
+COMPARE = Command("compare", CompareSettings, "builtins:print", HelpText("Compare."))
 
 
 WARNING = """
@@ -290,8 +290,8 @@ def test_a_warning_of_a_library_is_one_line_of_a_command():
 
 
 def test_a_current_folder_that_was_deleted_is_one_line_of_a_command(tmp_path):
-    code = "import os, scripts.light as light; os.mkdir(name := os.environ['GONE']); os.chdir(name)"
-    code += "; os.rmdir(name); light.main()"
+    code = "import os, scripts.compare as c; os.mkdir(name := os.environ['GONE']); os.chdir(name)"
+    code += "; os.rmdir(name); c.main()"
     ended = run_python(f"import os; os.environ['GONE'] = {str(tmp_path / 'gone')!r}; {code}")
     assert ended.returncode == USER_ERROR
     assert ended.stderr.startswith("error: the current folder cannot be used")
@@ -299,7 +299,7 @@ def test_a_current_folder_that_was_deleted_is_one_line_of_a_command(tmp_path):
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), LIGHT.handle_errors():
+    with pytest.raises(ZeroDivisionError), COMPARE.handle_errors():
         raise ZeroDivisionError
 
 
@@ -317,7 +317,7 @@ def interrupt_and_fail() -> None:
 
 @pytest.mark.parametrize("act", [interrupt, interrupt_and_fail])
 def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys, act):
-    with pytest.raises(SystemExit) as stop, LIGHT.handle_errors():
+    with pytest.raises(SystemExit) as stop, COMPARE.handle_errors():
         act()
     assert stop.value.code == 128 + signal.SIGINT
     printed = capsys.readouterr()

@@ -12,7 +12,7 @@ from renderer.errors import InputError
 from train.checkpoints import save
 from train.networks import Dropout, WideResNet, build_network, describe
 from train.run_folder import BEST, PUBLISHED
-from train.saved_networks import load_network, load_run, load_selected, publish
+from train.saved_networks import load_network, load_run, load_selected, write_published
 from train.training.initial import Initial
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
@@ -87,7 +87,7 @@ def write(
     architecture = description_of(network) if description is None else description
     state = {"model": network.state_dict(), "architecture": architecture | changes}
     save(folder / BEST, state)
-    publish(folder / PUBLISHED, state)
+    write_published(folder / PUBLISHED, state)
     return folder
 
 

@@ -1,6 +1,7 @@
 """Files are replaced as a whole: a write that fails leaves the old file, and no other file."""
 
 import json
+import math
 import os
 import resource
 import stat
@@ -24,7 +25,8 @@ from renderer.io.files import (
     replacing,
 )
 from renderer.io.images import write_image
-from renderer.light.environment import write_map
+from renderer.light.environment import read_panorama, write_map
+from renderer.light.harmonics import equirectangular
 from renderer.light.projector import Projector
 from train import checkpoints
 
@@ -153,6 +155,39 @@ def test_a_light_is_saved_and_loaded_by_either_type_of_path(tmp_path, path_type)
     renderer.save_light(path, LIGHT)
     assert torch.equal(renderer.load_light(path), LIGHT)
     assert json.loads(Path(path).read_text())["basis"] == "harmonics"
+
+
+class TestAMapOfALightThatIsNegativeInPlaces:
+    """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z)."""
+
+    @pytest.fixture(params=[".npy", ".exr", ".hdr"])
+    def saved(self, request, tmp_path) -> tuple[torch.Tensor, float]:
+        """Write the light as a map; return the red channel of the file, and the printed error."""
+        light = torch.zeros(49, 3)
+        light[0] = math.sqrt(4 * math.pi)
+        light[2] = 2 * math.sqrt(4 * math.pi / 3)
+        path = tmp_path / f"map{request.param}"
+        error = renderer.save_light(path, light, height=64)
+        return read_panorama(path)[..., 0].double(), error
+
+    def test_has_the_same_flux_without_negative_radiance(self, saved):
+        radiance, _ = saved
+        _, solid_angles = equirectangular(*radiance.shape)
+        flux = float((radiance * solid_angles).sum())
+        assert radiance.min() >= 0
+        assert flux == pytest.approx(4 * math.pi, rel=0.01)
+
+    def test_comes_with_the_error_of_the_irradiance(self, saved):
+        """Compare with the error at 201 normals. The mean square irradiance is π² (1 + 16/27)."""
+        radiance, found = saved
+        directions, solid_angles = equirectangular(*radiance.shape)
+        height = torch.linspace(-1, 1, 201, dtype=torch.float64)
+        normals = torch.stack([(1 - height**2).sqrt(), 0 * height, height], dim=1)
+        cosines = (normals @ directions.flatten(0, 1).T).clamp(min=0)
+        irradiance = cosines @ (radiance * solid_angles).flatten()
+        error = (irradiance - math.pi * (1 + 4 / 3 * height)).square().mean().sqrt()
+        root_mean_square = math.pi * math.sqrt(1 + 16 / 27)
+        assert found == pytest.approx(float(error) / root_mean_square, abs=0.005)
 
 
 @pytest.mark.parametrize("path_type", [str, Path])

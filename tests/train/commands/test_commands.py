@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import re
 import shlex
 from contextlib import suppress
@@ -18,9 +17,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.images import read_image
-from renderer.light.environment import read_panorama, to_map
-from renderer.light.files import save_light
-from renderer.light.harmonics import equirectangular
+from renderer.light.environment import to_map
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network
@@ -35,7 +32,6 @@ from train.saved_networks import load_run
 
 EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]
-EXPORT = ["light", "light=grace", "height=4"]
 
 
 @pytest.fixture
@@ -125,40 +121,6 @@ def test_a_laboratory_of_other_meshes_needs_a_label():
         LabSettings(out="lab", meshes=["can.glb"])
 
 
-class TestExportOfALightThatIsNegativeInPlaces:
-    """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z)."""
-
-    @pytest.fixture(params=[".npy", ".exr", ".hdr"])
-    def radiance(self, request, call, here, capsys) -> torch.Tensor:
-        """Export the light as a map, and read the red channel of the file."""
-        light = torch.zeros(49, 3)
-        light[0] = math.sqrt(4 * math.pi)
-        light[2] = 2 * math.sqrt(4 * math.pi / 3)
-        save_light(here / "light.json", light)
-        name = f"map{request.param}"
-        assert call("light", "light=light.json", f"out={name}", "height=64") == 0
-        return read_panorama(here / name)[..., 0].double()
-
-    def test_is_a_map_of_the_same_flux_without_negative_radiance(self, radiance):
-        _, solid_angles = equirectangular(*radiance.shape)
-        flux = float((radiance * solid_angles).sum())
-        assert radiance.min() >= 0
-        assert flux == pytest.approx(4 * math.pi, rel=0.01)
-
-    def test_prints_the_error_of_the_irradiance(self, radiance, capsys):
-        """Compare with the error at 201 normals. The mean square irradiance is π² (1 + 16/27)."""
-        printed = re.search("irradiance is off by ([0-9.]+)%", capsys.readouterr().out)
-        directions, solid_angles = equirectangular(*radiance.shape)
-        height = torch.linspace(-1, 1, 201, dtype=torch.float64)
-        normals = torch.stack([(1 - height**2).sqrt(), 0 * height, height], dim=1)
-        cosines = (normals @ directions.flatten(0, 1).T).clamp(min=0)
-        irradiance = cosines @ (radiance * solid_angles).flatten()
-        error = (irradiance - math.pi * (1 + 4 / 3 * height)).square().mean().sqrt()
-        root_mean_square = math.pi * math.sqrt(1 + 16 / 27)
-        percent = 100 * float(error) / root_mean_square
-        assert float(printed[1]) == pytest.approx(percent, abs=0.5)
-
-
 MISTAKES = [
     ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe"),
     ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
@@ -175,9 +137,6 @@ MISTAKES = [
     (["compare", "runs=[a,b,./a]"], "runs names a twice"),
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["compare", "--multirun"], "--multirun"),
-    ([*EXPORT, "out=a.jpg"], "out: "),
-    (["publish", "run=1.10", "out=file/out"], "out=file/out"),
-    ([*EXPORT, "out=file/a.npy"], "out: environment map file/a.npy"),
     (["lab", "out=file/out"], "out=file/out"),
 ]
 
@@ -213,15 +172,6 @@ def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
         assert call(*command, "out=out") == USER_ERROR
     assert "error: out=out " in capsys.readouterr().err
     assert not (here / "out").exists()
-
-
-def test_a_light_is_not_written_over_itself(call, here, capsys):
-    assert call("light", "light=grace", "height=8", "out=a.npy") == 0
-    (here / "b.npy").symlink_to("a.npy")
-    before = (here / "a.npy").read_bytes()
-    assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
-    assert capsys.readouterr().err.startswith("error: out=b.npy would overwrite the light itself")
-    assert (here / "a.npy").read_bytes() == before
 
 
 def to_pixels(image: torch.Tensor) -> np.ndarray:

@@ -24,8 +24,6 @@ NAMES = (
     "evaluate",
     "fit",
     "lab",
-    "light",
-    "publish",
     "report",
 )
 

@@ -47,8 +47,6 @@ def sweep(made_up_run, tmp_path) -> list[Path]:
         ["attack", "meshes=solid:orange:0", *ATTACK, *TRANSFER],
         ["compare", f"runs=[{','.join(f'sweep/{index}' for index in range(20))}]"],
         ["report", "runs=[sweep]", "out=page"],
-        ["light", "light=grace", "height=4", "out=grace.hdr"],
-        ["publish", f"run={PRETRAINED / 'best'}", "out=published"],
         pytest.param(["evaluate", *EVALUATE, "out=scores"], marks=pytest.mark.slow),
     ],
     ids=lambda words: " ".join(words)[:40],

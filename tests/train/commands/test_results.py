@@ -31,7 +31,6 @@ COMMANDS = {
     "evaluate": ["run=network", "photos=photos", "device=cpu", "precision=float32"],
     "fit": ["photograph=photos/orange/0.png", "mask=photos/orange/0.png", "mesh=solid:orange"],
     "lab": ["setups=6"],
-    "publish": ["run=network"],
     "report": ["network", "photos"],
     "train": ["experiment=paper", "data=shapes", "compare=[]", "train.device=cpu"],
 }
@@ -104,7 +103,7 @@ def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it
     assert contents(here) == before
 
 
-@pytest.mark.parametrize("command", ["attack", "audit", "evaluate", "publish"])
+@pytest.mark.parametrize("command", ["attack", "audit", "evaluate"])
 def test_no_command_writes_into_the_folder_of_a_run(call, here, capsys, command):
     (here / "network" / "config.yaml").write_text("train: {}\nout: network\n")
     before = contents(here / "network")

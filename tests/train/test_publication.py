@@ -7,12 +7,10 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+import norm_balls as nb
 from renderer.errors import InputError
 from renderer.io.images import read_image
 from train import checkpoints, run_folder
-from train.command_settings import EvaluateSettings, PublishSettings
-from train.commands.evaluate import evaluate
-from train.commands.publish import publish_network
 from train.data.cache import content_hash
 from train.results.store import summarize
 from train.run_folder import PUBLISHED
@@ -22,7 +20,7 @@ from train.saved_networks import load_run, load_selected
 @pytest.fixture(scope="module")
 def published(finished, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("published") / "tiny"
-    publish_network(PublishSettings(str(finished), str(folder)))
+    nb.publish(finished, folder)
     return folder
 
 
@@ -60,7 +58,7 @@ class TestAPublishedNetwork:
 
 def test_a_rate_without_photographs_is_refused(finished, tmp_path):
     with pytest.raises(InputError, match="together"):
-        PublishSettings(str(finished), str(tmp_path), false_positive_rate=0.5)
+        nb.publish(finished, tmp_path, false_positive_rate=0.5)
 
 
 def read_images(paths: list[Path]) -> Tensor:
@@ -71,7 +69,7 @@ def read_images(paths: list[Path]) -> Tensor:
 def calibrated(finished, photos, tmp_path_factory) -> Path:
     """Publish a network with the threshold of a false positive rate of 1/2."""
     folder = tmp_path_factory.mktemp("calibrated") / "first"
-    publish_network(PublishSettings(str(finished), str(folder), 0.5, str(photos)))
+    nb.publish(finished, folder, calibrate=photos, false_positive_rate=0.5)
     return folder
 
 
@@ -88,7 +86,7 @@ class TestAnOperatingPoint:
         assert network.detect(negatives).sum() == 2
 
     def test_and_the_network_stay_the_same_if_it_is_published_again(self, calibrated, tmp_path):
-        publish_network(PublishSettings(str(calibrated), str(tmp_path / "second")))
+        nb.publish(calibrated, tmp_path / "second")
         hashes = []
         for folder in (calibrated, tmp_path / "second"):
             _, state = load_selected(folder)
@@ -97,7 +95,7 @@ class TestAnOperatingPoint:
 
     def test_is_used_by_evaluation(self, calibrated, photos, tmp_path):
         (point,) = load_run(calibrated).operating_points
-        evaluate(EvaluateSettings(str(photos), str(calibrated), out=str(tmp_path)))
+        nb.evaluate(load_run(calibrated), photos, "orange", out=tmp_path)
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert summary["operating_point"] == vars(point) | {"in_sample": True}
 
@@ -111,8 +109,8 @@ def folders(finished, photos, tmp_path_factory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("labels")
     labels = {"both": list(LABELS), "orange": "orange", "apple": "apple"}
     for name, label in labels.items():
-        out = str(root / name)
-        publish_network(PublishSettings(str(finished), out, 0.5, str(photos), label))
+        options = {"calibrate": photos, "false_positive_rate": 0.5, "label": label}
+        nb.publish(finished, root / name, **options)
     return {name: root / name for name in labels}
 
 
@@ -133,13 +131,7 @@ class TestSeveralLabels:
 
     def test_are_scored_in_the_order_of_the_settings(self, folders, photos, tmp_path):
         labels = list(reversed(LABELS))
-        settings = EvaluateSettings(
-            str(photos),
-            str(folders["both"]),
-            label=labels,
-            out=str(tmp_path),
-        )
-        evaluate(settings)
+        nb.evaluate(load_run(folders["both"]), photos, labels, out=tmp_path)
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert [point["label"] for point in summary["operating_point"]] == labels
 
@@ -150,7 +142,7 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     state["architecture"] = state["architecture"] | {"width": "wide"}
     checkpoints.save(run / run_folder.BEST, state)
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
-        publish_network(PublishSettings(str(run), str(tmp_path / "out")))
+        nb.publish(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -169,3 +161,45 @@ def test_all_pretrained_networks_are_scored_on_the_same_photographs():
         scores = summarize(Path("pretrained", name)).photographs
         images.add(scores["photographs"].images)
     assert len(images) == 1
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def rows_of_the_page() -> dict[str, list[str]]:
+    """Read the first table of results in pretrained/README.md, by the name of the network."""
+    lines = (ROOT / "pretrained" / "README.md").read_text().splitlines()
+    header = next(line for line in lines if line.startswith("|network|CIFAR-100|"))
+    rows: dict[str, list[str]] = {}
+    for line in lines[lines.index(header) + 2 :]:
+        if not line.startswith("|"):
+            return rows
+        name, *cells = line.strip("|").split("|")
+        rows[name.strip("`")] = cells
+    return rows
+
+
+@pytest.mark.parametrize("name", ["none", "random", "adversarial", "best"])
+def test_the_results_are_those_of_the_page(name):
+    accuracy, *_, recall, false_positive_rate, auc, _ = rows_of_the_page()[name]
+    results = nb.load(name).results
+    assert results["test/accuracy"].value == float(accuracy)
+    errors = results["photographs/false_positive_rate"]
+    # The page has the scores of another precision of the arithmetic.
+    assert errors.value == pytest.approx(float(false_positive_rate), abs=3e-3)
+    assert results["photographs/recall"].value == pytest.approx(float(recall), abs=5e-3)
+    assert results["photographs/auc"].value == pytest.approx(float(auc.split()[0]), abs=1e-3)
+
+
+def test_the_network_is_that_of_its_folder():
+    loaded = nb.load("best")
+    expected = nb.load_run("pretrained/best")
+    assert loaded.classes == expected.classes
+    weights = expected.state_dict()
+    assert all(value.equal(weights[name]) for name, value in loaded.state_dict().items())
+    assert loaded.operating_points == expected.operating_points
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(nb.InputError, match="adversarial, best, none, random"):
+        nb.load("bset")

@@ -1,0 +1,212 @@
+"""Publish the network of a run, and load networks that are published with the library."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from augment.network import Classifier, OperatingPoint
+from renderer.errors import InputError
+from renderer.validation import as_path, require_kind
+from train.command_settings import require_calibration
+from train.networks import PYTHON
+from train.results.metrics import METRICS, Metrics
+from train.results.overwrite import require_replaceable
+from train.results.scoring import Predictor, choose_operating_points
+from train.results.store import summarize, trained_labels
+from train.results.tables import Estimate
+from train.run_folder import PUBLISHED
+from train.saved_networks import load_run, load_selected, write_published
+from train.settings import mapped, published
+from train.system.user_errors import keyed, writable_folder
+
+# Folder of the published networks, in the installation or in a clone.
+PRETRAINED = Path("pretrained")
+# Name of the score "accuracy on the test images of CIFAR-100".
+ACCURACY = "test/accuracy"
+
+
+class PublishedNetwork(Classifier):
+    """A network that is published with the library, with its results.
+
+    Attributes:
+        results: Metrics with 95% intervals by name. "test/accuracy" is the
+            accuracy on the test images of CIFAR-100. Metrics on photographs are
+            "photographs/recall", "photographs/false_positive_rate",
+            "photographs/auc" and others.
+    """
+
+    results: Mapping[str, Estimate]
+
+
+def load(name: str) -> PublishedNetwork:
+    """Load a network that is published with the library, with its results.
+
+    Args:
+        name: "best", "adversarial", "random" or "none". The file
+            pretrained/README.md describes these networks.
+
+    Returns:
+        Classifier of images of 32 pixels per side. Its attribute `results` has
+        its metrics.
+
+    Raises:
+        InputError: If there is no published network of this name.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> network = nb.load("best")
+        >>> network.size, len(network.classes)
+        (32, 100)
+        >>> round(network.results["photographs/auc"].value, 3)
+        0.966
+    """
+    require_kind("name", name, str, "the name of a published network, such as 'best'")
+    names = published_names()
+    if name not in names:
+        known = ", ".join(names)
+        raise InputError(f"name={name!r} is no published network: choose one of {known}")
+    folder = published(PRETRAINED / name)
+    loaded = load_run(folder)
+    _, state = load_selected(folder)
+    network = PublishedNetwork(loaded.function, loaded.size, loaded.classes, name)
+    network.operating_points = loaded.operating_points
+    network.results = _read_results(state["scores"])
+    return network
+
+
+def published_names() -> list[str]:
+    """Return the names of the networks that are published with the library, sorted."""
+    files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
+    return sorted(path.parent.name for path in files)
+
+
+def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
+    """Read the results of a published network from the scores in its file.
+
+    A folder's metrics are nested in `scores`, and get names such as "photographs/auc".
+    """
+    results = {ACCURACY: Estimate(scores[ACCURACY])}
+    for folder, metrics in scores.items():
+        if not isinstance(metrics, Mapping):
+            continue
+        for metric in METRICS:
+            estimate = Metrics.read(metrics).find(metric)
+            if estimate is not None and estimate.value is not None:
+                results[f"{folder}/{metric}"] = estimate
+    return results
+
+
+def publish(
+    run: str | Path,
+    out: str | Path,
+    *,
+    calibrate: str | Path | None = None,
+    false_positive_rate: float | None = None,
+    label: str | int | Sequence[str | int] | None = None,
+    network: str | None = None,
+    trust_code: bool = False,
+    overwrite: bool = False,
+) -> list[OperatingPoint]:
+    """Write the network of a run as half-precision safetensors, for other users.
+
+    The metadata of the file holds the settings and the scores of the run as JSON. `load_run`
+    reads the file.
+
+    Args:
+        run: Folder of a finished run, or of a published network.
+        out: Folder of the written file.
+        calibrate: Folder of photographs on which a threshold on the log-odds of each positive
+            class is chosen, with a sub-folder for each class. None for the threshold that a
+            published network has, if any.
+        false_positive_rate: False-positive rate of the thresholds on these photographs, in
+            (0, 1). It is given together with `calibrate`.
+        label: Class of the threshold, by name or index, or several. None for what the run was
+            trained for.
+        network: "python:package.module:function", if such a function built the network of the
+            run.
+        trust_code: Whether a function that the file of the network names may be called. It can
+            run any code.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        The chosen thresholds, one for each positive class. Empty without `calibrate`.
+
+    Raises:
+        InputError: If the network cannot be read or built, if the photographs cannot be read, or
+            if `out` has other results.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> nb.publish("pretrained/best", "published/best")
+        []
+        >>> nb.load_run("published/best").size
+        32
+    """
+    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    target = writable_folder(str(as_path("out", out)), "out")
+    folder = as_path("run", run)
+    path, state = load_selected(folder)
+    # `run` may be the folder of a published network, which is then replaced, for example
+    # to add a detection threshold to it.
+    is_replaced = path.resolve() == (target / PUBLISHED).resolve()
+    require_replaceable(target, "out", overwrite, [PUBLISHED] if is_replaced else [])
+    if path.suffix != Path(PUBLISHED).suffix:
+        state |= _describe_run(folder)
+    points: list[OperatingPoint] = []
+    # A Python function of the user may build the network. It is called only if the
+    # network must be calibrated.
+    is_python = str(state["architecture"].get("name")).startswith(PYTHON)
+    if calibrate is not None or not is_python:
+        # `load_run` raises an InputError if nobody could load the published network.
+        loaded = load_run(path, model=network, trust_code=trust_code)
+        if calibrate is not None and false_positive_rate is not None:
+            labels = label if label is not None else trained_labels(folder)
+            if not labels:
+                raise InputError(
+                    f"label is not set, and run={run} records no positive class: give label",
+                    "label",
+                )
+            points = _calibrate(
+                loaded, as_path("calibrate", calibrate), labels, false_positive_rate
+            )
+            state["operating_point"] = [asdict(point) for point in points]
+    target.mkdir(parents=True, exist_ok=True)
+    write_published(target / PUBLISHED, state)
+    return points
+
+
+def _calibrate(
+    network: Classifier, folder: Path, label: Any, false_positive_rate: float
+) -> list[OperatingPoint]:
+    """Choose a threshold for each positive class on photographs, with weights of 16 bits.
+
+    Published weights have 16 bits.
+    """
+    network.half().float()
+    with keyed(folder="calibrate"):
+        return choose_operating_points(
+            Predictor(network, network.classes, network.size),
+            published(folder),
+            label,
+            false_positive_rate,
+        )
+
+
+def _describe_run(folder: Path) -> dict[str, Any]:
+    """Collect "settings", "versions" of packages and "scores" of a run for the published file."""
+    run = summarize(folder)
+    photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
+    return {
+        "settings": mapped(dict(run.settings), _without_folder),
+        "versions": dict(run.config.versions),
+        "scores": {**run.scores, **photographs},
+    }
+
+
+def _without_folder(text: str) -> str:
+    """Remove the folders from an absolute path, because other machines do not have them.
+
+    Other values than absolute paths are returned as they are.
+    """
+    return Path(text).name if text.startswith("/") else text
