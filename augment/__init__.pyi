@@ -3,12 +3,12 @@ from augment.attack_settings import EOTSettings as EOTSettings
 from augment.attack_settings import RelightingSettings as RelightingSettings
 from augment.attacks.adversary import Adversary as Adversary
 from augment.attacks.adversary import reload as reload
-from augment.attacks.attack import AttackResult as AttackResult
 from augment.attacks.attack import attack as attack
 from augment.attacks.checks import check as check
 from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
 from augment.attacks.files import save as save
+from augment.attacks.result import AttackResult as AttackResult
 from augment.network import Classifier as Classifier
 from augment.parameter_settings import MaterialSettings as MaterialSettings
 from augment.parameter_settings import ParameterSettings as ParameterSettings

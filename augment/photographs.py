@@ -14,10 +14,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings, RelightingSettings
-from augment.attacks.attack import fooled_in_views
 from augment.attacks.eot import Quantized
 from augment.attacks.gain import Best, descend_gain, draw_log_gain, search_gain
-from augment.attacks.loop import Criterion
+from augment.attacks.objective import Criterion, Objective
 from augment.network import Classifier, frozen_eval_mode
 from augment.plain_networks import (
     UNIT_RANGE,
@@ -351,15 +350,8 @@ class _PhotographAttack:
         criterion = Criterion(self.source[rows].to(self.device)[:, None])
         # Index of the sensor noise, which differs for each pair of a photograph and a slide.
         noise_indices = rows * self.settings.slides + slide
-        is_changed = fooled_in_views(
-            self.model,
-            relit[:, None],
-            predicted[:, None],
-            noise_indices,
-            criterion,
-            self.success_settings,
-            self.seed,
-        )
+        objective = Objective(self.classifier, criterion, self.success_settings, self.seed)
+        is_changed = objective.fooled_in_views(relit[:, None], predicted[:, None], noise_indices)
         self.predicted[light][rows, slide] = predicted.cpu()
         self.changed[light][rows, slide] = is_changed[:, 0].cpu()
         self.log_gain[light][rows, slide] = log_gain

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import distributed
-from augment.attacks.attack import fooled_in_views, warn_of_changed_light
+from augment.attacks.attack import warn_of_changed_light
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.loop import Criterion, DescentResult
-from augment.attacks.optimizers import descend
-from augment.attacks.problem import AttackProblem, build_problem
+from augment.attacks.loop import Minimum, minimize
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.problem import SceneProblem, build_problem
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known
 from augment.network import NetworkCall, compute_outputs, frozen_eval_mode
 from augment.progress import Phases
@@ -394,7 +394,7 @@ class AugmentationService:
         return Renders(selected, labels, diagnostics)
 
     def _random(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Int[Tensor, " A"]
+        self, model: nn.Module, problem: SceneProblem, number: int, shard: Int[Tensor, " A"]
     ) -> Renders:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
@@ -426,42 +426,24 @@ class AugmentationService:
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
     def _adversarial(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Int[Tensor, " A"]
+        self, model: nn.Module, problem: SceneProblem, number: int, shard: Int[Tensor, " A"]
     ) -> Renders:
         """Attack all examples."""
         attack = self.settings.attack
+        seed = stream_seed(self.seed, number)
         criterion = self._attack_criterion().select(shard)
-        attacked_model = preprocessed_model(attack, model)
+        objective = Objective(model, criterion, attack, seed, self.phases)
         start = self._attack_start(problem, number)
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
-        seed = stream_seed(self.seed, number)
-        result = descend(
-            attacked_model,
-            problem,
-            criterion,
-            attack,
-            self.phases,
-            examples=shard,
-            start=start[shard],
-            restarts=restarts,
-            seed=seed,
-        )
+        result = minimize(problem, objective, examples=shard, start=start[shard], restarts=restarts)
         with frozen_eval_mode(model), self.phases("attack_classifier"):
-            is_fooled = fooled_in_views(
-                attacked_model,
-                result.images,
-                result.predicted,
-                shard,
-                criterion,
-                attack,
-                seed,
-            )
+            is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, shard)
         # Replace the result of this process by the results of all processes.
         parts = [getattr(result, item.name) for item in fields(result)]
-        result = DescentResult(*[self._gather(part, shard) for part in parts])
+        result = Minimum(*[self._gather(part, shard) for part in parts])
         if self.settings.warm_start:
             self._last_values = result.values
         max_steps = attack.max_steps * (1 + attack.restarts)
@@ -511,7 +493,7 @@ class AugmentationService:
         target = torch.where(is_positive, NO_CLASS, target_in_turn)
         return Criterion(source[:, None], target[:, None])
 
-    def _attack_start(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
+    def _attack_start(self, problem: SceneProblem, number: int) -> Float[Tensor, "E D"]:
         """Return the attack values at which the next attack starts.
 
         With `warm_start`, they are the values at which the previous attack ended, projected to the
@@ -524,7 +506,7 @@ class AugmentationService:
             return self._random_values(problem, number)
         return problem.start
 
-    def _random_values(self, problem: AttackProblem, number: int) -> Float[Tensor, "E D"]:
+    def _random_values(self, problem: SceneProblem, number: int) -> Float[Tensor, "E D"]:
         """Draw random values of all attacked parameters. `number` selects the random numbers."""
         settings = self.settings.random_light
         parts = []
@@ -590,7 +572,7 @@ class CheckedNetwork(nn.Module):
 
 def select_examples_to_log(
     model: nn.Module,
-    problem: AttackProblem,
+    problem: SceneProblem,
     values: Float[Tensor, "E D"],
     success: Bool[Tensor, " E"],
     labels: Int[Tensor, " E"],
@@ -626,7 +608,7 @@ def select_examples_to_log(
     )
 
 
-def _changes(problem: AttackProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
+def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
     """Compute by how much an attack changed the light, the vertices and other conditions.
 
     A diagnostic such as "light_change" is the L2 norm of the change, averaged over the examples.

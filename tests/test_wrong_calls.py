@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import augment
 import renderer
-from augment.attacks.attack import AttackResult
+from augment.attacks.result import AttackResult
 from augment.progress import Phases
 from augment.scene.conditions import Conditions
 from augment.settings import RandomLightSettings

@@ -14,20 +14,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary
-from augment.attacks.attack import (
-    ZERO_GRADIENT,
-    AttackResult,
-    final_images,
-    fooled_in_views,
-    predictions,
-    require_result,
-)
-from augment.attacks.eot import preprocessed_model
-from augment.attacks.loop import Criterion
-from augment.attacks.optimizers import descend
+from augment.attacks.attack import ZERO_GRADIENT, final_images
+from augment.attacks.loop import minimize
+from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters import parameter_class
-from augment.attacks.problem import AttackProblem, build_problem
-from augment.network import Classifier, compute_outputs
+from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.result import AttackResult, predictions, require_result
+from augment.network import Classifier
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import progress
@@ -369,7 +362,7 @@ class Successes:
     def add(
         self,
         result: AttackResult,
-        problem: AttackProblem,
+        problem: SceneProblem,
         values: Float[Tensor, "A D"],
         examples: Int[Tensor, " A"],
         images: Float[Tensor, "A V 3 H W"],
@@ -380,31 +373,18 @@ class Successes:
         criterion, it is rendered again with exact shadows and bounces, and
         these images decide, without and with sensor noise.
         """
-        is_reached = result.criterion.select(examples).reached(_predicted(result, images))
+        objective = result.objective().select(examples)
+        is_reached = objective.criterion.reached(objective.logits(images).argmax(2))
         candidates = torch.nonzero(is_reached).squeeze(1)
         if not len(candidates):
             return
         candidate_examples = examples[candidates]
-        criterion = result.criterion.select(candidate_examples)
+        objective = objective.select(candidates)
         final = final_images(problem, values[candidates], candidate_examples, images[candidates])
-        predicted = _predicted(result, final)
-        fooled = fooled_in_views(
-            result.preprocessed_model,
-            final,
-            predicted,
-            candidate_examples,
-            criterion,
-            result.settings,
-            result.seed,
-        )
-        self.without_noise[candidate_examples] |= criterion.reached(predicted)
+        predicted = objective.logits(final).argmax(2)
+        fooled = objective.fooled_in_views(final, predicted, candidate_examples)
+        self.without_noise[candidate_examples] |= objective.criterion.reached(predicted)
         self.with_noise[candidate_examples] |= fooled.all(1)
-
-
-def _predicted(result: AttackResult, images: Float[Tensor, "A V 3 H W"]) -> Tensor:
-    """Return the classes that the attacked classifier predicts, shape (A, V)."""
-    logits = compute_outputs(result.preprocessed_model, images, result.settings.batch_size)
-    return logits.argmax(2)
 
 
 def _success_by_draws(
@@ -459,13 +439,9 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
         successes = successes.clone()
         unsuccessful = successes.unsuccessful
         if len(unsuccessful):
-            descent = descend(
-                result.preprocessed_model,
-                result.problem,
-                result.criterion.select(unsuccessful),
-                longer_settings,
-                examples=unsuccessful,
-                seed=result.seed,
+            longer = replace(result, settings=longer_settings)
+            descent = minimize(
+                result.problem, longer.objective().select(unsuccessful), examples=unsuccessful
             )
             successes.add(
                 result,
@@ -507,7 +483,7 @@ def _scaled(settings: StepSettings, scale: float) -> StepSettings:
 
 def _descend_further(
     result: AttackResult,
-    problem: AttackProblem,
+    problem: SceneProblem,
     values: Float[Tensor, "E D"],
     found: Successes,
 ) -> None:
@@ -518,15 +494,8 @@ def _descend_further(
     examples = found.unsuccessful
     if not len(examples):
         return
-    end = descend(
-        result.preprocessed_model,
-        problem,
-        result.criterion.select(examples),
-        result.settings,
-        examples=examples,
-        start=values[examples],
-        seed=result.seed,
-    )
+    objective = result.objective().select(examples)
+    end = minimize(problem, objective, examples=examples, start=values[examples])
     values[examples] = end.values
     found.add(result, problem, values=end.values, examples=examples, images=end.images)
 
@@ -583,21 +552,15 @@ class _Adversaries:
 
     def classify(self, classifier: Classifier) -> dict[str, Any]:
         """Render the examples before and after the attack, and classify the images."""
-        settings = self.result.settings
+        result = self.result
         criterion = self._criterion_for(classifier)
-        logits_before = self._logits(self._render(self.before, classifier.size), classifier)
+        objective = Objective(classifier, criterion, result.settings, result.seed)
+        logits_before = self._logits(self._render(self.before, classifier.size), objective)
         images = self._render(self.after, classifier.size)
-        logits = self._logits(images, classifier)
+        logits = self._logits(images, objective)
         predicted_before = predictions(logits_before, classifier.classes)
-        success_in_views = fooled_in_views(
-            preprocessed_model(settings, classifier),
-            images,
-            logits.argmax(2),
-            torch.tensor(self.examples, dtype=torch.long),
-            criterion,
-            settings,
-            self.result.seed,
-        )
+        examples = torch.tensor(self.examples, dtype=torch.long)
+        success_in_views = objective.fooled_in_views(images, logits.argmax(2), examples)
         return {
             "clean_correct": (logits_before.argmax(2) == criterion.source).all(1).tolist(),
             "success": success_in_views.all(1).tolist(),
@@ -644,14 +607,12 @@ class _Adversaries:
         return torch.stack(images).to(self.result.images_in_views)
 
     def _logits(
-        self, images: Float[Tensor, "A V 3 size size"], classifier: Classifier
+        self, images: Float[Tensor, "A V 3 size size"], objective: Objective
     ) -> Float[Tensor, "A V C"]:
         """Compute the logits of images with the preprocessing of the attack."""
-        settings = self.result.settings
         if not len(images):
-            return torch.empty(0, images.shape[1], len(classifier.classes))
-        model = preprocessed_model(settings, classifier)
-        return compute_outputs(model, images, settings.batch_size).cpu()
+            return torch.empty(0, images.shape[1], len(self.result.classifier.classes))
+        return objective.logits(images).cpu()
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:

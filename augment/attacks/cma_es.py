@@ -20,11 +20,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.attacks.gradient_free import GradientFree
-from augment.attacks.loop import Criterion, DescentResult, State
+from augment.attacks.optimizers import Evaluation, Optimizer
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 
@@ -77,77 +76,48 @@ class Population:
         self.strategy.tell(list(self.drawn), (costs.double() + penalties).tolist())
 
 
-@dataclass(frozen=True)
-class CMAES(GradientFree):
-    """Attack with CMA-ES (covariance matrix adaptation evolution strategy, Hansen 2016).
+class CMAES(Optimizer):
+    """CMA-ES (covariance matrix adaptation evolution strategy, Hansen 2016) of each example."""
 
-    In each step, an evolution strategy draws P candidates for each example, and adapts to their
-    costs.
+    def begin(self, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]) -> None:
+        """Begin new evolution strategies, by the rows of their examples."""
+        super().begin(examples, start)
+        self._populations: dict[int, Population] = {}
 
-    Attributes:
-        populations: Evolution strategy of each example. The key is the row of the
-            example in the state of the search.
-        generations: D attack values of the P candidates that are evaluated next, projected to
-            the norm-ball, shape (P, D). The key is the row of the example, too.
-    """
+    @property
+    def candidate_count(self) -> int:
+        """Number of candidates: 4 + ⌊3 ln D⌋ for D values, the default of `cma`."""
+        return 4 + int(3 * math.log(self.values.shape[1]))
 
-    populations: dict[int, Population] = field(default_factory=dict, init=False)
-    generations: dict[int, Tensor] = field(default_factory=dict, init=False)
-
-    def run(
-        self, criterion: Criterion, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]
-    ) -> DescentResult:
-        """Attack A examples from one set of initial values, with new evolution strategies."""
-        # Strategies of an earlier run started from other values.
-        self.populations.clear()
-        self.generations.clear()
-        return super().run(criterion, examples, start)
-
-    def _candidates_per_step(self, state: State) -> int:
-        """Return how many candidates of each example a step evaluates.
-
-        For D values, these are 4 + ⌊3 ln D⌋, the default of `cma`.
-        """
-        return 4 + int(3 * math.log(state.values.shape[1]))
-
-    def _step(self, state: State) -> None:
-        """Draw the next candidates of each active example, and project them to the norm-balls."""
-        for row in state.active_rows.tolist():
-            if row not in self.populations:
-                self.populations[row] = self._begin(state, row)
-            values = self.populations[row].ask()
+    def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N P D"]:
+        """Draw candidates of each example, and project them to the norm-balls."""
+        candidates = []
+        for row in rows.tolist():
+            if row not in self._populations:
+                self._populations[row] = self._population(row)
+            values = self._populations[row].ask()
             # `project` needs the example of each of the P candidates, which is the same for all.
-            examples = state.examples[row].expand(len(values))
-            self.generations[row] = self.problem.project(values, examples)
-        state.result.steps[state.active_rows] += 1
+            examples = self.examples[row].expand(len(values))
+            candidates.append(self.problem.project(values, examples))
+        return torch.stack(candidates)
 
-    def _begin(self, state: State, row: int) -> Population:
+    def _population(self, row: int) -> Population:
         """Start the evolution strategy of an example at its accepted values."""
-        example = state.examples[[row]]
-        value_count = state.values.shape[1]
+        example = self.examples[[row]]
         strategy = start_strategy(
-            value_count,
-            population_size=self._candidates_per_step(state),
+            self.values.shape[1],
+            population_size=self.candidate_count,
             seed=stream_seed(self.seed, int(example), "cma"),
         )
         [scale] = self.problem.search_scale(example)
-        return Population(strategy, state.values[row].clone(), scale)
+        return Population(strategy, self.values[row].clone(), scale)
 
-    def _candidates(self, state: State) -> Float[Tensor, "N P D"]:
-        """Return the candidates to evaluate next."""
-        if not self.generations:
-            return super()._candidates(state)
-        return torch.stack([self.generations[row] for row in state.active_rows.tolist()])
-
-    def _learn(
-        self, state: State, candidates: Float[Tensor, "N P D"], costs: Float[Tensor, "N P"]
-    ) -> None:
-        """Adapt the evolution strategy of each active example to the costs of its candidates."""
-        # No strategy drew the initial values, which are evaluated before the first step.
-        if not self.generations:
-            return
-        for index, row in enumerate(state.active_rows.tolist()):
-            self.populations[row].tell(candidates[index], costs[index])
+    def tell(self, rows: Int[Tensor, " N"], evaluation: Evaluation) -> Bool[Tensor, " N"]:
+        """Adapt the strategies to the costs of their candidates."""
+        # No strategy drew the initial values.
+        for index, row in enumerate(rows.tolist() if self._populations else []):
+            self._populations[row].tell(evaluation.candidates[index], evaluation.costs[index])
+        return super().tell(rows, evaluation)
 
 
 def start_strategy(value_count: int, population_size: int, seed: int) -> Any:

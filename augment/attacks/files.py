@@ -12,15 +12,9 @@ from torch import Tensor
 
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.attack import (
-    AttackResult,
-    fooled_in_views,
-    predictions,
-    require_result,
-)
 from augment.attacks.checks import CHECKED, warnings
 from augment.attacks.eot import as_jpeg
-from augment.network import compute_outputs
+from augment.attacks.result import AttackResult, predictions, require_result
 from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
@@ -214,17 +208,10 @@ def _numbers_of_version(
     Return a dictionary for each example: its successes, predictions, and differences from the
     images of the result.
     """
-    logits = compute_outputs(result.preprocessed_model, images, result.settings.batch_size)
+    objective = result.objective()
+    logits = objective.logits(images)
     predicted = logits.argmax(2)
-    success_in_views = fooled_in_views(
-        result.preprocessed_model,
-        images,
-        predicted,
-        result.problem.all_examples,
-        result.criterion,
-        result.settings,
-        result.seed,
-    )
+    success_in_views = objective.fooled_in_views(images, predicted, result.problem.all_examples)
     success = success_in_views.all(1) & ~result.success_before
     without_noise = result.criterion.reached(predicted) & ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)

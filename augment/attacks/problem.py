@@ -1,6 +1,7 @@
 """All parameters that an attack changes, as one vector of values."""
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -16,7 +17,36 @@ from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 
 
-class AttackProblem:
+class Problem(Protocol):
+    """Values of E examples that an attack changes, and the images that they give.
+
+    Attributes:
+        start: Values at which attacks start, one row for each example.
+        group_size: Largest number of examples that are rendered at the same time,
+            so that they fit in memory.
+    """
+
+    start: Float[Tensor, "E D"]
+    group_size: int
+
+    def render(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Render the V views of examples, differentiable in the values."""
+
+    def project(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest values that are feasible and lie in the norm-balls."""
+
+    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+        """Compute the step that gradient descent subtracts from the values."""
+
+    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+        """Return how much a search without gradients should change each value at first."""
+
+
+class SceneProblem:
     """A scene, and the parameters of it that an attack changes, such as lighting and pose.
 
     Each of the E examples of the scene has a vector of D attack values. It
@@ -81,21 +111,10 @@ class AttackProblem:
             image_part.copy_(self.render(values[example_part], example_part))
         return images
 
-    def take_step(
-        self,
-        values: Float[Tensor, "A D"],
-        gradient: Float[Tensor, "A D"],
-        examples: Int[Tensor, " A"],
-        length: Float[Tensor, "A 1"],
-    ) -> Float[Tensor, "A D"]:
-        """Take a step of projected gradient descent with each parameter."""
-        gradient_parts = gradient.split(self._value_counts, dim=1)
-        moved = []
-        for (parameter, value_part), gradient_part in zip(
-            self.split_by_parameter(values), gradient_parts, strict=True
-        ):
-            moved.append(parameter.take_step(value_part, gradient_part, examples, length))
-        return torch.cat(moved, dim=1)
+    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+        """Compute the step of each parameter that gradient descent subtracts from the values."""
+        parts = self.split_by_parameter(gradient)
+        return torch.cat([parameter.scale_gradient(part) for parameter, part in parts], dim=1)
 
     def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Return how much random search should change each attack value at first."""
@@ -135,7 +154,7 @@ class AttackProblem:
         return list(zip(self.parameters, parts, strict=True))
 
 
-def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
+def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
     """Prepare an attack on a scene.
 
     Unless `settings.allow_negative`, negative radiance is first removed from the light of the
@@ -149,4 +168,4 @@ def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
         if name in (Lighting.name, Skylight.name):
             options["nonnegative"] = not settings.allow_negative
         parameters.append(make_parameter(name, scene, steps, **options))
-    return AttackProblem(scene, parameters)
+    return SceneProblem(scene, parameters)

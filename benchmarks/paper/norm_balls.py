@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings, attack
-from augment.attacks.attack import AttackResult
+from augment.attacks.result import AttackResult
 from augment.network import compute_outputs
 from augment.random_streams import generator
 from benchmarks.common import Row

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import torch
 
 from augment import AttackSettings, Classifier
-from augment.attacks.loop import Criterion
-from augment.attacks.optimizers import descend
+from augment.attacks.loop import minimize
+from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import build_problem
 from augment.scene.objects import SceneObject
 from benchmarks.common import Row
@@ -39,7 +39,7 @@ def measure_attack(
     criterion = Criterion(torch.tensor([[classifier.label(subject.label)]]))
     start = time.process_time()
     problem = build_problem(settings, scene)
-    result = descend(classifier, problem, criterion, settings)
+    result = minimize(problem, Objective(classifier, criterion, settings))
     seconds = time.process_time() - start
     return {
         "mesh": subject.name,

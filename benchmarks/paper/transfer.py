@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.attacks.loop import Criterion
-from augment.attacks.optimizers import descend
-from augment.attacks.problem import AttackProblem, build_problem
+from augment.attacks.loop import minimize
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.problem import SceneProblem, build_problem
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.paper import common
@@ -46,7 +46,7 @@ class SharedProblem:
         group_size: Largest number of examples that are rendered at once.
     """
 
-    def __init__(self, problem: AttackProblem):
+    def __init__(self, problem: SceneProblem):
         self._problem = problem
         self.start = problem.start[:1]
         self.group_size = problem.group_size
@@ -94,7 +94,7 @@ class Adversaries:
 
 def find_adversaries(
     classifier: Classifier,
-    problem: AttackProblem | SharedProblem,
+    problem: SceneProblem | SharedProblem,
     settings: AttackSettings,
     label: str,
     view_count: int,
@@ -113,9 +113,10 @@ def find_adversaries(
     """
     labels = torch.full((len(problem.start), view_count), classifier.label(label))
     criterion = Criterion(labels)
-    first = descend(classifier, problem, criterion, settings).values
+    first = minimize(problem, Objective(classifier, criterion, settings)).values
     further_settings = replace(settings, max_steps=ADDITIONAL_STEPS, margin=ENDLESS_MARGIN)
-    further = descend(classifier, problem, criterion, further_settings, start=first).values
+    further_objective = Objective(classifier, criterion, further_settings)
+    further = minimize(problem, further_objective, start=first).values
     return Adversaries(problem.start, first, further)
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.loop import Criterion, DescentResult
-from augment.attacks.optimizers import descend
+from augment.attacks.loop import Minimum, minimize
+from augment.attacks.objective import Criterion, Objective
 from augment.network import compute_outputs, warn_once
 
 OUT_OF_MEMORY = [
@@ -62,11 +62,14 @@ class Shades:
     def render(self, values, examples):
         return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
 
-    def take_step(self, values, gradient, examples, length):
-        return (values - length * 0.05 * gradient.sign()).clamp(0, 1)
+    def scale_gradient(self, gradient):
+        return 0.05 * gradient.sign()
+
+    def project(self, values, examples):
+        return values.clamp(0, 1)
 
 
-def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> DescentResult:
+def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minimum:
     """Attack ten examples with one restart.
 
     Args:
@@ -75,13 +78,14 @@ def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Desce
         group_size: The largest number of examples of a part.
     """
     criterion = Criterion(torch.zeros(10, 1, dtype=torch.int64))
-    settings = AttackSettings(max_steps=6, margin=0.0, batch_size=batch_size)
-    return descend(model, Shades(group_size), criterion, settings, restarts=[Shades.start.flip(0)])
+    settings = AttackSettings(max_steps=6, margin=0.0, quantized=False, batch_size=batch_size)
+    objective = Objective(model, criterion, settings)
+    return minimize(Shades(group_size), objective, restarts=[Shades.start.flip(0)])
 
 
-def require_same(actual: DescentResult, expected: DescentResult) -> None:
+def require_same(actual: Minimum, expected: Minimum) -> None:
     """Require equal results to the bit."""
-    for field in fields(DescentResult):
+    for field in fields(Minimum):
         assert torch.equal(getattr(actual, field.name), getattr(expected, field.name)), field.name
 
 

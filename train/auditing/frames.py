@@ -9,8 +9,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.attack import AttackResult
-from augment.network import compute_outputs
+from augment.attacks.result import AttackResult
 from renderer.image import to_bytes
 from renderer.rendering import light_sphere
 
@@ -22,8 +21,6 @@ CLASS_COUNT = 5
 SIDE = 200
 # Width and height of the image of a white ball, which shows the light, in pixels.
 BALL_SIDE = 120
-# Number of images that the classifier classifies in one pass.
-BATCH = 16
 
 
 def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
@@ -42,7 +39,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     with torch.no_grad():
         images = result.problem.render(values, examples)
         conditions = result.problem.conditions(values, examples)
-        logits = compute_outputs(result.preprocessed_model, images, BATCH)[:, 0]
+        logits = result.objective().logits(images)[:, 0]
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
     highest_probability = probabilities.amax(dim=0)

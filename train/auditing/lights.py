@@ -18,11 +18,11 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
-from augment.attacks.attack import AttackResult, attack, fooled_in_views, predictions
+from augment.attacks.attack import attack
 from augment.attacks.checks import success_by_radius
-from augment.attacks.eot import preprocessed_model
-from augment.attacks.loop import Criterion
-from augment.attacks.problem import AttackProblem, build_problem
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.result import AttackResult, predictions
 from augment.network import Classifier, compute_outputs
 from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
@@ -333,13 +333,12 @@ class _TransferTest:
             attacked parameters.
     """
 
-    def __init__(self, result: AttackResult, other: Classifier, problem: AttackProblem):
+    def __init__(self, result: AttackResult, other: Classifier, problem: SceneProblem):
         label = other.label(problem.scene.labels[0])
-        self.result = result
         self.problem = problem
         self.is_correct = is_correct(other, problem.scene, problem.images(problem.start))
-        self.criterion = Criterion(torch.full_like(result.criterion.source, label))
-        self.model = preprocessed_model(result.settings, other)
+        criterion = Criterion(torch.full_like(result.criterion.source, label))
+        self.objective = Objective(other, criterion, result.settings, result.seed)
 
     def count(self, is_wrong: Bool[Tensor, " E"], values: Float[Tensor, "E D"]) -> list[int]:
         """Count the views whose attacked lighting also fools the second classifier.
@@ -351,16 +350,9 @@ class _TransferTest:
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))
-        predicted = compute_outputs(self.model, images, BATCH).argmax(2)
-        is_fooled = fooled_in_views(
-            self.model,
-            images,
-            predicted,
-            self.problem.all_examples,
-            self.criterion,
-            self.result.settings,
-            self.result.seed,
-        ).all(1)
-        is_fooled_without_noise = self.criterion.reached(predicted)
+        predicted = self.objective.logits(images).argmax(2)
+        examples = self.problem.all_examples
+        is_fooled = self.objective.fooled_in_views(images, predicted, examples).all(1)
+        is_fooled_without_noise = self.objective.criterion.reached(predicted)
         masks = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
         return [int(mask.sum()) for mask in masks]

@@ -18,13 +18,7 @@ from torch import Tensor
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
-from augment.attacks.attack import (
-    ZERO_GRADIENT,
-    AttackResult,
-    attack,
-    fooled_in_views,
-    predictions,
-)
+from augment.attacks.attack import ZERO_GRADIENT, attack
 from augment.attacks.checks import (
     check,
     require_transferable,
@@ -35,7 +29,8 @@ from augment.attacks.checks import (
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.files import require_renderers, save
 from augment.attacks.find_scene import find_scene
-from augment.attacks.loop import Criterion
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.result import AttackResult, predictions
 from augment.losses import NO_CLASS
 from augment.network import Classifier, compute_outputs
 from augment.random_streams import generator
@@ -478,22 +473,15 @@ def format_reloaded(
     The images are rendered again, in [0, 1]. Each line has the prediction, whether noise changes
     it, and the largest difference from the saved image.
     """
-    model = preprocessed_model(settings, classifier)
     # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
-    logits = compute_outputs(model, images[None], len(images))
+    logits = compute_outputs(preprocessed_model(settings, classifier), images[None], len(images))
     predicted = logits.argmax(2)
     # The target class of the "attack" is `predicted`. `fooled_in_views` then tests whether
     # the images are still classified as `predicted` when there is noise.
     criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
-    is_same_with_noise = fooled_in_views(
-        model,
-        images[None],
-        predicted,
-        examples=torch.zeros(1, dtype=torch.int64),
-        criterion=criterion,
-        settings=settings,
-        seed=seed,
-    )
+    objective = Objective(classifier, criterion, settings, seed)
+    example = torch.zeros(1, dtype=torch.int64)
+    is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)
     saved_images = adversary.images_in_views.to(images)
     max_differences = (images - saved_images).abs().flatten(1).amax(1)
     named = predictions(logits[0], classifier.classes)

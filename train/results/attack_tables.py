@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
+from augment.attacks.result import AttackResult
 from renderer.io.files import atomic_write
 from train.results.plots import COLORS
 from train.results.tables import Proportion, Table, format_fraction, fraction

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.attacks.norm_ball import project, sample, take_step, unconstrained
+from augment.attacks.norm_ball import project, sample, scale_gradient, unconstrained
 from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
@@ -72,19 +72,9 @@ class Parameter(ABC):
         """
         return unconstrained(values, within)
 
-    def take_step(
-        self,
-        values: Float[Tensor, "A D"],
-        gradient: Float[Tensor, "A D"],
-        examples: Int[Tensor, " A"],
-        length: Float[Tensor, "A 1"],
-    ) -> Float[Tensor, "A D"]:
-        """Take a step of projected gradient descent.
-
-        `length` multiplies the step of each example.
-        """
-        center = self.start[examples]
-        return take_step(self.settings, values, gradient, center, self.project_feasible, length)
+    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+        """Compute the step that gradient descent subtracts from the values."""
+        return scale_gradient(self.settings, gradient)
 
     def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Return how much a search without gradients should change each value at first.

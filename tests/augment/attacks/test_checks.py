@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
+from augment.attacks.result import AttackResult
 from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import AttackSettings
-from augment.attacks.loop import Criterion, DescentResult
+from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import project
-from augment.attacks.optimizers import descend
-from augment.attacks.problem import AttackProblem
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import StepSettings
 from renderer.light.nonnegative import project_nonnegative
 from renderer.light.presets import load_light
@@ -59,12 +59,12 @@ class Values:
         return torch.full_like(self.start[examples], RADIUS / 2)
 
 
-def search(optimizer: str, norm: str, start: Tensor, queries: int, seed: int = 0) -> DescentResult:
+def search(optimizer: str, norm: str, start: Tensor, queries: int, seed: int = 0) -> Minimum:
     """Lower the lead of the first class, which always remains."""
     problem = Values(StepSettings(norm, RADIUS), start)
     criterion = Criterion(torch.zeros(len(start), 1, dtype=torch.int64))
-    settings = AttackSettings(optimizer=optimizer, max_queries=queries)
-    return descend(Linear(), problem, criterion, settings, seed=seed)
+    settings = AttackSettings(optimizer=optimizer, max_queries=queries, quantized=False)
+    return minimize(problem, Objective(Linear(), criterion, settings, seed))
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
@@ -92,7 +92,7 @@ def test_the_same_seed_gives_the_same_result_and_leaves_other_random_numbers(opt
     assert (np.random.get_state()[1] == numpy_state).all()
     assert torch.equal(torch.random.get_rng_state(), torch_state)
     again = search(optimizer, "l2", CENTERS, queries=60)
-    for field in fields(DescentResult):
+    for field in fields(Minimum):
         assert torch.equal(getattr(first, field.name), getattr(again, field.name)), field.name
     other = search(optimizer, "l2", CENTERS, queries=60, seed=1)
     assert not torch.equal(first.values, other.values)
@@ -115,13 +115,13 @@ BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatch, optimizer, ball):
     pytest.importorskip("cma")
     rendered = []
-    render = AttackProblem.render
+    render = SceneProblem.render
 
     def record(problem, values, examples):
         rendered.append(values)
         return render(problem, values, examples)
 
-    monkeypatch.setattr(AttackProblem, "render", record)
+    monkeypatch.setattr(SceneProblem, "render", record)
     result = attacked(
         {"lighting": ball},
         optimizer=optimizer,

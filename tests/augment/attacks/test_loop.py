@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.loop import Criterion, DescentResult
+from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import project, sample, scale_gradient
-from augment.attacks.optimizers import descend
+from augment.attacks.objective import Criterion, Objective
 from augment.parameter_settings import STEPS, StepSettings
 
 EPS = torch.finfo(torch.float64).eps
 IMAGE_SHAPE = (3, 2, 2)
 VALUE_COUNT = 5
-FIELDS = [field.name for field in dataclasses.fields(DescentResult)]
+FIELDS = [field.name for field in dataclasses.fields(Minimum)]
 
 
 def random(*shape: int, seed: int) -> Tensor:
@@ -75,24 +75,23 @@ class LinearScene:
         brightness = 1 + examples.double() / 10
         return (images * brightness[:, None, None]).unflatten(2, IMAGE_SHAPE)
 
-    def take_step(
-        self,
-        values: Tensor,
-        gradient: Tensor,
-        examples: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        settings = StepSettings(step=self.rule, step_size=self.step_size)
-        step = scale_gradient(settings, gradient)
-        return project(self.ball, values - length * step, self.center[examples])
+    def scale_gradient(self, gradient: Tensor) -> Tensor:
+        return scale_gradient(StepSettings(step=self.rule, step_size=self.step_size), gradient)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return project(self.ball, values, self.center[examples])
 
 
 def settings_of(max_steps: int = 30, margin: float = 0.0, **others) -> AttackSettings:
     """Return settings of an attack that ends when the classifier errs by the margin."""
-    return AttackSettings(max_steps=max_steps, margin=margin, **others)
+    return AttackSettings(max_steps=max_steps, margin=margin, quantized=False, **others)
 
 
-def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **settings) -> DescentResult:
+def descend(model: nn.Module, problem, criterion: Criterion, settings, restarts=()) -> Minimum:
+    return minimize(problem, Objective(model, criterion, settings), restarts=restarts)
+
+
+def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **settings) -> Minimum:
     """Run an untargeted descent on examples of one view each."""
     return descend(model, problem, Criterion(labels[:, None]), settings_of(steps, **settings))
 
@@ -156,7 +155,7 @@ MAX_STEPS = 6
 
 
 @pytest.fixture(params=STEP_SIZES)
-def linear_attack(request) -> tuple[Linear, LinearScene, Tensor, DescentResult, list[Expected]]:
+def linear_attack(request) -> tuple[Linear, LinearScene, Tensor, Minimum, list[Expected]]:
     """Attack examples that succeed at once, on the way, and never."""
     step = request.param
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
@@ -322,14 +321,11 @@ class Axis:
         self.rendered += values.flatten().tolist()
         return values[:, :, None, None, None]
 
-    def take_step(
-        self,
-        values: Tensor,
-        gradient: Tensor,
-        examples: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        return values - length * 1.5 * gradient.sign()
+    def scale_gradient(self, gradient: Tensor) -> Tensor:
+        return 1.5 * gradient.sign()
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return values
 
 
 # Values after each step. From 1, a step leads to -1/2. From there 1.5 is too far, but 3/4 is not.
@@ -441,7 +437,7 @@ def small_network() -> nn.Sequential:
 NINE_STARTS = 3 * random(9, VALUE_COUNT, seed=3)
 
 
-def attack_nine(views: int, **settings) -> DescentResult:
+def attack_nine(views: int, **settings) -> Minimum:
     """Attack nine examples, of which some succeed at once, some on the way and some never."""
     problem = LinearScene(NINE_STARTS, step_size=0.3, views=views)
     labels = torch.arange(9) % 4
@@ -504,9 +500,9 @@ def test_a_margin_changes_no_success_and_lets_successful_examples_continue(backt
 class Restarted:
     """An attack with two restarts, and the same descents one by one."""
 
-    result: DescentResult
+    result: Minimum
     render_counts: Tensor
-    single: list[DescentResult]
+    single: list[Minimum]
     first_success: list[int]
     """Which of the single descents is the first that succeeds, or 0."""
 

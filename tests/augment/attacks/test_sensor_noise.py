@@ -9,10 +9,10 @@ from scipy.stats import norm
 from torch import Tensor
 
 import augment
-from augment.attacks.attack import AttackResult, fooled_in_views
 from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise
-from augment.attacks.loop import Criterion
-from augment.attacks.optimizers import descend
+from augment.attacks.loop import minimize
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.result import AttackResult
 from augment.losses import NO_CLASS
 from augment.service import Renders
 from augment.settings import TrainingAttackSettings
@@ -50,8 +50,8 @@ def counted(images: Tensor, classifier: augment.Classifier, **settings) -> Tenso
     criterion = Criterion(torch.zeros(views, dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(views)
     rows = torch.arange(len(images))
-    chosen = augment.AttackSettings(**settings)
-    return fooled_in_views(classifier, images, predicted, rows, criterion, chosen, 0)
+    objective = Objective(classifier, criterion, augment.AttackSettings(**settings))
+    return objective.fooled_in_views(images, predicted, rows)
 
 
 def survival(images: Tensor, classifier: augment.Classifier, deviation: float) -> float:
@@ -159,8 +159,8 @@ def test_a_target_must_be_reached_with_noise(source):
     criterion = Criterion(torch.tensor([[source]]), torch.tensor([[1]]))
     settings = augment.AttackSettings(quantized=False)
     rows = torch.zeros(1, dtype=torch.long)
-    classifier = nervous(AT_GRAY)
-    assert not fooled_in_views(classifier, images, predicted, rows, criterion, settings, 0).any()
+    objective = Objective(nervous(AT_GRAY), criterion, settings)
+    assert not objective.fooled_in_views(images, predicted, rows).any()
 
 
 # --------------------------------------------------------------- attacks
@@ -254,14 +254,11 @@ class StillScene:
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return self.views[None] + 0 * values[:, :, None, None, None]
 
-    def take_step(
-        self,
-        values: Tensor,
-        gradient: Tensor,
-        examples: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        return values
+    def scale_gradient(self, gradient: Tensor) -> Tensor:
+        return gradient
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return torch.zeros_like(values)
 
 
 @pytest.mark.parametrize(("leads", "steps"), [((20.0, 20.0), 0), ((20.0, 0.1), 3)])
@@ -275,7 +272,7 @@ def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps
     settings = augment.AttackSettings(
         max_steps=3, margin=0.0, sensor_noise=1.0, noise_margin=1.0, quantized=False
     )
-    result = descend(nervous(0.0), StillScene(views), criterion, settings)
+    result = minimize(StillScene(views), Objective(nervous(0.0), criterion, settings))
     assert result.success.tolist() == [True]
     assert result.steps.tolist() == [steps]
 

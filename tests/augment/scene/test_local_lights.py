@@ -11,7 +11,7 @@ from torch import Tensor
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import StepSettings
 from augment.scene.build import build_local_light
 from augment.scene.conditions import Conditions
@@ -79,7 +79,7 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parame
     """On most of an orange, no shadow moves with the lamps. Two views share the lights."""
     first = torch.arange(1)
     shown = scene(exposure=0.3, shared=True, samples=4)
-    problem = AttackProblem(shown, [make_parameter(parameter, shown, StepSettings())])
+    problem = SceneProblem(shown, [make_parameter(parameter, shown, StepSettings())])
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, first)
     unchanged = shown.render(shown.conditions(first), first)

@@ -14,7 +14,7 @@ import renderer
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.parameter import Parameter
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.scene import relighting
 from augment.scene.build import build_scene, load_backgrounds
@@ -226,7 +226,7 @@ def test_a_sky_in_light_of_a_higher_degree_has_49_coefficients(glossy):
 
 def test_attacked_light_of_a_higher_degree_is_read_back_to_its_image(glossy, tmp_path):
     lighting = make_parameter("lighting", glossy, StepSettings(radius=0.3))
-    problem = AttackProblem(glossy, [lighting])
+    problem = SceneProblem(glossy, [lighting])
     values = problem.sample(torch.Generator().manual_seed(0))
     conditions = problem.conditions(values, torch.arange(2))
     image = problem.images(values)[1]

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from augment.attacks.attack import AttackResult
 from augment.attacks.checks import check
+from augment.attacks.result import AttackResult
 from augment.network import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError

@@ -14,7 +14,7 @@ from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
 from augment.attacks.files import render_again
 from augment.attacks.parameters.material import Material
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import MATERIAL_PARTS
 from augment.scene.objects import SceneObject, add_table
 from augment.scene.scene import Scene
@@ -68,10 +68,10 @@ def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Sce
     return scene.changed(objects=objects, examples=examples, lights=lights)
 
 
-def problem_of(scene: Scene, **settings) -> AttackProblem:
+def problem_of(scene: Scene, **settings) -> SceneProblem:
     """Return the problem of an attack on the material; keywords are those of its settings."""
     chosen = augment.MaterialSettings(**UNITS | settings)
-    return AttackProblem(scene, [Material(scene, chosen)])
+    return SceneProblem(scene, [Material(scene, chosen)])
 
 
 # --------------------------------------------------------------- values

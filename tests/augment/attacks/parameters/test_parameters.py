@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks import norm_ball
-from augment.attacks.loop import Criterion, DescentResult
-from augment.attacks.optimizers import descend
+from augment.attacks.loop import Minimum, minimize
+from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight
-from augment.attacks.problem import AttackProblem, build_problem
+from augment.attacks.problem import SceneProblem, build_problem
 from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.scene import direct_rendering
 from augment.scene.conditions import Conditions
@@ -60,15 +60,15 @@ def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
     return SkylightSettings(zenith=zenith, azimuth=azimuth, turbidity=turbidity, **steps)
 
 
-def split(problem: AttackProblem, values: Tensor) -> list[Tensor]:
+def split(problem: SceneProblem, values: Tensor) -> list[Tensor]:
     """Return the values of each parameter."""
     return [part for _, part in problem.split_by_parameter(values)]
 
 
-def problem_of(scene: Scene, **settings: StepSettings) -> AttackProblem:
+def problem_of(scene: Scene, **settings: StepSettings) -> SceneProblem:
     """Return an attack problem on the named parameters with these settings."""
     parameters = [make_parameter(name, scene, steps) for name, steps in settings.items()]
-    return AttackProblem(scene, parameters)
+    return SceneProblem(scene, parameters)
 
 
 def free(*names: str) -> dict[str, StepSettings]:
@@ -81,15 +81,16 @@ def free(*names: str) -> dict[str, StepSettings]:
 
 def attack(
     model: nn.Module,
-    problem: AttackProblem,
+    problem: SceneProblem,
     criterion: Criterion,
     steps: int,
-) -> DescentResult:
+) -> Minimum:
     """Run the descent until the classifier errs, without a margin."""
-    return descend(model, problem, criterion, AttackSettings(max_steps=steps, margin=0.0))
+    settings = AttackSettings(max_steps=steps, margin=0.0, quantized=False)
+    return minimize(problem, Objective(model, criterion, settings))
 
 
-def towards(problem: AttackProblem, target: int | None = 1) -> Criterion:
+def towards(problem: SceneProblem, target: int | None = 1) -> Criterion:
     """Return the criterion that class 0 of every image falls and the target, if any, rises."""
     source = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
     if target is None:
@@ -390,7 +391,7 @@ def test_an_attack_in_nonnegative_light_ends_in_light_that_a_map_holds(
     """The map's format, RGBE, has no negative numbers. The map gives the images back."""
     scene = in_sunlight(make_scene())
     settings = StepSettings(step_size=0.5)
-    problem = AttackProblem(
+    problem = SceneProblem(
         scene,
         [make_parameter("lighting", scene, settings, nonnegative=True)],
     )
@@ -435,7 +436,7 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
     """Starts include the horizon and the clearest and haziest air of the sky model."""
     scene = scenes_by_dtype[dtype]
     sky = make_parameter("skylight", scene, sky_at(start, norm=norm, radius=radius))
-    problem = AttackProblem(scene, [sky])
+    problem = SceneProblem(scene, [sky])
     center = sky.start[0]
     lowest = torch.tensor(LOWEST_SKY, dtype=dtype)
     highest = torch.tensor(HIGHEST_SKY, dtype=dtype)
@@ -569,7 +570,7 @@ TARGETS_OF_VIEWS = torch.tensor([[1, 2], [2, 1], [1, 1]])
 
 
 @pytest.fixture
-def illusion(make_scene, make_linear) -> tuple[nn.Module, AttackProblem, Criterion]:
+def illusion(make_scene, make_linear) -> tuple[nn.Module, SceneProblem, Criterion]:
     """Return a model, a problem of two views per example, and a target for each view."""
     gray = torch.full((3, 3, 6, 6), 0.5)
     scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=gray)
@@ -601,7 +602,7 @@ def test_an_attack_on_two_views_ends_only_when_both_have_their_class(illusion):
 
 
 @pytest.fixture
-def mixed(make_scene) -> AttackProblem:
+def mixed(make_scene) -> SceneProblem:
     """Return a problem on light, shape, albedo and pixels, each with a ball of its own."""
     return problem_of(
         make_scene(),
@@ -624,22 +625,14 @@ def test_each_parameter_is_projected_as_if_it_were_alone(mixed):
         assert torch.equal(projected, expected)
 
 
-def test_each_parameter_steps_by_its_own_gradient_from_starts_of_each_example(mixed):
+def test_each_parameter_steps_by_its_own_gradient(mixed):
     for size, parameter in enumerate(mixed.parameters, start=1):
         parameter.settings = replace(parameter.settings, step_size=size)
-        parameter.start = parameter.start + torch.arange(3)[:, None]
-    chosen = torch.tensor([2, 0])
-    lengths = torch.tensor([[0.5], [2.0]]).double()
-    draws = torch.Generator().manual_seed(0)
-    values = mixed.start + 0.1 * torch.randn(mixed.start.shape, generator=draws)
-    gradient = values[chosen]
-    before = split(mixed, values[chosen])
-    after = split(mixed, mixed.take_step(values[chosen], gradient, chosen, lengths))
-    for parameter, part, stepped in zip(mixed.parameters, before, after, strict=True):
-        unit = part / part.norm(dim=1, keepdim=True)
-        moved = part - lengths * parameter.settings.step_size * unit
-        expected = norm_ball.project(parameter.settings, moved, parameter.start[chosen])
-        torch.testing.assert_close(stepped, expected, rtol=0, atol=64 * EPS)
+    gradient = torch.randn(mixed.start.shape, generator=torch.Generator().manual_seed(0)).double()
+    steps = split(mixed, mixed.scale_gradient(gradient))
+    for size, (part, step) in enumerate(zip(split(mixed, gradient), steps, strict=True), start=1):
+        expected = size * part / part.norm(dim=1, keepdim=True)
+        torch.testing.assert_close(step, expected, rtol=0, atol=64 * EPS)
 
 
 def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 import augment
 import renderer
 from augment.attacks.parameters.pose import Pose
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import POSE_PARTS
 from augment.scene.scene import Scene
 from renderer.errors import InputError
@@ -38,13 +38,13 @@ def scene_of(size: int = 24, **options) -> Scene:
     return scene.changed(lights=0.4 * scene.lights.double())
 
 
-def problem_of(scene: Scene, **units) -> AttackProblem:
+def problem_of(scene: Scene, **units) -> SceneProblem:
     """Return the problem of an attack on the pose; keywords are those of its settings."""
     settings = augment.PoseSettings(radius=1.0, **units)
-    return AttackProblem(scene, [Pose(scene, settings)])
+    return SceneProblem(scene, [Pose(scene, settings)])
 
 
-def random_poses(problem: AttackProblem, count: int) -> torch.Tensor:
+def random_poses(problem: SceneProblem, count: int) -> torch.Tensor:
     """Draw poses (count, D) in the ball of a problem with one example."""
     draws = [problem.sample(torch.Generator().manual_seed(seed)) for seed in range(count)]
     return torch.cat(draws)
@@ -102,7 +102,7 @@ def test_the_camera_moves_to_the_place_of_another_scenes_camera(fov):
 def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
     scene = scene_of(fov=85.0, width=2.0)
     pose = Pose(scene, augment.PoseSettings())
-    problem = AttackProblem(scene, [pose])
+    problem = SceneProblem(scene, [pose])
     too_close = torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
     with pytest.raises(InputError, match="reaches the camera"):
         problem.render(too_close, FIRST)
@@ -180,13 +180,13 @@ def arm(tmp_path_factory) -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def bending(arm) -> AttackProblem:
+def bending(arm) -> SceneProblem:
     """Return an attack on the pose of the arm, whose shoulder is stiff."""
     options = {"silhouettes": True, "rasterizer": "numpy", "ground": GRAY}
     scene = augment.build_scene([(arm, "arm")], 16, **options)
     scene = scene.changed(lights=scene.lights.double())
     settings = augment.PoseSettings(radius=3.0, joints={"elbow": 60.0, "wrist": 30})
-    return AttackProblem(scene, [Pose(scene, settings)])
+    return SceneProblem(scene, [Pose(scene, settings)])
 
 
 def test_joints_are_drawn_within_their_limits_and_stiff_ones_not_at_all(bending):
@@ -318,7 +318,7 @@ def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and
 
     @torch.no_grad()
     def fools(values: torch.Tensor) -> torch.Tensor:
-        logits = result.preprocessed_model(result.problem.images(values)[:, 0])
+        logits = result.objective().logits(result.problem.images(values))[:, 0]
         return logits.argmax(1) != result.criterion.source[:, 0]
 
     draws = torch.Generator().manual_seed(0)

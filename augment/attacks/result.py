@@ -1,0 +1,338 @@
+"""The result of an attack, with figures and animations of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from augment.attack_settings import AttackSettings
+from augment.attacks import animation
+from augment.attacks.loop import Minimum
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.problem import SceneProblem
+from augment.network import Classifier
+from augment.scene.conditions import Conditions
+from renderer.errors import require_choice, require_range
+from renderer.io.images import write_image
+from renderer.rendering import light_sphere
+from renderer.short_repr import ShortRepr
+from renderer.validation import as_path, require_kind, require_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Pixels per side of the white ball with which `AttackResult.plot` shows the light.
+BALL_SIZE = 96
+# File formats that `AttackResult.save_animation` can write.
+ANIMATION_SUFFIXES = (".gif", ".webp")
+# Largest number of frames that `AttackResult.save_animation` writes.
+MAX_FRAME_COUNT = 1000
+
+
+@dataclass(frozen=True, repr=False)
+class AttackResult(ShortRepr):
+    """Result of an attack on E examples of V views, with a classifier of C classes.
+
+    `nb.check`, `nb.success_by_radius`, `nb.transfer` and `nb.save` take it as
+    an argument.
+
+    Attributes:
+        problem: The attacked scene, and the parameters that were changed.
+        classifier: The attacked classifier, without the rounding to 8 bits.
+        criterion: Source and target class of each view.
+        settings: Settings of the attack.
+        seed: Seed of the attack.
+        images_in_views_before: Images before the attack, in [0, 1] and not
+            rounded, shape (E, V, 3, size, size).
+        images_in_views: Images after the attack, with the same shape and range.
+            Their shadows and bounces are those of the attacked shape and colors.
+        logits_in_views_before: Logits of the preprocessed images before the
+            attack, shape (E, V, C).
+        logits_in_views: Logits of the preprocessed images after the attack,
+            shape (E, V, C).
+        success_in_views: Whether each view meets the criterion without noise and
+            in each draw of sensor noise, shape (E, V), bool.
+        descent: Result of the optimizer, before the final images are rendered. If
+            the attack changes shape or colors, the images of the descent have
+            the shadows and bounces of the original shape. `descent.success` is
+            the success of these images without noise.
+        queries: Number of images of each example that the attack showed to the
+            classifier, (E,) int64. Images with sensor noise, which decide about
+            successes, are included. An image that is shown again counts once.
+        seconds: Seconds of the attack in total, and of its parts by name.
+    """
+
+    problem: SceneProblem
+    classifier: Classifier
+    criterion: Criterion
+    settings: AttackSettings
+    seed: int
+    images_in_views_before: Tensor
+    images_in_views: Tensor
+    logits_in_views_before: Tensor
+    logits_in_views: Tensor
+    success_in_views: Tensor
+    descent: Minimum
+    queries: Tensor
+    seconds: dict[str, float]
+
+    @property
+    def images_before(self) -> Tensor:
+        """Images before the attack in [0, 1], one row for each example.
+
+        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        """
+        return self.images_in_views_before.squeeze(1)
+
+    @property
+    def images(self) -> Tensor:
+        """Images after the attack in [0, 1], one row for each example.
+
+        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        """
+        return self.images_in_views.squeeze(1)
+
+    @property
+    def logits_before(self) -> Tensor:
+        """Logits of the C classes before the attack, one row for each example.
+
+        The shape is (E, V, C), or (E, C) if an example has one view.
+        """
+        return self.logits_in_views_before.squeeze(1)
+
+    @property
+    def logits(self) -> Tensor:
+        """Logits of the C classes after the attack, one row for each example.
+
+        The shape is (E, V, C), or (E, C) if an example has one view.
+        """
+        return self.logits_in_views.squeeze(1)
+
+    def objective(self, network: nn.Module | None = None) -> Objective:
+        """Return the objective of the attack, also against another network of the same classes."""
+        return Objective(network or self.classifier, self.criterion, self.settings, self.seed)
+
+    @property
+    def success(self) -> Tensor:
+        """Return a mask of the examples for which the attack succeeded, shape (E,).
+
+        All views of the example meet the criterion, also with sensor noise. Before the attack,
+        the example did not meet it.
+        """
+        return self.success_in_views.all(1) & ~self.success_before
+
+    @property
+    def success_without_noise(self) -> Tensor:
+        """Return a mask of the examples for which the attack succeeded without noise, shape (E,).
+
+        All views of the example meet the criterion in their images without sensor noise. Before
+        the attack, the example did not meet it.
+        """
+        return self.criterion.reached(self.logits_in_views.argmax(2)) & ~self.success_before
+
+    @property
+    def success_with_margin(self) -> Tensor:
+        """Return a mask of the successful examples with a sufficient logit gap, shape (E,).
+
+        The logit gap, see `augment.losses.logit_gap`, is at least `settings.margin` in all views.
+        """
+        gaps = self.criterion.gap(self.logits_in_views)
+        return self.success & (gaps >= self.settings.margin).all(1)
+
+    @property
+    def success_before(self) -> Tensor:
+        """Return a mask of the examples that met the criterion before the attack, shape (E,)."""
+        return self.criterion.reached(self.logits_in_views_before.argmax(2))
+
+    @property
+    def clean_correct(self) -> Tensor:
+        """Return a mask of the examples that were classified correctly before the attack.
+
+        All views of such an example are correct. Success rates count only these examples. Shape
+        (E,).
+        """
+        return (self.logits_in_views_before.argmax(2) == self.criterion.source).all(1)
+
+    @property
+    def steps(self) -> Tensor:
+        """Number of steps of each example, (E,) int64."""
+        return self.descent.steps
+
+    @property
+    def backward_passes(self) -> Tensor:
+        """Number of images of each example whose gradient was computed, shape (E,), int64."""
+        return self.descent.backward_passes
+
+    @property
+    def conditions(self) -> Conditions:
+        """Light, shape, colors and pose of the E examples after the attack."""
+        return self.problem.conditions(self.descent.values, self.problem.all_examples)
+
+    def plot(self, example: int | None = None, view: int | None = None) -> Figure:
+        """Draw a view of an example as a figure with four parts.
+
+        The parts are the image before the attack, a white ball in the attacked
+        light, the image after the attack, and the probabilities of the true
+        class and of the most probable classes before and after.
+
+        Args:
+            example: Index of the example. None for the first one with a view
+                that was correct before the attack and that the attack fooled.
+                If there is none, it is the first that was correct before, or
+                else 0.
+            view: Index of the view. None chooses it in the same way.
+
+        Returns:
+            Figure of matplotlib. `figure.savefig(path)` writes it.
+
+        Raises:
+            InputError: If there is no such example or view.
+        """
+        # Importing matplotlib takes half a second.
+        from augment.attacks.plots import draw_attack
+
+        example, view = self._shown_view(example, view)
+        conditions = self.conditions
+        basis = self.problem.scene.basis_under(conditions, example)
+        before = self.logits_in_views_before[example, view].softmax(0)
+        after = self.logits_in_views[example, view].softmax(0)
+        return draw_attack(
+            self.images_in_views_before[example, view].cpu(),
+            light_sphere(conditions.light[example], BALL_SIZE, basis=basis),
+            self.images_in_views[example, view].cpu(),
+            before.cpu(),
+            after.cpu(),
+            self.classifier.classes,
+            int(self.criterion.source[example, view]),
+        )
+
+    def _shown_view(self, example: int | None, view: int | None) -> tuple[int, int]:
+        """Return an example and a view, where None is replaced by what shows the attack best."""
+        example_count, view_count = self.images_in_views.shape[:2]
+        if example is not None:
+            _require_index("example", example, example_count)
+        if view is not None:
+            _require_index("view", view, view_count)
+        was_correct = self.logits_in_views_before.argmax(2) == self.criterion.source
+        # 2 for views that the attack turned from correct to wrong, 1 for others that were correct.
+        scores = was_correct * (1 + self.success_in_views.to(was_correct.device).int())
+        rows = slice(None) if example is None else example
+        columns = slice(None) if view is None else view
+        # Views that are not chosen from have a score of -1.
+        chosen = torch.full_like(scores, -1)
+        chosen[rows, columns] = scores[rows, columns]
+        return divmod(int(chosen.argmax()), view_count)
+
+    def save_animation(
+        self, path: str | Path, example: int = 0, view: int = 0, frame_count: int = 20
+    ) -> None:
+        """Save how one view changes from the scene's light to the adversarial light.
+
+        Every frame shows the image, its predicted class with its probability,
+        and a white ball in the light. The values that the attack found (light,
+        shape, colors or pose) are interpolated linearly, so the frames between
+        the first and the last are not steps of the descent.
+
+        Args:
+            path: File to write, with the suffix .gif or .webp.
+            example: Index of the example.
+            view: Index of the view.
+            frame_count: Number of frames, from 2 to 1000. With 20 frames, the
+                file has at most 2 MB.
+
+        Raises:
+            InputError: If the suffix is another, or if there is no such example
+                or view.
+            OSError: If the file cannot be written.
+
+        Example:
+            >>> from pathlib import Path
+            >>> import torch
+            >>> import norm_balls as nb
+            >>> def logits(images):
+            ...     mean = images.mean((1, 2, 3))
+            ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+            >>> scene = nb.build_scene([("solid:orange", "0")], 8)
+            >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=2)
+            >>> result = nb.attack(logits, scene, settings=settings)
+            >>> result.save_animation("attack.gif", frame_count=4)
+            >>> Path("attack.gif").exists()
+            True
+        """
+        path = as_path("path", path)
+        require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
+        example, view = self._shown_view(example, view)
+        require_whole("frame_count", frame_count)
+        require_range("frame_count", frame_count, 2, MAX_FRAME_COUNT)
+        fractions = [index / (frame_count - 1) for index in range(frame_count)]
+        images = [self._image_between(fraction, example, view) for fraction in fractions]
+        balls = [self._ball_between(fraction, example) for fraction in fractions]
+        logits = self.objective().logits(torch.stack(images)[:, None])
+        predicted = predictions(logits[:, 0], self.classifier.classes)
+        captions = []
+        for name, confidence in zip(predicted["predicted"], predicted["confidence"], strict=True):
+            captions.append(f"{name} {confidence:.0%}")
+        first, *others = animation.draw_frames(images, balls, captions)
+        times = animation.frame_times(frame_count)
+        write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
+
+    def _values_between(self, fraction: float) -> Float[Tensor, "E D"]:
+        """Interpolate linearly between the attack values before and after the attack.
+
+        The fraction is 0 before the attack and 1 after it.
+        """
+        start = self.problem.start
+        return start + fraction * (self.descent.values.to(start) - start)
+
+    def _image_between(
+        self, fraction: float, example: int, view: int
+    ) -> Float[Tensor, "3 size size"]:
+        """Render a view with values that are interpolated between before and after the attack."""
+        if fraction == 0:
+            return self.images_in_views_before[example, view]
+        if fraction == 1:
+            return self.images_in_views[example, view]
+        examples = self.problem.all_examples[[example]]
+        # Shape (1, V, 3, size, size).
+        images = self.problem.images(self._values_between(fraction), examples)
+        return images[0, view]
+
+    def _ball_between(self, fraction: float, example: int) -> Float[Tensor, "3 size size"]:
+        """Render a white ball in light that is interpolated between before and after the attack."""
+        examples = self.problem.all_examples[[example]]
+        conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
+        # `conditions` contain one example only, at index 0.
+        basis = self.problem.scene.basis_under(conditions, 0)
+        return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
+
+    def _repr_png_(self) -> bytes:
+        """Return `plot()` as a PNG file. Notebooks display it."""
+        content = BytesIO()
+        self.plot().savefig(content, format="png")
+        return content.getvalue()
+
+
+def _require_index(name: str, index: int, count: int) -> None:
+    """Raise InputError unless an index is a whole number from 0 to count - 1."""
+    require_whole(name, index)
+    require_range(name, index, 0, count - 1)
+
+
+def require_result(result: object) -> None:
+    """Check that a value is the result of an attack."""
+    require_kind("result", result, AttackResult, "the result of norm_balls.attack")
+
+
+def predictions(logits: Float[Tensor, "... C"], classes: Sequence[str]) -> dict[str, Any]:
+    """Return the names and the probabilities of the predicted classes, for a JSON file."""
+    highest = logits.softmax(-1).max(-1)
+    names = np.asarray(classes)[highest.indices.cpu().numpy()]
+    return {"predicted": names.tolist(), "confidence": highest.values.tolist()}
