@@ -7,17 +7,20 @@ predicts for it unchanged.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from augment.attack_settings import AttackSettings, RelightingSettings
+from augment.attack_settings import GRADIENT, RANDOM_SEARCH, AttackSettings, RelightingSettings
 from augment.attacks.eot import Quantized
-from augment.attacks.gain import Best, descend_gain, draw_log_gain, search_gain
+from augment.attacks.loop import minimize
+from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
+from augment.attacks.optimizers import Gradient, Optimizer
 from augment.network import Classifier, frozen_eval_mode
+from augment.parameter_settings import StepSettings
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
@@ -32,7 +35,7 @@ from augment.projected_light import (
     require_photographs,
 )
 from augment.random_streams import generator
-from renderer.errors import InputError, require_choice
+from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_choice
 from renderer.image import decode, to_bytes, to_unit
 from renderer.short_repr import ShortRepr
 from renderer.validation import require_kind, require_seed
@@ -46,6 +49,76 @@ ADVERSARIAL = "adversarial"
 LIGHTS = (SLIDE, RANDOM, ADVERSARIAL)
 # Name of the light of the photograph itself, without a projector.
 UNCHANGED = "unchanged"
+# Total length of all steps of an attack, in units of the radius of the norm-ball. It is more than
+# the diameter, so that the steps can cross the ball from any start (Madry et al. 2018).
+TRAVELED_RADII = 2.5
+
+
+class RelitPhotographs(NormBalls):
+    """Photographs in the light of a projector, whose slide an attack multiplies by factors.
+
+    The factors are one for each color channel in each cell of a grid. The attacked values are their
+    logarithms, in an L∞ ball around 0.
+
+    Args:
+        albedo: Photographs, as linear light.
+        light: Light of the projector, with a slide for each photograph.
+        cells: Number of cells per side.
+        radius: Largest magnitude of a logarithm.
+        steps: Number of steps in which an attack may cross the ball.
+        generators: Generator of the random factors of each photograph. None to draw none.
+    """
+
+    def __init__(
+        self,
+        albedo: Float[Tensor, "B 3 H W"],
+        light: ProjectedLight,
+        cells: int,
+        radius: float,
+        steps: int,
+        generators: Sequence[torch.Generator] = (),
+    ):
+        step_size = max(TRAVELED_RADII * radius / max(steps, 1), 1 / MAX_MAGNITUDE)
+        settings = StepSettings("linf", radius, "sign", step_size)
+        super().__init__(settings, albedo.new_zeros(len(albedo), 3 * cells**2))
+        self.group_size = len(albedo)
+        self._albedo = albedo
+        self._light = light
+        self._cells = cells
+        self._generators = generators
+
+    def log_gain(self, values: Float[Tensor, "A D"]) -> Float[Tensor, "A 3 cells cells"]:
+        """Return the logarithms of the factors of each channel in each cell."""
+        return values.unflatten(1, (3, self._cells, self._cells))
+
+    def render(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A 1 3 H W"]:
+        """Show photographs in the light of the projector, each in one view."""
+        light = self._light.select(examples)
+        return light.expose(self._albedo[examples], self.log_gain(values))[:, None]
+
+    def draw(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+        """Draw random factors of some photographs, whose logarithms are uniform in the ball."""
+        drawn = [
+            sample(self.settings, self.start[[example]], self._generators[example])
+            for example in examples.tolist()
+        ]
+        return torch.cat(drawn)
+
+
+class UniformDraws(Optimizer):
+    """Independent draws from the norm-ball, of which the best is kept."""
+
+    problem: RelitPhotographs
+
+    def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
+        """Draw values of each photograph."""
+        return self.problem.draw(self.examples[rows])[:, None]
+
+
+# Optimizers that search for factors of the slide, by the names of the lights.
+OPTIMIZERS: dict[str, type[Optimizer]] = {RANDOM: UniformDraws, ADVERSARIAL: Gradient}
 
 
 @dataclass(frozen=True, repr=False)
@@ -270,10 +343,8 @@ class _PhotographAttack:
         unchanged_rows = rows[~self.changed[SLIDE][rows, slide]]
         if not len(unchanged_rows):
             return
-        log_gain_of_light = {RANDOM: self._search_randomly(unchanged_rows, slide)}
-        if ADVERSARIAL in self.lights:
-            log_gain_of_light[ADVERSARIAL] = self._descend(unchanged_rows, slide)
-        for light, log_gain in log_gain_of_light.items():
+        for light in self.lights[1:]:
+            log_gain = self._search(unchanged_rows, slide, OPTIMIZERS[light])
             self._record(light, unchanged_rows, slide, log_gain)
 
     def _light(self, rows: Int[Tensor, " A"], slide: int) -> ProjectedLight:
@@ -284,53 +355,38 @@ class _PhotographAttack:
         lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
         return lights.to(self.device)
 
-    def _search_randomly(
-        self, rows: Int[Tensor, " A"], slide: int
+    def _search(
+        self, rows: Int[Tensor, " A"], slide: int, optimizer: type[Optimizer]
     ) -> Float[Tensor, "A 3 cells cells"]:
-        """Try random factors by which the slides on photographs are multiplied.
+        """Search for factors by which the slides on photographs are multiplied.
 
-        Return logarithms of those that change the class most surely, or come closest to it.
+        Return logarithms of those that change the class most surely or, if none changes it, of the
+        last accepted ones.
         """
-        # Give each photograph a generator of its own, so that its factors do not depend on the
+        # Each photograph has a generator of its own, so that its factors do not depend on the
         # other photographs.
         generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
-        candidates = []
-        for _ in range(self.settings.passes):
-            drawn = [
-                draw_log_gain(1, self.settings.cells, self.settings.radius, draws)
-                for draws in generators
-            ]
-            candidates.append(torch.cat(drawn).to(self.device))
-        albedo = decode(self._load(rows), "srgb")
-        light = self._light(rows, slide)
-        source = self.source[rows].to(self.device)
-        return search_gain(self.model, albedo, light, source, candidates).cpu()
-
-    def _descend(self, rows: Int[Tensor, " A"], slide: int) -> Float[Tensor, "A 3 cells cells"]:
-        """Search along the gradient for factors that multiply the slides on photographs.
-
-        Return logarithms of the best factors of all steps.
-        """
-        albedo = decode(self._load(rows), "srgb")
-        light = self._light(rows, slide)
-        source = self.source[rows].to(self.device)
-        start = torch.zeros_like(self.log_gain[ADVERSARIAL][rows, slide]).to(self.device)
-        best = Best(start)
-        last = descend_gain(
-            self.model,
-            albedo,
-            light,
-            source,
-            start,
+        problem = RelitPhotographs(
+            decode(self._load(rows), "srgb"),
+            self._light(rows, slide),
+            self.settings.cells,
             self.settings.radius,
             self.settings.steps,
-            best,
+            generators,
         )
-        # `descend_gain` has not classified the factors after its last step. Classify them here,
-        # and keep them if they are the best.
-        with torch.no_grad():
-            best.update(last, self.model(light.expose(albedo, last)), source)
-        return best.log_gain.cpu()
+        criterion = Criterion(self.source[rows].to(self.device)[:, None])
+        # With this margin, which no search can reach, all passes are used.
+        settings = replace(
+            self.success_settings,
+            optimizer=GRADIENT if optimizer is Gradient else RANDOM_SEARCH,
+            max_steps=self.settings.steps,
+            max_queries=self.settings.passes,
+            margin=MAX_SCALE,
+            sensor_noise=0.0,
+        )
+        objective = Objective(self.classifier, criterion, settings)
+        found = minimize(problem, objective, optimizer=optimizer)
+        return problem.log_gain(found.values).cpu()
 
     @torch.no_grad()
     def _record(
@@ -370,9 +426,4 @@ def _draw_lights(
     for row in rows:
         draws = generator(seed, "light", row, slide)
         lights.append(draw_projected_light(1, size, draws, photographs))
-    return ProjectedLight(
-        slide=torch.cat([light.slide for light in lights]),
-        shading=torch.cat([light.shading for light in lights]),
-        ambient=torch.cat([light.ambient for light in lights]),
-        stops=torch.cat([light.stops for light in lights]),
-    )
+    return ProjectedLight.join(lights)

@@ -12,11 +12,12 @@ There are no shadows, no reflections and no depth.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from augment.random_streams import generator
@@ -63,13 +64,17 @@ class ProjectedLight:
 
     def to(self, device: torch.device | str) -> ProjectedLight:
         """Return a copy whose tensors are on a device."""
-        return replace(
-            self,
-            slide=self.slide.to(device),
-            shading=self.shading.to(device),
-            ambient=self.ambient.to(device),
-            stops=self.stops.to(device),
-        )
+        return ProjectedLight(*(getattr(self, item.name).to(device) for item in fields(self)))
+
+    def select(self, photographs: Int[Tensor, " A"]) -> ProjectedLight:
+        """Return the light on some of the photographs."""
+        return ProjectedLight(*(getattr(self, item.name)[photographs] for item in fields(self)))
+
+    @classmethod
+    def join(cls, lights: Sequence[ProjectedLight]) -> ProjectedLight:
+        """Return the light on the photographs of several lights."""
+        names = [item.name for item in fields(cls)]
+        return cls(*(torch.cat([getattr(light, name) for light in lights]) for name in names))
 
     def light(
         self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None

@@ -140,8 +140,9 @@ def minimize(
     examples: Int[Tensor, " A"] | None = None,
     start: Float[Tensor, "A D"] | None = None,
     restarts: Iterable[Tensor] = (),
+    optimizer: type[Optimizer] | None = None,
 ) -> Minimum:
-    """Attack examples with the optimizer that the settings of the objective choose.
+    """Attack examples with an optimizer, by default the one that the settings choose.
 
     The examples are attacked in groups of at most `problem.group_size`, so that the gradients fit
     in memory. The network runs in evaluation mode, and its state is restored afterwards. By
@@ -152,23 +153,24 @@ def minimize(
         examples = torch.arange(len(problem.start), device=problem.start.device)
     if start is None:
         start = problem.start[examples]
-    groups: Iterable[Tensor] = torch.arange(len(start), device=start.device).split(
-        problem.group_size
-    )
+    all_rows = torch.arange(len(start), device=start.device)
+    groups: Iterable[Tensor] = all_rows.split(problem.group_size)
     if len(start) > problem.group_size:
         # Each group uses all restarts, and an iterator would be empty after the first.
         restarts = list(restarts)
         groups = progress(groups, "groups of examples")
+    kind = optimizer or OPTIMIZERS[objective.settings.optimizer or GRADIENT]
+    search = kind(problem, objective.settings, objective.seed)
     minima = []
     for rows in groups:
         starts = (restart[rows] for restart in restarts)
         part = objective.select(rows)
-        minima.append(_minimize_group(problem, part, examples[rows], start[rows], starts))
+        minima.append(_minimize_group(search, part, examples[rows], start[rows], starts))
     return Minimum.join(minima)
 
 
 def _minimize_group(
-    problem: Problem,
+    optimizer: Optimizer,
     objective: Objective,
     examples: Int[Tensor, " A"],
     start: Float[Tensor, "A D"],
@@ -180,8 +182,7 @@ def _minimize_group(
     not survive sensor noise, unless their share of the queries is less than one evaluation.
     """
     settings = objective.settings
-    optimizer = OPTIMIZERS[settings.optimizer or GRADIENT](problem, settings, objective.seed)
-    result = attack_from(start, problem, objective, optimizer, examples)
+    result = minimize_from(start, optimizer, objective, examples)
     limit = settings.query_limit_of_start
     if limit is not None and limit < objective.passes_per_candidate:
         return result
@@ -191,7 +192,7 @@ def _minimize_group(
     for restart in restarts:
         # The successes that must survive sensor noise. A success whose start has too few queries
         # left for the noisy images counts without them.
-        noisy_count = NOISE_DRAWS * objective.view_count
+        noisy_count = NOISE_DRAWS * objective.criterion.view_count
         is_checked = latest.success & bool(settings.sensor_noise)
         if limit is not None:
             is_checked &= latest.queries + noisy_count <= limit
@@ -206,33 +207,37 @@ def _minimize_group(
         if not len(rows):
             break
         part = objective.select(rows)
-        latest = attack_from(restart[rows], problem, part, optimizer, examples[rows])
+        latest = minimize_from(restart[rows], optimizer, part, examples[rows])
         result.add_restart(rows, latest)
     return result
 
 
 @torch.no_grad()
-def attack_from(
+def minimize_from(
     start: Float[Tensor, "A D"],
-    problem: Problem,
-    objective: Objective,
     optimizer: Optimizer,
+    objective: Objective,
     examples: Int[Tensor, " A"],
+    scores_last: bool = True,
 ) -> Minimum:
     """Attack A examples from one set of initial values.
 
     Each example takes steps until it reaches its criterion with the required margin, or has used up
-    its steps or queries.
+    its steps or queries. Without `scores_last`, the values after the last step are the result of
+    the examples that are not finished, whatever they cost.
     """
     settings = objective.settings
     active = torch.arange(len(start), device=start.device)
     optimizer.begin(examples, start)
     with frozen_eval_mode(objective.model):
-        for step in progress(range(settings.step_limit + 1), "attack, until all succeed"):
+        evaluation_count = settings.step_limit + scores_last
+        for step in progress(range(evaluation_count), "attack, until all succeed"):
             candidates = optimizer.ask(active) if step else start[:, None]
             needs_gradient = optimizer.uses_gradients and step < settings.step_limit
             part = objective.select(active)
-            evaluation = evaluate(candidates, problem, part, examples[active], needs_gradient)
+            evaluation = evaluate(
+                optimizer.problem, part, candidates, examples[active], needs_gradient
+            )
             if not step:
                 result = Minimum.at_start(evaluation)
             is_accepted = optimizer.tell(active, evaluation)
@@ -254,13 +259,15 @@ def attack_from(
                 active = active[result.queries[active] <= affordable]
             if not len(active):
                 break
+    if not scores_last:
+        result.values[active] = optimizer.ask(active)[:, 0]
     return result
 
 
 def evaluate(
-    candidates: Float[Tensor, "N P D"],
     problem: Problem,
     objective: Objective,
+    candidates: Float[Tensor, "N P D"],
     examples: Int[Tensor, " N"],
     needs_gradient: bool,
 ) -> Evaluation:

@@ -74,6 +74,11 @@ class Criterion:
             return Criterion(self.source.flatten())
         return Criterion(self.source.flatten(), self.target.flatten())
 
+    @property
+    def view_count(self) -> int:
+        """Number V of views of each example."""
+        return self.source.shape[1]
+
     def cost(self, logits: Float[Tensor, "N C"]) -> Float[Tensor, " N"]:
         """Compute the cost of single images, for a criterion that is flat."""
         return adversarial_cost(logits, self.source, self.target)
@@ -175,17 +180,12 @@ class Objective:
         return selected
 
     @property
-    def view_count(self) -> int:
-        """Number V of views of each example."""
-        return self.criterion.source.shape[1]
-
-    @property
     def passes_per_candidate(self) -> int:
         """Number of images that the network sees to evaluate one candidate of an example.
 
         These are all its views, each as it is and in each of its random transformations.
         """
-        return self.view_count * (1 + self.settings.eot.draws)
+        return self.criterion.view_count * (1 + self.settings.eot.draws)
 
     def score(
         self, images: Float[Tensor, "E V _ H W"], needs_gradient: bool
@@ -250,7 +250,7 @@ class Objective:
         if self.settings.overconfident_noise_margin:
             has_margin = self._noise_margin(score.is_overconfident) > 0
             checked = (is_finished & has_margin).nonzero()[:, 0]
-            noisy_count[checked] = NOISE_DRAWS * self.view_count
+            noisy_count[checked] = NOISE_DRAWS * self.criterion.view_count
             with self.phases("attack_classifier"):
                 is_robust = self.select(checked).is_robust(images[checked], examples[checked])
             is_finished = is_finished.index_copy(0, checked, is_robust)

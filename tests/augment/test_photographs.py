@@ -7,9 +7,16 @@ import pytest
 import torch
 from torch import nn
 
-from augment.attack_settings import RelightingSettings
-from augment.attacks.gain import descend_gain
-from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, attack_photographs
+from augment.attack_settings import AttackSettings, RelightingSettings
+from augment.attacks.loop import minimize
+from augment.attacks.objective import Criterion, Objective
+from augment.photographs import (
+    ADVERSARIAL,
+    LIGHTS,
+    RANDOM,
+    RelitPhotographs,
+    attack_photographs,
+)
 from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.errors import InputError
@@ -100,12 +107,11 @@ def test_steps_lower_the_confidence_in_the_source(photographs):
     images = to_unit(photographs)
     light = draw_projected_light(len(images), SIZE, generator(0))
     source = network(images).argmax(1)
-    start = torch.zeros(len(images), 3, 3, 3)
-    log_gain = descend_gain(
-        network, decode(images, "srgb"), light, source, start, math.log(2), steps=4
-    )
+    problem = RelitPhotographs(decode(images, "srgb"), light, 3, math.log(2), steps=4)
+    settings = AttackSettings(max_steps=4, margin=100.0, quantized=False)
+    found = minimize(problem, Objective(network, Criterion(source[:, None]), settings))
     before = network(light.apply(images)).log_softmax(1)
-    after = network(light.apply(images, log_gain)).log_softmax(1)
+    after = network(light.apply(images, problem.log_gain(found.values))).log_softmax(1)
     change = (after - before).gather(1, source[:, None])
     assert (change < 0).float().mean() > 0.9
 

@@ -4,7 +4,7 @@ They are image transforms of torchvision, and adversarial attacks on pixels (PGD
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,13 +12,16 @@ from jaxtyping import Int, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attacks.norm_ball import project, sample, take_step
+from augment.attack_settings import AttackSettings
+from augment.attacks.loop import minimize_from
+from augment.attacks.norm_ball import NormBalls
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.optimizers import Gradient
 from augment.losses import label_loss
-from augment.network import frozen_eval_mode
 from augment.parameter_settings import StepSettings
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
-from renderer.light.ball import nearest_in_box
+from renderer.light.ball import Ball, nearest_in_box
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
 # 8/255 on CIFAR-10.
@@ -83,7 +86,6 @@ def _transform(name: str) -> Any:
     return v2.Compose([jitter, v2.AugMix()])
 
 
-@torch.enable_grad()
 def pgd(
     model: nn.Module,
     images: UInt8[Tensor, "B 3 H W"],
@@ -96,13 +98,60 @@ def pgd(
     All PGD_STEPS steps are taken, also if an image is misclassified earlier. A negative label is
     complementary: the image shows neither this class nor the classes `absent`.
     """
-    clean = to_unit(images)
-    clip_to_unit = partial(nearest_in_box, low=0, high=1)
-    adversarial = project(PGD, sample(PGD, clean, draws), clean, clip_to_unit)
-    with frozen_eval_mode(model):
-        for _ in range(PGD_STEPS):
-            adversarial.requires_grad_(True)
-            cost = -label_loss(model(adversarial), labels, absent=absent).sum()
-            (gradient,) = torch.autograd.grad(cost, adversarial)
-            adversarial = take_step(PGD, adversarial.detach(), gradient, clean, clip_to_unit)
-    return to_bytes(adversarial)
+    problem = _Pixels(images)
+    settings = AttackSettings(
+        max_steps=PGD_STEPS, quantized=False, sensor_noise=0.0, batch_size=len(images)
+    )
+    objective = Objective(model, _LossOfLabels(labels[:, None], absent=absent), settings)
+    rows = torch.arange(len(images), device=images.device)
+    optimizer = Gradient(problem, settings, seed=0)
+    found = minimize_from(problem.sample(draws), optimizer, objective, rows, scores_last=False)
+    return to_bytes(found.values.view(images.shape))
+
+
+class _Pixels(NormBalls):
+    """Pixels of images as attacked values, in balls around the images."""
+
+    def __init__(self, images: UInt8[Tensor, "B 3 H W"]):
+        super().__init__(PGD, to_unit(images).flatten(1))
+        self.group_size = len(images)
+        self._shape = images.shape[1:]
+
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Clip values to [0, 1]."""
+        return nearest_in_box(values, 0, 1, within)
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Return the images (A, 1, 3, H, W) that consist of the values."""
+        return values.unflatten(1, self._shape)[:, None]
+
+
+@dataclass(frozen=True)
+class _LossOfLabels(Criterion):
+    """Criterion that raises the loss of labels, which may be complementary, and is never reached.
+
+    Attributes:
+        absent: Classes that images with a complementary label do not show, either.
+    """
+
+    absent: Sequence[int] = ()
+
+    def select(self, examples: Tensor | slice) -> Criterion:
+        """Return the criterion of some of the examples."""
+        return replace(self, source=self.source[examples])
+
+    def flatten(self) -> Criterion:
+        """Return the labels as one list."""
+        return replace(self, source=self.source.flatten())
+
+    def cost(self, logits: Tensor) -> Tensor:
+        """Return the negative loss of each image."""
+        return -label_loss(logits, self.source, absent=self.absent)
+
+    def gap(self, logits: Tensor) -> Tensor:
+        """Return a gap of −∞, with which no attack ends."""
+        return torch.full_like(logits[..., 0], -torch.inf)
+
+    def reached_in_views(self, predicted: Tensor) -> Tensor:
+        """Return False for each image."""
+        return torch.zeros_like(predicted, dtype=torch.bool)

@@ -3,15 +3,18 @@
 import math
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attack_settings import RelightingSettings
-from augment.attacks.gain import descend_gain, draw_log_gain
-from augment.network import frozen_eval_mode
+from augment.attack_settings import AttackSettings, RelightingSettings
+from augment.attacks.loop import minimize_from
+from augment.attacks.objective import Criterion, Objective
+from augment.attacks.optimizers import Gradient
+from augment.photographs import RelitPhotographs
 from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
+from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from train.settings import TrainSettings
 
@@ -55,23 +58,33 @@ class RelitBatches:
         draws = generator(self._seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape
         light = draw_projected_light(count, size, draws, images).to(images.device)
-        # Logarithms of the factors by which the projected slide of each image is multiplied.
-        log_gain = draw_log_gain(count, CELLS, self._radius, draws).to(images.device)
         unit = to_unit(images)
-        if self._steps and self._teacher is not None:
-            with torch.no_grad():
-                original_classes = self._teacher(unit).argmax(1)
-            # The linear colors of an image stand for the albedo of what it shows.
-            albedo = decode(unit, "srgb")
-            with frozen_eval_mode(self._model):
-                log_gain = descend_gain(
-                    self._model,
-                    albedo,
-                    light,
-                    source=original_classes,
-                    start=log_gain,
-                    radius=self._radius,
-                    steps=self._steps,
-                )
+        # The linear colors of an image stand for the albedo of what it shows.
+        problem = RelitPhotographs(decode(unit, "srgb"), light, CELLS, self._radius, self._steps)
+        values = problem.sample(draws)
+        if self._steps and self._radius and self._teacher is not None:
+            values = self._attack(problem, values, unit)
         with torch.no_grad():
-            return to_bytes(light.apply(unit, log_gain))
+            return to_bytes(light.apply(unit, problem.log_gain(values)))
+
+    def _attack(
+        self,
+        problem: RelitPhotographs,
+        start: Float[Tensor, "B D"],
+        images: Float[Tensor, "B 3 size size"],
+    ) -> Float[Tensor, "B D"]:
+        """Take all steps away from the classes that the teacher predicts for the images."""
+        assert self._teacher is not None
+        with torch.no_grad():
+            original_classes = self._teacher(images).argmax(1)
+        settings = AttackSettings(
+            max_steps=self._steps,
+            margin=MAX_SCALE,
+            quantized=False,
+            sensor_noise=0.0,
+            batch_size=len(images),
+        )
+        objective = Objective(self._model, Criterion(original_classes[:, None]), settings)
+        rows = torch.arange(len(images), device=images.device)
+        optimizer = Gradient(problem, settings, seed=0)
+        return minimize_from(start, optimizer, objective, rows, scores_last=False).values
