@@ -31,22 +31,13 @@ REFERRING = (".obj", ".mtl", ".ply", ".gltf")
 def fingerprints(settings: Any) -> dict[str, str]:
     """Compute the fingerprint of each input file and folder that the settings of a command name.
 
-    Two fingerprints of a path are compared by `is_changed`. That of a training run covers its
-    selected network, that of a mesh its materials and textures, and that of a network
-    python:MODULE:FUNCTION the file of the module.
+    The fingerprint of a training run covers its selected network, that of a mesh its materials and
+    textures, and that of a network python:MODULE:FUNCTION the file of the module.
     """
     values = dict(dotted(asdict(settings)))
     texts = _collect_texts([values.get(key) for key in INPUTS]) - {""}
     paths = {text.removeprefix("run:"): _path_of(text) for text in sorted(texts)}
     return {name: _fingerprint(path) for name, path in paths.items() if path.exists()}
-
-
-def is_changed(before: str, now: str) -> bool:
-    """Return whether a fingerprint differs from a recorded one.
-
-    Earlier versions recorded only the part before the colon.
-    """
-    return before not in (now, now.partition(":")[0])
 
 
 def _path_of(text: str) -> Path:
@@ -80,11 +71,9 @@ def _fingerprint(path: Path) -> str:
     """Compute the fingerprint of a file, of a training run or of another folder that exists."""
     path = selected_file(path) or path
     if path.is_dir():
-        files = [file for file in path.rglob("*") if file.is_file()]
-        sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
-        return f"{_hash(sizes)}:{_hash_contents(path)}"
+        return _hash_contents(path)
     companions = [(str(name), _hash_file(name)) for name in sorted(_companions(path))]
-    return f"{_hash_file(path)}:{_hash(companions)}" if companions else _hash_file(path)
+    return _hash([_hash_file(path), *companions]) if companions else _hash_file(path)
 
 
 def _hash_contents(folder: Path) -> str:

@@ -215,10 +215,10 @@ def require_same(
                 f"set {key} to the former value, or choose another folder with {elsewhere}",
             )
     hashes = config.get("inputs") or {}
-    from train.fingerprints import fingerprints, is_changed
+    from train.fingerprints import fingerprints
 
     for path, fingerprint in fingerprints(settings).items():
-        if is_changed(hashes.get(path, fingerprint), fingerprint):
+        if hashes.get(path, fingerprint) != fingerprint:
             raise InputError(
                 f"{path} has changed since {folder} began: "
                 f"put it back, or start in another folder with {elsewhere}",

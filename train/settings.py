@@ -358,8 +358,7 @@ class TrainSettings(Settings):
     )
     cache: str | None = setting(
         "auto",
-        "Folder of rendered data sets and predictions. auto: ~/.cache/parametric-norm-balls. "
-        "null: none.",
+        "Folder of rendered data sets. auto: ~/.cache/parametric-norm-balls. null: none.",
     )
 
     def __post_init__(self) -> None:

@@ -1,11 +1,9 @@
 """A run's folder, also where others write to it or have damaged its files."""
 
-import hashlib
 import io
 import itertools
 import os
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -194,37 +192,6 @@ def test_a_folder_too_large_to_read_is_told_by_the_times_of_its_files(tmp_path, 
     assert fingerprints.fingerprints(settings) != before
 
 
-def test_a_folder_that_an_earlier_version_recorded_by_its_sizes_is_accepted(tmp_path):
-    (tmp_path / "photographs").mkdir()
-    (tmp_path / "photographs" / "a.png").write_text("ab")
-    settings = AuditSettings(**AUDIT | {"photos": str(tmp_path / "photographs")})
-    (now,) = fingerprints.fingerprints(settings).values()
-    sizes = hashlib.sha256(repr([("a.png", 2)]).encode()).hexdigest()
-    assert not fingerprints.is_changed(sizes, now)
-    assert fingerprints.is_changed(sizes[::-1], now)
-
-
-def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(
-    tiny,
-    tmp_path,
-    monkeypatch,
-):
-    file = tmp_path / "data.npz"
-    reads = []
-    file.write_bytes(b"data")
-    settings = tiny(f"data.path={file}")
-    digest = hashlib.file_digest
-    monkeypatch.setattr(
-        hashlib,
-        "file_digest",
-        lambda opened, name: reads.append(opened.name) or digest(opened, name),
-    )
-    write_config(tmp_path / "run", settings)
-    require_same_run(tmp_path / "run", settings)
-    require_same_run(tmp_path / "run", settings)
-    assert reads == [str(file)]
-
-
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):
     assert read_metrics(tmp_path) == []  # This log has no file.
     (tmp_path / METRICS).write_text('{"epoch": 1}\n{"epo')
@@ -299,24 +266,3 @@ def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_
         windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
         windows = [window for window in windows if window.shape == shown.shape]
         assert any((abs(window - 255 * shown) < 1).all() for window in windows)
-
-
-def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes(tmp_path):
-    @dataclass
-    class Settings:
-        photos: str | None = None
-        meshes: list[str] = field(default_factory=list)
-
-    mesh = tmp_path / "a.obj"
-    mesh.write_text("v 0 0 0")
-    write_config(tmp_path, Settings(meshes=[str(mesh)]))
-    settings = Settings("photos", [str(mesh)])
-    require_same(tmp_path, settings, "out=", lambda *change: change == ("photos", None, "photos"))
-    with pytest.raises(InputError, match="was made with photos=None, not photos: set photos to"):
-        require_same(tmp_path, settings, "out=", lambda *change: False)
-    mesh.write_text("v 0 0 1")
-    with pytest.raises(
-        InputError,
-        match=r"a\.obj has changed since .* began: .* another folder with out=",
-    ):
-        require_same(tmp_path, Settings(meshes=[str(mesh)]), "out=", lambda *change: False)

@@ -5,8 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.files import is_network_file
@@ -22,9 +20,7 @@ from train.class_names import (
     with_class_names,
     with_classes_of_meshes,
 )
-from train.data.cache import TensorCache, content_hash
 from train.data.sets import HELD_OUT, DataSet
-from train.device import MixedPrecision
 from train.networks import CLASSIFIER, PYTHON, describe
 from train.saved_networks import (
     NORMALIZE_LIGHT,
@@ -314,23 +310,3 @@ def _fraction_left_out(initial: Initial, record: Mapping[str, Any]) -> float | N
     # The two records may differ only in the fraction.
     is_same_data = {**record, "fraction": fraction} == initial_record
     return fraction if is_same_data else None
-
-
-class CachedModel:
-    """Wrapper of a network that stores logits on disk, so that later runs need not compute them."""
-
-    def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
-        """Hash what decides the logits of an image."""
-        self._model = model
-        self._cache = cache
-        facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]
-        self._key = content_hash(facts)
-
-    def __call__(self, images: Float[Tensor, "B 3 size size"]) -> Float[Tensor, "B classes"]:
-        """Read the logits of images from the cache, or compute and store them."""
-        key = content_hash([self._key, images])
-        stored = self._cache.read(key)
-        if stored is None:
-            stored = {"logits": self._model(images).cpu().contiguous()}
-            self._cache.write(key, stored)
-        return stored["logits"]

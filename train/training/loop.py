@@ -470,12 +470,6 @@ class Trainer:
             own = self._description()
             if (best["seed"], best["mode"]) != (own["seed"], own["mode"]):
                 raise ValueError("it is of another run")
-            # best.pt can be from an epoch after the checkpoint. This epoch is then trained
-            # again, and its accuracy is not known yet.
-            if best["epoch"] <= len(self.history):
-                line = self.history[best["epoch"] - 1]
-                if line["validation/accuracy"] != best["validation_accuracy"]:
-                    raise ValueError("its accuracy is not the one that this run had")
             self.best = best
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(

@@ -28,7 +28,6 @@ from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
-from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import choose_labels, find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import (
@@ -51,7 +50,6 @@ from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.system.user_errors import keyed, keys_of
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.initial import (
-    CachedModel,
     Initial,
     ValidationPart,
     choose_validation,
@@ -270,20 +268,12 @@ class Run:
         If the data have no labels, the predictions of the initial network become
         their labels.
         """
-        settings = self.settings
-        # The logits of a network with code of the user are not cached, because this
-        # code may have changed.
-        has_own_code = self.initial is not None and (
-            self.initial.network is not None or self.initial.name.startswith(PYTHON)
-        )
-        cache = TensorCache(None if has_own_code else cache_folder(settings.train.cache))
-        cached = CachedModel(model, self.trainer.device, cache)
-        predictions = self._predict(cached, self.data.test)
+        predictions = self._predict(model, self.data.test)
         self._initial_predictions = predictions
         if not self.data.labeled:
             # The loss computes such predictions for the training images itself.
             labels = self.data.train.labels.clone()
-            labels[self.held_out] = self._predict(cached, self.data.train[self.held_out])
+            labels[self.held_out] = self._predict(model, self.data.train[self.held_out])
             train = Split(self.data.train.images, labels)
             test = Split(self.data.test.images, predictions)
             self.data = replace(self.data, train=train, test=test)
@@ -291,10 +281,10 @@ class Run:
             return {}
         accuracy = (predictions == self.data.test.labels).float().mean().item()
         if self.data.labeled:
-            images = describe_test_images(settings, self.data)
-            name = settings.network
+            images = describe_test_images(self.settings, self.data)
+            name = self.settings.network
             console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
-        self._score_photographs(cached, self.folder / BEFORE)
+        self._score_photographs(model, self.folder / BEFORE)
         return {"test/accuracy_before": accuracy}
 
     def _predict(self, model: Model, split: Split, *light_key: int | str) -> Int[Tensor, " N"]:

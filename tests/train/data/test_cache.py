@@ -72,22 +72,6 @@ def test_no_flipped_bit_and_no_cut_is_taken_for_the_file(written):
     assert tensors.read(KEY) is not None
 
 
-def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(written, monkeypatch):
-    tensors, path = written
-    before = path.read_bytes()
-
-    def interrupted(self, content):
-        with open(self, "wb") as file:
-            file.write(content[:40])
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        tensors.write(KEY, {"ratios": torch.zeros(9)})
-    assert list(path.parent.iterdir()) == [path]
-    assert path.read_bytes() == before
-
-
 def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeypatch, caplog):
     tries = []
 

@@ -100,27 +100,14 @@ class TestALaboratory:
         assert described["setups"] == 4
         assert described["seed"] == 0
 
-    @pytest.mark.parametrize(
-        ("setup", "source", "meshes"),
-        [
-            ("0", "stripes", {"solid:orange:7", "solid:lemon:7"}),
-            ("1", "stripes", {"solid:orange:8", "solid:pear:7"}),
-            ("2", "half", {"solid:orange:7", "solid:lemon:7"}),
-            ("3", "half", {"solid:orange:8", "solid:pear:7"}),
-        ],
-    )
-    def test_shows_an_object_of_the_label_and_another_one_in_the_same_light(
-        self,
-        laboratory,
-        setup,
-        source,
-        meshes,
-    ):
-        first, second = [row for row in rows(laboratory) if row["setup"] == setup]
-        assert {first["mesh"], second["mesh"]} == meshes
-        assert first["source_tag"] == second["source_tag"] == source
-        assert first["brightness"] == second["brightness"]
-        assert 0.2 <= float(first["brightness"]) <= 2.5
+    def test_shows_an_object_of_the_label_and_another_one_in_the_same_light(self, laboratory):
+        pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}]
+        for setup, source in enumerate(["stripes", "stripes", "half", "half"]):
+            first, second = [row for row in rows(laboratory) if row["setup"] == str(setup)]
+            assert {first["mesh"], second["mesh"]} == pairs[setup % 2]
+            assert first["source_tag"] == second["source_tag"] == source
+            assert first["brightness"] == second["brightness"]
+            assert 0.2 <= float(first["brightness"]) <= 2.5
 
 
 def test_the_same_settings_write_the_same_bytes(laboratory, tmp_path):
@@ -157,11 +144,6 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_another_thing
     expected = name if name in SOLIDS else f"other_{name}"
     label, *_ = lab.read_subject(f"solid:{name}:1", 0)
     assert label == expected
-
-
-def test_a_solid_with_a_label_has_this_label():
-    label, *_ = lab.read_subject({"mesh": "solid:orange", "label": "pear"}, 0)
-    assert label == "pear"
 
 
 UNSAFE_LABEL = {"mesh": "solid:orange", "label": "other_../../x"}
@@ -289,10 +271,6 @@ class TestShots:
         assert (edges[:-1] <= brightness).all()
         assert (brightness <= edges[1:]).all()
 
-    def test_all_have_different_cameras(self):
-        shots = [*self.SHOTS, *draw(11, PATTERN_FUNCTIONS, seed=4)]
-        assert len({tuple(shot.camera) for shot in shots}) == 231
-
     def test_have_the_object_in_view(self):
         for shot in self.SHOTS:
             backwards = shot.camera - shot.aim
@@ -315,11 +293,6 @@ class TestShots:
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(rotation) == pytest.approx(1)
             assert rotation[2, 2] >= 0.5 - 1e-9
-
-    def test_have_dark_surroundings_and_a_dark_table(self):
-        for shot in self.SHOTS:
-            assert shot.ambient.max() <= 0.06
-            assert shot.table.max() <= 0.16
 
 
 def test_settings_leave_draws_that_they_do_not_name_as_they_were():
@@ -523,23 +496,3 @@ def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_e
     expected = np.broadcast_to(0.7 * shot.table, image.shape)
     # Bilinear interpolation spreads the lamp over two texels.
     np.testing.assert_allclose(image, expected, rtol=0.02)
-
-
-@pytest.mark.parametrize("division_count", [0, 2])
-def test_right_angles_stay_sharp(division_count):
-    cube = trimesh.creation.box((2, 2, 2))
-    vertices = cube.vertices
-    faces = cube.faces
-    for _ in range(division_count):
-        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
-    mesh = Mesh.plain(vertices, faces)
-    [part] = lab.lab_parts(mesh, 1.0)
-    expected = mesh.face_normals()[:, None].repeat(3, axis=1)
-    np.testing.assert_array_equal(part.normals, expected)
-
-
-def test_round_surfaces_are_smooth():
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    mesh = Mesh.plain(ball.vertices, ball.faces)
-    [part] = lab.lab_parts(mesh, 1.0)
-    np.testing.assert_allclose(part.normals, mesh.vertices[mesh.faces], atol=0.02)

@@ -19,7 +19,7 @@ from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.run_folder import read_metrics
-from train.saved_networks import load_network, load_run
+from train.saved_networks import load_run
 from train.training.inputs import load_data
 
 NAME = "shufflenet_v2_x0_5"
@@ -161,19 +161,10 @@ class TestNormalizedLight:
         assert network.normalized_light == NormalizedLightSettings(white_balance=1.0)
         torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
 
-    def test_is_not_in_the_file_of_weights(self, trained, weights):
-        state = load_torchvision(trained / "weights.pt").state_dict()
-        assert state.keys() == load_torchvision(weights).state_dict().keys()
-
     def test_is_remembered_by_the_network_of_the_next_run(self, tuned, trained, expected):
         continued, _ = tuned("unlabeled", f"network={trained}", "weights=null", ALMOST_FIXED)
         images = self.images()
         torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
-
-    def test_is_put_before_a_network_that_was_trained_without(self, tuned, weights, expected):
-        plain, _ = tuned("unlabeled", ALMOST_FIXED)
-        network = load_network(f"run:{plain}", normalize_light={"white_balance": 1.0})
-        torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fixed):
@@ -244,27 +235,6 @@ def test_photographs_that_stay_on_disk_train_and_score_a_network_of_their_size(t
     assert read_metrics(folder)[0]["train/loss"] < 1e-6
     assert scores["test/agreement"] == 1
     assert load_run(folder)(torch.rand(1, 3, 96, 96)).shape == (1, 1000)
-
-
-class TestATruncatedPhotograph:
-    @pytest.fixture
-    def path(self, photos, tmp_path) -> str:
-        """Copy the photographs, and add one that cannot be read."""
-        for file in photos.glob("*/*.png"):
-            copy = tmp_path / f"{file.parent.name}_{file.name}"
-            copy.write_bytes(file.read_bytes())
-        (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 not much of a JPEG")
-        return f"unlabeled={tmp_path}"
-
-    def test_among_unlabeled_ones_is_refused(self, tuned, path):
-        message = r"1 of 33 photographs .*broken\.jpg.*skip_unreadable"
-        with pytest.raises(InputError, match=message):
-            tuned("unlabeled", path)
-
-    def test_is_skipped_and_counted_if_the_settings_say_so(self, tuned, path, caplog):
-        tuned("unlabeled", path, "evaluate.skip_unreadable=true")
-        assert "1 of 33 images" in caplog.text
-        assert "broken.jpg" in caplog.text
 
 
 class TestANetworkOfTimm:

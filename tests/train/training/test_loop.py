@@ -24,7 +24,7 @@ from train.run_folder import read_metrics
 from train.settings import TrainSettings
 from train.training import loop
 from train.training.loop import Trainer, evaluate
-from train.training.recipe import SCHEDULE_FACTORS, freeze
+from train.training.recipe import freeze
 from train.training.run_log import RunLog
 from train.training.step import activation_bytes
 
@@ -192,17 +192,6 @@ def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp
     monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
     with pytest.raises(InputError, match=r"batch_size=16 need .* free"):
         fit_noise(make_trainer(tmp_path))
-
-
-def test_the_schedule_goes_on_within_an_epoch(tmp_path):
-    trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=4, schedule="cosine")
-    rates = []
-    trainer.step.optimizer.register_step_post_hook(
-        lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]),
-    )
-    fit(trainer, single_colors(12), single_colors(3))
-    expected = [0.05 * SCHEDULE_FACTORS["cosine"](step / 3) for step in range(3)]
-    assert rates == pytest.approx(expected)
 
 
 class Step:
@@ -415,23 +404,6 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
     assert last["epoch"] == 5
     torch.testing.assert_close(best["model"], states[1], rtol=0, atol=0)
     torch.testing.assert_close(last["model"], states[4], rtol=0, atol=0)
-
-
-def test_best_pt_is_not_written_again_for_an_epoch_that_is_no_better(tmp_path, monkeypatch):
-    accuracies = iter([0.6, 0.5, 0.4])
-    monkeypatch.setattr(loop, "evaluate", lambda *_: {"loss": 1.0, "accuracy": next(accuracies)})
-    written = []
-    save = checkpoints.save
-
-    def recorded(path: Path, *arguments) -> None:
-        written.append(path.name)
-        save(path, *arguments)
-
-    monkeypatch.setattr(checkpoints, "save", recorded)
-    trainer = make_trainer(tmp_path, color_network(), epochs=3, batch_size=12)
-    fit(trainer, single_colors(12), single_colors(3))
-    assert written.count(run_folder.LAST) == 3
-    assert written.count(run_folder.BEST) == 1
 
 
 class DivergingNetwork(nn.Module):

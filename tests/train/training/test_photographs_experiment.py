@@ -10,7 +10,6 @@ from PIL import Image
 from torchvision.models import get_model
 
 from augment.random_streams import generator
-from renderer.errors import InputError
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
@@ -19,7 +18,7 @@ from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.saved_networks import load_run
-from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, TrainSettings
+from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.averages import FACTORS, INTERPOLATION, mix
 from train.training.losses import TrainingLoss
@@ -150,24 +149,6 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, 
         assert torch.equal(value, resumed["model"][name])
 
 
-def test_a_finished_run_resumes_with_the_same_scores(finished, settings_of):
-    folder, scores = finished
-    again = completed_run(settings_of(folder, "train.resume=true"), folder)
-    for name in ("test/accuracy", "test/interpolation", "test/relit_agreement_after"):
-        assert again[name] == scores[name]
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["train.relight_steps=1"], ["train.augmentation=color_jitter+augmix"]],
-)
-def test_other_arms_run(settings_of, tmp_path, words):
-    folder = tmp_path / "run"
-    scores = completed_run(settings_of(folder, "train.epochs=1", *words), folder)
-    assert 0 <= scores["test/relit_agreement_after"] <= 1
-    assert read_metrics(folder)
-
-
 @pytest.fixture(scope="module")
 def chain(small):
     """Return a function that trains on photographs first and then on renders, by one command."""
@@ -294,16 +275,3 @@ def test_mixed_weights_are_the_ends_at_0_and_1():
     assert torch.equal(mix(begin, end, 1.0)["weight"], end["weight"])
     assert torch.equal(mix(begin, end, 0.25)["weight"], torch.tensor([0.25, 2.0]))
     assert mix(begin, end, 0.25)["count"] == 7
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"consistency_weight": 1.0},
-        {"interpolate": True},
-        {"relight_steps": 1},
-    ],
-)
-def test_settings_that_need_others_are_an_error(values):
-    with pytest.raises(InputError, match=r"need|attack"):
-        ExperimentSettings(train=TrainSettings(**values))

@@ -56,14 +56,6 @@ def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
     return (q * (q / p).log()).sum()
 
 
-@pytest.mark.parametrize(
-    "name, value", [("learning_rate", math.nan), ("distillation_weight", 1.0), ("ema_decay", -0.1)]
-)
-def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(InputError, match=rf"\b{name}\b"):
-        TrainSettings(**{name: value})
-
-
 @pytest.mark.parametrize("epochs", [10, 150])
 def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent(epochs):
     rates = [SCHEDULE_FACTORS["step"](epoch / epochs) for epoch in range(epochs)]
@@ -223,12 +215,6 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
     assert with_both[[0, 2]].sum() > max(with_2[[0, 2]].sum(), before[[0, 2]].sum())
 
 
-def test_a_network_of_one_layer_learns_in_it():
-    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 2))
-    freeze(network, "all_but_last", size=2)
-    assert all(parameter.requires_grad for parameter in network.parameters())
-
-
 class HeadFirst(nn.Module):
     """Network that defines its layers in another order than it calls them."""
 
@@ -329,15 +315,6 @@ def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_laye
         logits.append(network(units).detach())
     torch.testing.assert_close(logits[1], logits[0], rtol=1e-3, atol=1e-3)
     assert not torch.allclose(logits[0], Scaled(1.0)(units), atol=0.1)
-
-
-@pytest.mark.parametrize("changes", [{"feature_norm": None}, {"freeze": None}])
-def test_the_learning_rate_is_that_of_the_settings_without_a_norm_or_a_frozen_network(
-    images, changes
-):
-    settings = TrainSettings(**{"freeze": "all_but_last", "feature_norm": 5.0, **changes})
-    rate = scale_learning_rate(settings, Scaled(9.0), to_unit(images))
-    assert rate == settings.learning_rate
 
 
 @pytest.mark.parametrize("brightness", [0.0, math.nan, math.inf])
