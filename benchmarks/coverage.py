@@ -2,42 +2,60 @@
 
     python -m benchmarks.coverage
 
-A score is the sum of the mean of its class, a normal effect of its object and normal noise of
-its image. The second network adds a gain to the positives, an effect of each object and noise.
-The true metrics are closed forms. The table has the fraction of intervals that contain the
-true metric and, in brackets, their mean width:
+A score is the sum of the mean of its class, an effect of its object and noise of its image. The
+second network adds a gain to the positives, an effect of each object and noise. The table has the
+fraction of intervals that contain the true metric and, in brackets, their mean width:
 
-- *jackknife*: the intervals of the library over objects, and the truth for all objects.
-- *bootstrap*: percentiles of resampled objects, which the library used before.
+- *objects*: the intervals of the library over objects, and the truth for all objects.
 - *images*: the intervals of the library over images, and the truth for the drawn objects.
+
+The truth is the metric of a population whose effects and noise are equally spaced quantiles.
 """
 
 import argparse
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri, stdtrit
 
 from train.results.metrics import (
-    RATES,
     ROC_METRICS,
     Jackknife,
     Units,
     auc_and_recalls,
-    change,
+    average,
+    change_ends,
     class_means,
     leave_out,
+    leave_out_of_roc,
     weighted_means,
 )
-from train.results.tables import Estimate, Table
+from train.results.tables import Table
 
 METRICS = (*ROC_METRICS, "recall", "FPR", "top-1")
-METHODS = ("jackknife", "bootstrap", "images")
-DRAWS = 200
 # Number of classes of the positive objects, for top-1.
 CLASSES = 3
+# Equally likely standard normal values, for populations.
+QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
+# Number of simulated test sets that are scored at once, which bounds the memory.
+BLOCK = 100
+
+
+def heavy_tails(normal: np.ndarray) -> np.ndarray:
+    """Transform standard normal values to Student's t with 3 degrees of freedom, times 0.77."""
+    return stdtrit(3, ndtr(normal)) / 1.3
+
+
+def two_modes(normal: np.ndarray) -> np.ndarray:
+    """Transform standard normal values to a distribution with modes at -1 and 1."""
+    return np.sign(normal) + 0.4 * normal
+
+
+def skewed(normal: np.ndarray) -> np.ndarray:
+    """Transform standard normal values to a log-normal distribution of skewness 4.7."""
+    return np.exp(0.9 * normal) - 1.5
 
 
 class Setup(NamedTuple):
@@ -49,10 +67,12 @@ class Setup(NamedTuple):
         images: Images of each object.
         means: Means of the scores of positives and of negatives. An image is
             recognized as the positive class if its score is above 0.
-        object_spread: Standard deviation between objects. That within is 1.
+        object_spread: Scale of the effects of objects. That of the noise is 1.
         gain: Mean gain of the second network on positives.
         gain_spread: Standard deviations of the gain over objects, images and seeds.
         seeds: Number of training runs of the second network.
+        shape: Transform of standard normal values to effects and noise.
+        limit: Largest absolute score. Scores beyond it tie.
     """
 
     name: str
@@ -63,191 +83,186 @@ class Setup(NamedTuple):
     gain: float = 0.8
     gain_spread: tuple[float, float, float] = (0.4, 0.6, 0.0)
     seeds: int = 1
+    shape: Callable[[np.ndarray], np.ndarray] = np.asarray
+    limit: float = np.inf
+
+    def means_of_objects(self, group: int, normal: np.ndarray, is_second: int) -> np.ndarray:
+        """Transform standard normal values to the means of positives (group 0) or negatives (1)."""
+        gain = self.gain if group == 0 and is_second else 0
+        spread = np.hypot(self.object_spread, self.gain_spread[0] * is_second)
+        return self.means[group] + gain + spread * self.shape(normal)
+
+    def scores(self, means: np.ndarray, normal: np.ndarray, is_second: int) -> np.ndarray:
+        """Add standard normal noise of images to means: (...) and (..., n) to (..., n)."""
+        spread = np.hypot(1, self.gain_spread[1] * is_second)
+        scores = means[..., None] + spread * self.shape(normal)
+        return scores.clip(-self.limit, self.limit)
 
 
-SHY = Setup("recall of 0.2", (9, 9), means=(-1.2, -2.3), gain=1.0)
-SURE = Setup("near 0 and 1", (9, 9), means=(2.5, -2.5), object_spread=1.0, gain=0.3)
-VARIED = Setup("varied objects", (9, 9), means=(1.7, -1.7), object_spread=2.0)
-NO_GAIN = Setup("no gain", (9, 9), means=(0.5, -1.0), gain=0.0)
-SETUPS = (
-    Setup("typical", (5, 5)),
-    Setup("typical", (5, 10)),
-    Setup("typical", (7, 9)),
-    Setup("typical", (9, 9)),
-    Setup("typical", (20, 20)),
-    *(setup._replace(objects=(5, 5)) for setup in (SHY, SURE, VARIED, NO_GAIN)),
-    *(setup._replace(objects=(7, 9)) for setup in (SHY, SURE, VARIED, NO_GAIN)),
-    *(setup._replace(objects=(20, 20)) for setup in (SHY, SURE, VARIED)),
+TYPICAL = {
+    "typical": {},
+    "recall of 0.2": {"means": (-1.2, -2.3), "gain": 1.0},
+    "near 0 and 1": {"means": (2.5, -2.5), "object_spread": 1.0, "gain": 0.3},
+    "varied objects": {"means": (1.7, -1.7), "object_spread": 2.0},
+    "no gain": {"means": (0.5, -1.0), "gain": 0.0},
+}
+# No choice in the library was made with these numbers of objects and distributions, except for
+# the degrees of freedom and the end of a threshold above all scores.
+OTHER = {
+    "heavy tails": {"shape": heavy_tails},
+    "two modes": {"shape": two_modes},
+    "skewed": {"shape": skewed},
+    "saturated": {"limit": 1.5},
+    "small effects": {"object_spread": 0.23},
+    "large effects": {"object_spread": 2.0},
+}
+SETUPS = [
+    *(Setup("typical", objects) for objects in ((5, 10), (9, 9))),
+    *(
+        Setup(name, objects, **changes)
+        for objects in ((5, 5), (7, 9), (20, 20))
+        for name, changes in TYPICAL.items()
+    ),
     Setup("three seeds", (7, 9), gain_spread=(0.4, 0.6, 0.4), seeds=3),
     Setup("two objects", (2, 7)),
-    Setup("photographs", (55, 55), images=1),
-    Setup("photographs", (226, 400), images=1),
-)
+    *(
+        Setup(name, objects, **changes)
+        for objects in ((5, 5), (6, 9), (7, 12), (10, 10))
+        for name, changes in OTHER.items()
+    ),
+    *(
+        Setup(f"photographs, {name}", objects, 1, **changes)
+        for objects in ((55, 55), (54, 40), (200, 200))
+        for name, changes in {"typical": {}, **OTHER}.items()
+    ),
+]
 
 
-def true_metrics(
-    positives: np.ndarray, negatives: np.ndarray, spreads: Sequence[float | np.floating]
-) -> np.ndarray:
-    """Compute METRICS for scores that are mixtures of normal distributions.
-
-    Args:
-        positives: Mean of the scores of each positive object. The objects are
-            equally frequent.
-        negatives: Mean of the scores of each negative object.
-        spreads: Standard deviations of positives and negatives around these means.
-    """
-    recalls = []
-    for rate in RATES:
-        low, high = -50.0, 50.0
-        while high - low > 1e-9:
-            middle = (low + high) / 2
-            is_low = ndtr((negatives - middle) / spreads[1]).mean() > float(rate)
-            low, high = (middle, high) if is_low else (low, middle)
-        recalls.append(ndtr((positives - low) / spreads[0]).mean())
-    auc = ndtr((positives[:, None] - negatives) / np.hypot(spreads[0], spreads[1])).mean()
-    found = ndtr(positives / spreads[0])
-    by_class = [found[first::CLASSES].mean() for first in range(min(CLASSES, len(found)))]
-    false_positive_rate = ndtr(negatives / spreads[1]).mean()
-    return np.array([auc, *recalls, found.mean(), false_positive_rate, np.mean(by_class)])
+def population_metrics(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
+    """Compute METRICS of populations of objects and images: (..., k, n) to (METRICS, ...)."""
+    groups = [scores.reshape(*scores.shape[:-2], -1) for scores in (positives, negatives)]
+    recall, false_positive_rate = ((scores > 0).mean(axis=-1) for scores in groups)
+    found = (positives > 0).mean(axis=-1)
+    class_count = min(CLASSES, found.shape[-1])
+    by_class = [found[..., first::CLASSES].mean(axis=-1) for first in range(class_count)]
+    top1 = np.mean(by_class, axis=0)
+    return np.stack([*auc_and_recalls(*groups), recall, false_positive_rate, top1])
 
 
 def true_values(setup: Setup) -> np.ndarray:
-    """Compute METRICS of both networks for all objects, shape (2, len(METRICS))."""
-    of_object, of_image, of_seed = setup.gain_spread
-    positive, negative = np.array(setup.means)[:, None]
-    first = np.hypot(1, setup.object_spread)
-    second = np.linalg.norm([first, of_object, of_image])
-    after = true_metrics(positive + setup.gain, negative, (np.hypot(second, of_seed), second))
-    return np.stack([true_metrics(positive, negative, (first, first)), after])
+    """Compute METRICS of both networks for all objects, shape (2, METRICS, 1)."""
+    values = []
+    for is_second in (0, 1):
+        positives, negatives = (
+            setup.means_of_objects(group, QUANTILES, is_second) for group in (0, 1)
+        )
+        shifts = setup.gain_spread[2] * is_second * QUANTILES[5::10]
+        positives = np.add.outer(shifts, positives).ravel() if shifts.any() else positives
+        scores = (setup.scores(item, QUANTILES, is_second) for item in (positives, negatives))
+        values.append(population_metrics(*scores)[:, None])
+    return np.stack(values)
 
 
-def simulate(
-    setup: Setup, generator: np.random.Generator
-) -> tuple[list[list[np.ndarray]], np.ndarray]:
-    """Draw the scores of both networks.
+def correlated(first: np.ndarray, second: np.ndarray, spread: float, added: float) -> np.ndarray:
+    """Return the normal values whose product with hypot(spread, added) is the sum of both parts."""
+    return (spread * first + added * second) / np.hypot(spread, added)
 
-    Returns:
-        Scores of positives and of negatives for each run, the first network
-        first. METRICS of both networks for the drawn objects, shape
-        (2, len(METRICS)).
+
+class Simulated(NamedTuple):
+    """Test sets that are drawn at random.
+
+    Attributes:
+        runs: Scores of positives and of negatives for each run, the first
+            network first, shape (draws, images).
+        here: METRICS of both networks for the drawn objects, shape
+            (2, METRICS, draws). Empty if each object has one image.
     """
+
+    runs: list[tuple[np.ndarray, np.ndarray]]
+    here: np.ndarray
+
+
+def simulate(setup: Setup, draws: int, generator: np.random.Generator) -> Simulated:
+    """Draw the scores of both networks."""
     of_object, of_image, of_seed = setup.gain_spread
-    shifts = generator.normal(0, of_seed, setup.seeds)
-    scores = []
-    means = []
-    for count, mean, gain in zip(setup.objects, setup.means, (1, 0), strict=True):
-        before = mean + generator.normal(0, setup.object_spread, (count, 1))
-        after = before + gain * setup.gain + generator.normal(0, of_object, (count, 1))
-        noise = generator.normal(size=(count, setup.images))
-        runs = [before + noise]
+    shifts = generator.normal(0, of_seed, (setup.seeds, draws, 1))
+    runs = []
+    populations = []
+    for group, count in enumerate(setup.objects):
+        own, other = generator.normal(size=(2, draws, count))
+        before = setup.means_of_objects(group, own, 0)
+        both = correlated(own, other, setup.object_spread, of_object)
+        after = setup.means_of_objects(group, both, 1)
+        noise = generator.normal(size=(draws, count, setup.images))
+        scores = [setup.scores(before, noise, 0)]
         for shift in shifts:
-            own_noise = generator.normal(0, of_image, noise.shape)
-            runs.append(after + gain * shift + noise + own_noise)
-        scores.append([run.ravel() for run in runs])
-        means.append((before[:, 0], after[:, 0]))
-    spread = np.hypot(1, of_image)
-    (positives, positives_after), (negatives, negatives_after) = means
-    spreads = (np.hypot(spread, of_seed), spread)
-    truth = [
-        true_metrics(positives, negatives, (1, 1)),
-        true_metrics(positives_after, negatives_after, spreads),
-    ]
-    return [list(run) for run in zip(*scores, strict=True)], np.stack(truth)
-
-
-def statistics(
-    scores: Sequence[np.ndarray], classes: Sequence[str]
-) -> list[tuple[Callable[..., np.ndarray], list[int]]]:
-    """Return the functions of image counts that compute METRICS, with the groups they take."""
-    positives, negatives = scores
-    is_found = positives[None] > 0
-    return [
-        (partial(auc_and_recalls, positives, negatives), [0, 1]),
-        (partial(weighted_means, is_found.astype(float)), [0]),
-        (partial(weighted_means, (negatives[None] > 0).astype(float)), [1]),
-        (partial(class_means, is_found, classes), [0]),
-    ]
+            own_noise = generator.normal(size=noise.shape)
+            run_means = after + shift if group == 0 else after
+            scores.append(setup.scores(run_means, correlated(noise, own_noise, 1, of_image), 1))
+        runs.append([run.reshape(draws, -1) for run in scores])
+        populations.append([setup.scores(before, QUANTILES, 0), setup.scores(after, QUANTILES, 1)])
+    here = np.empty(0)
+    if setup.images > 1:
+        here = np.stack([population_metrics(*pair) for pair in zip(*populations, strict=True)])
+    return Simulated(list(zip(*runs, strict=True)), here)
 
 
 def jackknives(
     scores: Sequence[np.ndarray], classes: Sequence[str], units: Sequence[np.ndarray]
 ) -> list[Jackknife]:
     """Leave out each unit of positives and negatives for each of METRICS."""
-    results = []
-    for statistic, groups in statistics(scores, classes):
-        results += leave_out(statistic, Units([units[group] for group in groups], ""))
-    return results
+    positives, negatives = scores
+    is_found, is_false = positives[None] > 0, negatives[None] > 0
+    of_positives, of_negatives = Units(units[:1], ""), Units(units[1:], "")
+    return [
+        *leave_out_of_roc(positives, negatives, Units(units, "")),
+        *leave_out(partial(weighted_means, is_found.astype(float)), of_positives),
+        *leave_out(partial(weighted_means, is_false.astype(float)), of_negatives),
+        *leave_out(partial(class_means, is_found, classes), of_positives),
+    ]
 
 
 def intervals(
     runs: Sequence[Sequence[np.ndarray]], classes: Sequence[str], units: Sequence[np.ndarray]
-) -> list[Estimate]:
-    """Return the library's intervals of the first network, and of the gain of the second."""
+) -> np.ndarray:
+    """Compute the library's intervals of values, and of gains, shape (2, 2 · METRICS, draws)."""
     first, *second = (jackknives(scores, classes, units) for scores in runs)
-    values = [jackknife.estimate for jackknife in first]
-    gains = [change(after, [before]) for before, *after in zip(first, *second, strict=True)]
-    return values + gains
+    means = [average(metric) for metric in zip(*second, strict=True)]
+    gains = [
+        change_ends(after, average([before])) for after, before in zip(means, first, strict=True)
+    ]
+    return np.stack([*(item.interval for item in first), *gains], axis=1)
 
 
-def resampled(
-    runs: Sequence[Sequence[np.ndarray]],
-    classes: Sequence[str],
-    objects: Sequence[np.ndarray],
-    generator: np.random.Generator,
-) -> list[Estimate]:
-    """Return the percentile intervals of the first network, and of the gain of the second."""
-    counts = []
-    for object_of_image in objects:
-        number = object_of_image.max() + 1
-        drawn = generator.multinomial(number, np.full(number, 1 / number), DRAWS)
-        counts.append(drawn[:, object_of_image])
-    draws = []
-    for scores in runs:
-        rows = []
-        for statistic, groups in statistics(scores, classes):
-            rows += list(statistic(*(counts[group] for group in groups)))
-        draws.append(rows)
-    first, second = np.array(draws[0]), np.mean(draws[1:], axis=0)
-    ends = np.quantile(np.concatenate([first, second - first]), [0.025, 0.975], axis=1).T
-    return [Estimate(None, low, high) for low, high in ends]
-
-
-def measure(
-    setup: Setup, repetitions: int, methods: Collection[str] = METHODS
-) -> dict[str, np.ndarray]:
-    """Measure the coverage and the mean width of each method.
+def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Measure the coverage and the mean width of the intervals over objects, and over images.
 
     Args:
         setup: What is simulated.
-        repetitions: Number of simulated test sets.
-        methods: Methods that are measured, of METHODS. There is no interval over
-            the images of objects that have a single image.
+        draws: Number of simulated test sets.
+        seed: Seed of the random draws.
 
     Returns:
         Coverage and width of the values and gains of METRICS by method, shape
-        (2, 2 * len(METRICS)).
+        (2, 2 · METRICS). There is no method "images" if an object has one image.
     """
-    generator = np.random.default_rng(0)
+    generator = np.random.default_rng(seed)
     objects = [np.arange(count).repeat(setup.images) for count in setup.objects]
     images = [np.arange(len(object_of_image)) for object_of_image in objects]
     classes = [str(number % CLASSES) for number in objects[0]]
-    truth = true_values(setup)
-    found: dict[str, list[np.ndarray]] = {}
-    for _ in range(repetitions):
-        runs, truth_here = simulate(setup, generator)
-        of_method: dict[str, tuple[list[Estimate], np.ndarray]] = {}
-        if "jackknife" in methods:
-            of_method["jackknife"] = intervals(runs, classes, objects), truth
-        if "bootstrap" in methods:
-            of_method["bootstrap"] = resampled(runs, classes, objects, generator), truth
-        if "images" in methods and setup.images > 1:
-            of_method["images"] = intervals(runs, classes, images), truth_here
-        for name, (estimates, (before, after)) in of_method.items():
-            low, high = np.array([(item.low, item.high) for item in estimates], float).T
+    overall = true_values(setup)
+    rows: dict[str, list[np.ndarray]] = {}
+    for start in range(0, draws, BLOCK):
+        simulated = simulate(setup, min(BLOCK, draws - start), generator)
+        methods = {"objects": (objects, overall)}
+        if setup.images > 1:
+            methods["images"] = (images, simulated.here)
+        for method, (units, (before, after)) in methods.items():
+            low, high = intervals(simulated.runs, classes, units)
             true = np.concatenate([before, after - before])
             is_covered = (low - 1e-12 <= true) & (true <= high + 1e-12)
-            found.setdefault(name, []).append(np.stack([is_covered, high - low]))
-    return {name: np.mean(rows, axis=0) for name, rows in found.items()}
+            rows.setdefault(method, []).append(np.stack([is_covered, high - low]))
+    return {name: np.concatenate(item, axis=-1).mean(axis=-1) for name, item in rows.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -259,13 +274,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repetitions", type=int, default=400, help="test sets of each setup")
-    parser.add_argument("--setups", type=int, default=len(SETUPS), help="first setups only")
+    parser.add_argument("--draws", type=int, default=2000, help="test sets of each setup")
+    parser.add_argument("--only", default="", help="text in the titles of the setups to measure")
     options = parser.parse_args(arguments)
     rows = []
-    for setup in SETUPS[: options.setups]:
+    for seed, setup in enumerate(SETUPS):
         title = f"{setup.name}, {setup.objects[0]} and {setup.objects[1]}"
-        for method, (coverage, width) in measure(setup, options.repetitions).items():
+        if options.only not in title:
+            continue
+        for method, (coverage, width) in measure(setup, options.draws, seed).items():
             cells = [f"{a:.3f} ({b:.2f})" for a, b in zip(coverage, width, strict=True)]
             rows.append([title, method, *cells])
     header = [*METRICS, *(f"gain in {name}" for name in METRICS)]

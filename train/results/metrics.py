@@ -331,8 +331,7 @@ class Pool(ShortRepr):
         """Values without each unit of the known metrics that depend on a ranking."""
         jackknives: dict[str, Jackknife] = {}
         if self.for_roc.positives and self.for_roc.negatives:
-            statistic = partial(auc_and_recalls, *self.scores)
-            of_roc = leave_out(statistic, choose_units(*self.for_roc))
+            of_roc = leave_out_of_roc(*self.scores, choose_units(*self.for_roc))
             jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
         if self.classified:
             names = [prediction.photograph.label for prediction in self.classified]
@@ -535,46 +534,65 @@ def _group(
 
 @dataclass(frozen=True)
 class Jackknife:
-    """Value of a statistic in [0, 1], and its values if one unit is left out.
+    """Statistics in [0, 1], and their values if one unit is left out.
 
     Attributes:
-        value: Value on all images.
+        value: Values on all images, shape (...).
         without: For each group of units, such as the positive and the negative
-            objects, the value without each unit, shape (k,).
+            objects, the values without each unit, shape (..., k).
         unit_count: Smallest number of units in a group.
         over: What the units are.
+        at_ends: Values at both ends of the interval of the threshold, shape (2, ...),
+            for a recall whose threshold depends on the second group. Otherwise None.
     """
 
-    value: float
+    value: np.ndarray
     without: Sequence[np.ndarray]
     unit_count: int
     over: str
+    at_ends: np.ndarray | None = None
 
     @cached_property
-    def interval(self) -> tuple[float, float]:
-        """Ends of the 95% interval: logit(value) ± t · standard error.
+    def interval(self) -> np.ndarray:
+        """Ends of the 95% intervals, logit(value) ± t · standard error, shape (2, ...).
 
         The variance of logit(value) is the sum of the jackknife variances of
-        the groups (Efron and Stein 1981). The quantile t has the degrees of
-        freedom of Welch and Satterthwaite. Without variance, as at a value of
-        1, the interval is Wilson's for a fraction of the units.
+        the groups (Efron and Stein 1981). The degrees of freedom of the
+        quantile t are the harmonic mean of those of the groups, weighted by
+        variance. They do not exceed those of Welch and Satterthwaite, which
+        cover too little if effects of objects have heavy tails. Without
+        variance, as at a value of 1, the interval is Wilson's for a fraction of
+        the units.
+
+        With `at_ends`, this is the interval at a fixed threshold. Its distances from the value and
+        those of `at_ends` are added in squares (Zou and Donner 2008).
         """
-        value = self.value
-        if min(map(len, self.without), default=0) < 2:
-            return 0.0, 1.0
-        spread = _Spread.of([np.zeros(len(values)) for values in self.without])
-        if 0 < value < 1:
-            spread = _Spread.of([_logit(_keep_errors(item, value)) for item in self.without])
-        if spread.variance > 0:
-            half_width = spread.quantile * spread.variance**0.5
-            low, high = 1 / (1 + np.exp([half_width, -half_width] - _logit(value)))
-            return float(low), float(high)
-        return _wilson(value, self.unit_count, spread.quantile)
+        value = np.asarray(self.value)
+        if self.at_ends is not None:
+            positives, _, *seeds = self.without
+            fixed = replace(self, without=[positives, *seeds], at_ends=None).interval
+            down, up = np.hypot(fixed - value, self.at_ends - value)
+            return np.clip([value - down, value + up], 0, 1)
+        if min((item.shape[-1] for item in self.without), default=0) < 2:
+            return np.stack([np.zeros_like(value), np.ones_like(value)])
+        is_inner = (value > 0) & (value < 1)
+        inner = np.where(is_inner, value, 0.5)
+        errors = [_keep_errors(item, inner[..., None]) for item in self.without]
+        spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
+        half_width = spread.quantile * spread.variance**0.5
+        ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
+        wilson = _wilson(value, self.unit_count, spread.quantile)
+        return np.where(spread.variance > 0, ends, wilson)
+
+    @property
+    def is_open(self) -> np.ndarray:
+        """Whether no positive exceeds the high end of the threshold, shape (...)."""
+        return np.zeros_like(self.value, bool) if self.at_ends is None else self.at_ends[0] == 0
 
     @property
     def estimate(self) -> Estimate:
         """Value with its 95% interval."""
-        return Estimate(self.value, *self.interval, self.over)
+        return Estimate(float(self.value), *map(float, self.interval), self.over)
 
 
 def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
@@ -583,16 +601,16 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     Images of the same object are not independent, so an object is left out with
     all its images. The groups of units depend only on `units`. Metrics of two
     networks on the same images are therefore paired. `statistic` takes, for each group, how often
-    each of its n images counts, shape (..., n), and returns an array of shape (M, ...).
+    each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
     """
-    counts = [np.ones(len(unit_of_image), int) for unit_of_image in units.groups]
+    counts = [np.ones((1, len(unit_of_image)), int) for unit_of_image in units.groups]
     values = statistic(*counts)
     unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
     without = []
     for group, unit_of_image in enumerate(units.groups):
         unit_count = unit_counts[group]
         if unit_count == 1:
-            without.append(values[:, None])
+            without.append(values)
             continue
         part_count = min(unit_count, MAX_GROUPS)
         # A random order divides the units into parts of about equal size.
@@ -601,20 +619,53 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
         is_kept = part_of_image != np.arange(part_count)[:, None]
         kept = [*counts[:group], is_kept.astype(int), *counts[group + 1 :]]
         without.append(statistic(*kept))
-    rows = zip(values, *without, strict=True)
-    return [Jackknife(float(row[0]), row[1:], min(unit_counts), units.over) for row in rows]
+    rows = zip(values[..., 0], *without, strict=True)
+    return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]
+
+
+def leave_out_of_roc(
+    positives: Num[np.ndarray, "... n"], negatives: Num[np.ndarray, "... m"], units: Units
+) -> list[Jackknife]:
+    """Evaluate ROC_METRICS without each unit, and the recalls at the ends of their thresholds.
+
+    The false-positive rate at the estimated threshold has an interval around the nominal rate. The
+    ends of the interval of the threshold are the scores that these fractions of the negatives
+    exceed (Woodruff 1952). If less than half a negative exceeds an end, it may be above all scores.
+    """
+    # The axis before the last is for the units that are left out.
+    statistic = partial(auc_and_recalls, positives[..., None, :], negatives[..., None, :])
+    auc, *recalls = leave_out(statistic, units)
+    count = negatives.shape[-1]
+    descending = -np.sort(-negatives, axis=-1)
+    results = [auc]
+    levels = thresholds(negatives, np.ones(count, int))
+    for rate, recall, threshold in zip(RATES, recalls, levels, strict=True):
+        is_above = negatives > threshold[..., None]
+        is_tied = negatives == threshold[..., None]
+        # Negatives at the threshold count in part, so that the rate is the nominal one.
+        missing = float(rate) * count - is_above.sum(axis=-1, keepdims=True)
+        hits = is_above + is_tied * missing / is_tied.sum(axis=-1, keepdims=True)
+        (rates,) = leave_out(partial(weighted_means, hits[None]), Units(units.groups[1:], ""))
+        exceeding = rates.interval * count
+        places = exceeding.astype(int).clip(max=count - 1)[..., None]
+        is_detected = positives > _take(descending, places)
+        at_ends = np.where(exceeding < 0.5, 0.0, is_detected.mean(axis=-1))
+        results.append(replace(recall, at_ends=at_ends))
+    return results
 
 
 def average(runs: Sequence[Jackknife]) -> Jackknife:
     """Average a metric over training runs. Several runs are a further group of units."""
-    values = np.array([run.value for run in runs])
+    values = np.stack([run.value for run in runs])
     groups = zip(*(run.without for run in runs), strict=True)
     without = [np.mean(group, axis=0) for group in groups]
     over = runs[0].over
     if len(runs) > 1:
-        without.append((values.sum() - values) / (len(runs) - 1))
+        without.append(np.moveaxis((values.sum(axis=0) - values) / (len(runs) - 1), 0, -1))
         over = f"seeds and {over}"
-    return Jackknife(float(values.mean()), without, runs[0].unit_count, over)
+    all_ends = [run.at_ends for run in runs if run.at_ends is not None]
+    at_ends = np.mean(all_ends, axis=0) if all_ends else None
+    return Jackknife(values.mean(axis=0), without, runs[0].unit_count, over, at_ends)
 
 
 def change(
@@ -628,41 +679,59 @@ def change(
     run i of both has the same seed.
     """
     one, other = average(after), average(before)
-    value = one.value - other.value
-    group_count = len(one.without) if is_paired else len(after[0].without)
-    pairs = list(zip(one.without[:group_count], other.without, strict=False))
     over = max(one.over, other.over, key=len)
-    if value == 0 and all(np.array_equal(*pair) for pair in pairs):
-        margin = fraction(0, one.unit_count).high
-        assert margin is not None
-        return Estimate(value, -margin, margin, over)
-    if min(map(len, [*one.without, *other.without]), default=0) < 2:
-        return Estimate(value, -1.0, 1.0, over)
-    variances = _Spread.of(one.without).variance * _Spread.of(other.without).variance
-    covariance = sum(_covariance(*pair) for pair in pairs)
-    correlation = covariance / variances**0.5 if variances > 0 else 0.0
+    ends = change_ends(one, other, is_paired)
+    return Estimate(float(one.value - other.value), *map(float, ends), over)
+
+
+def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.ndarray:
+    """Compute the ends of the interval of `change` from averages over runs, shape (2, ...)."""
+    value = one.value - other.value
+    if min((item.shape[-1] for item in [*one.without, *other.without]), default=0) < 2:
+        return np.stack([np.full_like(value, -1), np.full_like(value, 1)])
+    # Runs that are not paired are the last group.
+    group_count = len(one.without) if is_paired else -1
+    pairs = list(zip(one.without[:group_count], other.without, strict=False))
+    product = _Spread.of(one.without).variance * _Spread.of(other.without).variance
+    covariance = np.sum([_covariance(*pair) for pair in pairs], axis=0)
+    correlation = np.where(product > 0, covariance / np.where(product > 0, product, 1) ** 0.5, 0)
     low, high = one.interval
     other_low, other_high = other.interval
-    down = _hypotenuse(one.value - low, other_high - other.value, correlation)
-    up = _hypotenuse(high - one.value, other.value - other_low, correlation)
-    return Estimate(value, max(-1.0, value - down), min(1.0, value + up), over)
+    down = _half_width(one.value - low, other_high - other.value, correlation, one.is_open)
+    up = _half_width(high - one.value, other.value - other_low, correlation, other.is_open)
+    ends = np.clip([value - down, value + up], -1, 1)
+    is_same = (value == 0) & np.all([(a == b).all(axis=-1) for a, b in pairs], axis=0)
+    if one.at_ends is not None and other.at_ends is not None:
+        is_same &= (one.at_ends == other.at_ends).all(axis=0)
+    margin = fraction(0, one.unit_count).high
+    assert margin is not None
+    return np.where(is_same, np.multiply.outer([-margin, margin], np.ones_like(value)), ends)
 
 
-def _hypotenuse(a: float, b: float, correlation: float) -> float:
-    """Half width of a difference whose parts have the half widths a and b."""
-    return max(0.0, a * a + b * b - 2 * correlation * a * b) ** 0.5
+def _half_width(
+    a: np.ndarray, b: np.ndarray, correlation: np.ndarray, is_open: np.ndarray
+) -> np.ndarray:
+    """Half width of a difference whose parts have the half widths a and b.
+
+    If the threshold of a recall may be above all scores (`is_open`), the recall has no lower limit.
+    Its distance is then no error that partly cancels, and the distances are added.
+    """
+    squared = np.where(is_open, (a + b) ** 2, a * a + b * b - 2 * correlation * a * b)
+    return np.maximum(0.0, squared) ** 0.5
 
 
-def _covariance(one: np.ndarray, other: np.ndarray) -> float:
+def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Jackknife covariance of two statistics, from their values without each of k units."""
-    return float((len(one) - 1) * np.mean((one - one.mean()) * (other - other.mean())))
+    count = one.shape[-1]
+    deviations = (x - x.mean(axis=-1, keepdims=True) for x in (one, other))
+    return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
 
 
 class _Spread(NamedTuple):
     """Jackknife variance of a statistic, and the quantile of Student's t for its interval."""
 
-    variance: float
-    quantile: float
+    variance: np.ndarray
+    quantile: np.ndarray
 
     @classmethod
     def of(cls, without: Sequence[np.ndarray]) -> "_Spread":
@@ -670,41 +739,40 @@ class _Spread(NamedTuple):
         # This import is here because it takes a second.
         from scipy.special import stdtrit
 
-        variances = np.array([_covariance(values, values) for values in without])
-        degrees = np.array([len(values) - 1 for values in without])
-        freedom = degrees.min()
-        if variances.any():
-            # Welch and Satterthwaite.
-            freedom = variances.sum() ** 2 / (variances**2 / degrees).sum()
-        return cls(float(variances.sum()), float(stdtrit(freedom, 0.975)))
+        degrees = np.array([item.shape[-1] - 1 for item in without])
+        variances = np.stack([_covariance(values, values) for values in without], axis=-1)
+        total = variances.sum(axis=-1)
+        terms = (variances / degrees).sum(axis=-1)
+        freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
+        return cls(total, stdtrit(freedom, 0.975))
 
 
-def _keep_errors(values: np.ndarray, value: float) -> np.ndarray:
+def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Keep at least MIN_RATIO of the distance of a value from 0 and from 1."""
     return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
 
 
-def _logit(values: np.ndarray | float) -> np.ndarray:
+def _logit(values: np.ndarray) -> np.ndarray:
     """Log-odds of values in (0, 1)."""
     return np.log(values) - np.log1p(np.negative(values))
 
 
-def _wilson(value: float, n: int, quantile: float) -> tuple[float, float]:
-    """Wilson's interval of a fraction of n units, with a quantile of Student's t."""
+def _wilson(value: np.ndarray, n: int, quantile: np.ndarray) -> np.ndarray:
+    """Ends of Wilson's interval of a fraction of n units, with a quantile of Student's t."""
     shift = quantile**2 / n
     center = (value + shift / 2) / (1 + shift)
     half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
-    return max(0.0, center - half_width), min(1.0, center + half_width)
+    return np.clip([center - half_width, center + half_width], 0, 1)
 
 
 def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Compute means over images that count several times: (M, n) and (..., n) to (M, ...)."""
-    return np.moveaxis(counts @ values.T / counts.sum(axis=-1, keepdims=True), -1, 0)
+    """Compute means over images that count several times: (..., n) and (k, n) to (..., k)."""
+    return values @ counts.T / counts.sum(axis=-1)
 
 
 def class_means(
-    hits: Bool[np.ndarray, "K n"], names: Sequence[str], counts: Num[np.ndarray, "... n"]
-) -> Float[np.ndarray, "K ..."]:
+    hits: Bool[np.ndarray, "... n"], names: Sequence[str], counts: Num[np.ndarray, "k n"]
+) -> Float[np.ndarray, "... k"]:
     """Compute the fraction of hits in each class, and average it over the classes.
 
     This is the mean over all images if an image of a class with n images has
@@ -714,13 +782,14 @@ def class_means(
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
     weights = 1 / class_sizes[class_of_image]
-    total_weight = counts @ weights
-    return np.stack([counts @ (weights * row) / total_weight for row in hits])
+    # Sums in the same order make a mean of ones exactly 1.
+    weight_of_image = weights * counts
+    return (hits[..., None, :] * weight_of_image).sum(axis=-1) / weight_of_image.sum(axis=-1)
 
 
 def auc_and_recalls(
-    positives: Num[np.ndarray, " n"],
-    negatives: Num[np.ndarray, " m"],
+    positives: Num[np.ndarray, "... n"],
+    negatives: Num[np.ndarray, "... m"],
     positive_counts: Int[np.ndarray, "... n"] | None = None,
     negative_counts: Int[np.ndarray, "... m"] | None = None,
 ) -> Float[np.ndarray, "4 ..."]:
@@ -733,21 +802,21 @@ def auc_and_recalls(
     image counts. None counts each once.
     """
     if positive_counts is None:
-        positive_counts = np.ones(len(positives), int)
+        positive_counts = np.ones(positives.shape[-1], int)
     if negative_counts is None:
-        negative_counts = np.ones(len(negatives), int)
+        negative_counts = np.ones(negatives.shape[-1], int)
     positive_total = positive_counts.sum(axis=-1)
 
-    order = negatives.argsort()
-    sorted_negatives = negatives[order]
+    order = negatives.argsort(axis=-1)
+    sorted_negatives = _take(negatives, order)
     # Entry i of `counts_below` is the sum of the counts of the i negatives with the
     # lowest scores, for i from 0 to m, shape (..., m + 1).
-    counts_below = np.insert(negative_counts[..., order].cumsum(axis=-1), 0, 0, axis=-1)
+    counts_below = np.insert(_take(negative_counts, order).cumsum(axis=-1), 0, 0, axis=-1)
     negative_total = counts_below[..., -1]
     # Number of negatives with a lower score than each positive, shape (..., n).
-    lower = counts_below[..., sorted_negatives.searchsorted(positives, "left")]
+    lower = _take(counts_below, _search(sorted_negatives, positives, "left"))
     # Number of negatives whose score is lower than that of each positive, or equal to it.
-    lower_or_equal = counts_below[..., sorted_negatives.searchsorted(positives, "right")]
+    lower_or_equal = _take(counts_below, _search(sorted_negatives, positives, "right"))
     wins = (positive_counts * lower).sum(axis=-1)
     wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)
     # The mean of both numbers counts a tie half.
@@ -761,7 +830,7 @@ def auc_and_recalls(
 
 
 def thresholds(
-    negatives: Num[np.ndarray, " m"],
+    negatives: Num[np.ndarray, "... m"],
     counts: Int[np.ndarray, "... m"],
     rates: Sequence[str] = RATES,
 ) -> list[np.ndarray]:
@@ -772,11 +841,11 @@ def thresholds(
     20 negatives, at most 2 negatives exceed the threshold. `rates` are decimal strings, because
     these are exact.
     """
-    order = negatives.argsort()
-    sorted_negatives = negatives[order]
+    order = negatives.argsort(axis=-1)
+    sorted_negatives = _take(negatives, order)
     # Entry i is the sum of the counts of the i + 1 negatives with the lowest scores,
     # shape (..., m).
-    counts_up_to = counts[..., order].cumsum(axis=-1)
+    counts_up_to = _take(counts, order).cumsum(axis=-1)
     total = counts_up_to[..., -1]
     thresholds_by_rate = []
     for rate in rates:
@@ -786,8 +855,21 @@ def thresholds(
         needed_up_to = total - allowed_above
         # The index is the number of scores that too many negatives exceed.
         index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
-        thresholds_by_rate.append(sorted_negatives[index])
+        thresholds_by_rate.append(_take(sorted_negatives, index[..., None])[..., 0])
     return thresholds_by_rate
+
+
+def _take(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Take entries of the last axis: (..., n) and (..., k) to (..., k)."""
+    shape = np.broadcast_shapes(values.shape[:-1], indices.shape[:-1])
+    values, indices = (np.broadcast_to(item, shape + item.shape[-1:]) for item in (values, indices))
+    return np.take_along_axis(values, indices, axis=-1)
+
+
+def _search(ascending: np.ndarray, scores: np.ndarray, side: str) -> np.ndarray:
+    """Find the places of scores in sorted arrays: (..., m) and (..., n) to (..., n)."""
+    search = np.vectorize(partial(np.searchsorted, side=side), signature="(m),(n)->(n)")
+    return search(ascending, scores)
 
 
 def roc_curve(
