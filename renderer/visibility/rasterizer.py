@@ -35,9 +35,11 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from renderer.errors import InputError, require_choice
+from renderer.memory import require_memory
 from renderer.settings import RASTERIZERS
 from renderer.visibility import opengl
 
@@ -45,6 +47,8 @@ from renderer.visibility import opengl
 # is the side of the square in samples. Products of fixed-point coordinates then fit into
 # int64.
 SPAN = 2**21
+# Bytes for each sample of the view that is shaded, at least. A face index has 4 more in each view.
+SHADED_BYTES = 40
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,9 @@ class Rasterizer:
         limit = SPAN / resolution
         if max(-lowest, highest) > limit:
             points = np.clip(points, -limit, limit)
+        needed = (4 * len(points) + SHADED_BYTES) * resolution**2
+        name = f"{len(points)} views of {resolution} samples per side"
+        require_memory(name, needed, torch.device("cpu"))
         module = import_module(f"renderer.visibility.{self.name}")
         return module.rasterize(points, faces, resolution, closed)
 

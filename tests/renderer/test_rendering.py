@@ -346,3 +346,14 @@ def test_a_light_sphere_shows_even_light_before_white():
     torch.testing.assert_close(image[:, 8, 8], encode(color, "srgb"), rtol=0, atol=1e-6)
     image_corners = image[:, ::15, ::15]
     assert (image_corners == 1).all()
+
+
+@pytest.mark.parametrize("function", ["render", "precompute_transfer"])
+def test_images_that_need_more_than_the_free_memory_are_refused(
+    stone, light, function, monkeypatch
+):
+    monkeypatch.setattr("renderer.memory.free_memory", lambda device: 10**6)
+    arguments = (stone, CAMERAS, light)[: 3 if function == "render" else 2]
+    getattr(renderer, function)(*arguments, **SMALL)
+    with pytest.raises(InputError, match=r"^3 views of 512 samples per side need"):
+        getattr(renderer, function)(*arguments, size=256, rasterizer="numpy")
