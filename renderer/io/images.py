@@ -113,7 +113,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
         image.draft(None, (min_side, min_side))
         convert = conversion_to_srgb(image, path)
-        has_more_bits = re.search(";1[26]", str(image.tile))
+        has_more_bits = re.search(";1[26]", str(getattr(image, "tile", "")))
         color, alpha = color_and_alpha(image)
     if convert is not None:
         levels = Image.new(color.mode, (2, 1))
