@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "docs"))  # for pictures.py
 
 import norm_balls as nb  # noqa: E402 (The path is set above.)
 from renderer.settings import Settings  # noqa: E402
-from train.help import format_facts  # noqa: E402
+from train.cli import format_facts  # noqa: E402
 
 project = "Parametric norm-balls"
 author = "Parametric norm-balls maintainers"

@@ -1,8 +1,7 @@
 """pnb-attack: attack a classifier through lighting, shape, colors or pixels."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import AttackExperimentSettings
-from train.help import HelpText
 
 
 def list_parameters(words: list[str]) -> list[str]:

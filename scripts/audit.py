@@ -1,8 +1,7 @@
 """pnb-audit: measure how safe a classifier is in unusual lighting, and what hardening costs."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import AuditSettings
-from train.help import HelpText
 
 main = Command(
     name="audit",

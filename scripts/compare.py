@@ -1,8 +1,7 @@
 """pnb-compare: print Markdown tables of finished runs."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import CompareSettings
-from train.help import HelpText
 
 main = Command(
     name="compare",

@@ -1,8 +1,7 @@
 """pnb-evaluate: score a network on a folder of photographs."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import EvaluateSettings
-from train.help import HelpText
 
 main = Command(
     name="evaluate",

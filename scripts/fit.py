@@ -1,8 +1,7 @@
 """pnb-fit: find the camera and the lighting of a photograph."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import FitSettings
-from train.help import HelpText
 
 main = Command(
     name="fit",

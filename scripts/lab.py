@@ -1,8 +1,7 @@
 """pnb-lab: path-trace renders of oranges and hard negatives under a projector."""
 
-from train.command import Command
+from train.cli import Command, HelpText
 from train.command_settings import LabSettings
-from train.help import HelpText
 
 main = Command(
     name="lab",

@@ -2,9 +2,8 @@
 
 import os
 
-from train.command import Command, quoted
+from train.cli import Command, HelpText, quoted
 from train.command_settings import ReportSettings
-from train.help import HelpText
 
 
 def name_folders(words: list[str]) -> list[str]:

@@ -101,11 +101,10 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
     assert "train.precision" in keys
     gets_settings = re.compile("ExperimentSettings|DictConfig")
     command_layer = (
-        "train.command",
-        "train.help",
+        "train.cli",
         "train.__main__",
         "train.results",
-        "train.system.user_errors",
+        "train.user_errors",
     )
     checked = 0
     for name, path in modules().items():

@@ -8,11 +8,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from renderer.errors import InputError
-from train.command import SWEEP_FLAGS, Command, import_function, read_settings
-from train.help import HelpText
+from train.cli import SWEEP_FLAGS, Command, HelpText, read_settings
 from train.runs import run_names  # noqa: F401  (conf/train.yaml names the folders of a sweep by it)
 from train.settings import ExperimentSettings
-from train.system.verbosity import take_flag
+from train.system import import_function, take_flag
 
 
 class TrainCommand(Command):

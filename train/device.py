@@ -15,7 +15,7 @@ from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
 from renderer.visibility.rasterizer import Rasterizer, choose
 from train import console
-from train.system.user_errors import keyed
+from train.user_errors import keyed
 
 # File in which Linux stores how much time of the cores a container may use: a quota and a
 # period. The quota divided by the period is the number of cores.

@@ -18,7 +18,7 @@ from train.results.tables import Estimate
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected, write_published
 from train.settings import mapped, published
-from train.system.user_errors import keyed, writable_folder
+from train.user_errors import keyed, writable_folder
 
 # Folder of the published networks, in the installation or in a clone.
 PRETRAINED = Path("pretrained")

@@ -21,9 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.command import program
 from train.run_folder import opened_text
 from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, mapped
+from train.system import program
 
 CONFIG = "config.yaml"
 # Packages whose versions config.yaml records, in addition to Python and torch.

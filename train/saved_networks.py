@@ -26,7 +26,7 @@ from train.command_settings import ClassifierSettings
 from train.networks import PYTHON, WIDERESNET, build_network
 from train.run_folder import BEST, PUBLISHED, WEIGHTS
 from train.settings import published
-from train.system.user_errors import keyed
+from train.user_errors import keyed
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"

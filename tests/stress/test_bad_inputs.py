@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
 from train import checkpoints, run_folder
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 from train.data.cache import content_hash
 from train.data.sets import load_folder, load_npz
 

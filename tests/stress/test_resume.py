@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from train import checkpoints, run_folder
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 from train.data.cache import content_hash
 from train.run_folder import METRICS, read_metrics
 

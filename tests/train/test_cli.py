@@ -15,16 +15,15 @@ import torch
 import yaml
 
 from renderer.errors import InputError
-from train import command, console
-from train.command import USER_ERROR, Command
+from train import console, system
+from train import user_errors as errors
+from train.cli import USER_ERROR, Command, HelpText
 from train.command_settings import CompareSettings
 from train.commands.experiment import logged_to
 from train.data.cache import content_hash
-from train.help import HelpText
 from train.run_folder import LAST, locked
-from train.system import user_errors as errors
-from train.system.user_errors import user_message, writable_folder
-from train.system.verbosity import take_flag
+from train.system import take_flag
+from train.user_errors import user_message, writable_folder
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -271,7 +270,7 @@ COMPARE = Command("compare", CompareSettings, "builtins:print", HelpText("Compar
 
 WARNING = """
 import warnings
-from train.command import set_up_process
+from train.system import set_up_process
 set_up_process()
 warnings.warn("clamped")
 """
@@ -349,8 +348,8 @@ def test_an_interrupt_while_torch_is_imported_is_one_line(module):
 def test_slow_imports_are_announced(monkeypatch, tmp_path, capsys):
     (tmp_path / "slow.py").write_text("import time\ntime.sleep(0.2)\ndef work(): pass\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(command, "IMPORT_DELAY", 0.01)
-    command.import_function("slow:work")()
+    monkeypatch.setattr(system, "IMPORT_DELAY", 0.01)
+    system.import_function("slow:work")()
     assert capsys.readouterr().err.endswith(" ...\n")
 
 

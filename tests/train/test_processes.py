@@ -21,7 +21,7 @@ from augment.progress import Phases
 from augment.scene.scene import Scene
 from tests.runs import completed_run
 from train import checkpoints, run_folder
-from train.command import read_settings
+from train.cli import read_settings
 from train.processes import Interrupted, SignalHandler, process_group
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings

@@ -16,7 +16,7 @@ from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from train import fingerprints
-from train.command import read_settings
+from train.cli import read_settings
 from train.command_settings import AuditSettings
 from train.run_config import (
     CONFIG,

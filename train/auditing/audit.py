@@ -47,7 +47,6 @@ from train.auditing.relit import (
 )
 from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.class_names import class_name, class_of_meshes, require_others, with_class_name
-from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
@@ -59,7 +58,8 @@ from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer
 from train.saved_networks import load_chosen, load_network
 from train.settings import OTHER_PREFIX, published, read_objects, simplified, solid_name
-from train.system.user_errors import keyed, writable_folder
+from train.system import command_line
+from train.user_errors import keyed, writable_folder
 
 # Number of views of the meshes that are rendered in environment lighting.
 VIEW_COUNT = 24

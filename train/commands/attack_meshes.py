@@ -41,7 +41,6 @@ from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility.rasterizer import Rasterizer
 from train.class_names import class_name, class_of_meshes
-from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.commands import attack_photographs
 from train.device import choose_device, choose_rasterizer
@@ -61,8 +60,8 @@ from train.run_config import write_config
 from train.run_folder import sole_writer
 from train.saved_networks import load_chosen, load_network
 from train.settings import read_object, read_objects
-from train.system.user_errors import keyed, keys_of, writable_folder
-from train.system.verbosity import is_verbose, shortened
+from train.system import command_line, is_verbose, shortened
+from train.user_errors import keyed, keys_of, writable_folder
 
 # The search for a scene in which a mesh is recognized may change these settings.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")

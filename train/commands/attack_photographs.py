@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from renderer.errors import InputError
-from train.command import command_line
 from train.command_settings import AttackExperimentSettings
 from train.device import choose_device
 from train.results.overwrite import remove_attack, require_replaceable
@@ -12,8 +11,8 @@ from train.run_config import write_config
 from train.run_folder import sole_writer
 from train.saved_networks import load_chosen
 from train.settings import published
-from train.system.user_errors import keyed, writable_folder
-from train.system.verbosity import shortened
+from train.system import command_line, shortened
+from train.user_errors import keyed, writable_folder
 
 # Warnings about at most 3 unreadable files are printed if --verbose is not set.
 MAX_UNREADABLE = 3

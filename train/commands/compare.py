@@ -5,7 +5,7 @@ from pathlib import Path
 from train.command_settings import CompareSettings
 from train.results.compare import format_comparison, format_short_comparison
 from train.results.store import finished_runs
-from train.system.verbosity import is_verbose, shortened
+from train.system import is_verbose, shortened
 
 
 def print_comparison(settings: CompareSettings) -> None:

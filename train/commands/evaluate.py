@@ -12,8 +12,8 @@ from train.results.scoring import format_overall, format_scores
 from train.results.store import trained_labels
 from train.saved_networks import load_chosen, load_run
 from train.settings import label_names, published
-from train.system.user_errors import keyed
-from train.system.verbosity import is_verbose
+from train.system import is_verbose
+from train.user_errors import keyed
 
 
 def evaluate(settings: EvaluateSettings) -> None:

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from augment import distributed
 from augment.settings import MODES
 from train import checkpoints, console
-from train.command import compose, program, read_settings
+from train.cli import compose, read_settings
 from train.processes import Interrupted, broadcast, process_group
 from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import remove_run, require_new_run
@@ -29,10 +29,10 @@ from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.run_folder import sole_writer
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
-from train.system.user_errors import keyed, writable_folder
-from train.system.verbosity import is_verbose
+from train.system import is_verbose, program
 from train.training.initial import with_label
 from train.training.run import load_runs
+from train.user_errors import keyed, writable_folder
 
 # An override such as experiment=photographs chooses a file of settings. These keys
 # are the folders of such files in conf/.

@@ -23,7 +23,7 @@ from train.commands.attack_meshes import build_attacked
 from train.data.masks import read_mask
 from train.results.overwrite import require_replaceable
 from train.settings import read_object
-from train.system.user_errors import writable_folder
+from train.user_errors import writable_folder
 
 # Width and height of the background image that is written, in pixels.
 BACKGROUND_SIZE = 448

@@ -6,7 +6,7 @@ from pathlib import Path
 from train.command_settings import ReportSettings
 from train.results.overwrite import OF_AUDIT, RESULTS, require_replaceable
 from train.results.page import write_report
-from train.system.user_errors import writable_folder
+from train.user_errors import writable_folder
 
 
 def report(settings: ReportSettings) -> None:

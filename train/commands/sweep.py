@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train import checkpoints, console
-from train.command import compose, quoted, read_settings
+from train.cli import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
 from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import require_new_run, require_replaceable
@@ -32,10 +32,10 @@ from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
-from train.system.user_errors import user_message, writable_folder
-from train.system.verbosity import is_verbose, shortened
+from train.system import is_verbose, shortened
 from train.training.initial import with_label
 from train.training.run import Run, load_inputs, load_runs
+from train.user_errors import user_message, writable_folder
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
 MAX_TABLE_LINES = 10

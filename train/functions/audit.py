@@ -21,9 +21,13 @@ from train.auditing.audit import run_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.auditing.report import AuditReport, read_audit
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
+from train.functions.meshes import (
+    MeshItem,
+    as_mappings,
+    find_positive_classes,
+    folder_or_temporary,
+)
 from train.results.overwrite import require_replaceable
-from train.system.folders import folder_or_temporary
 
 
 def audit(

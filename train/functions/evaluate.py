@@ -25,7 +25,7 @@ from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores
 from train.run_folder import sole_writer
 from train.settings import published
-from train.system.user_errors import keyed, writable_folder
+from train.user_errors import keyed, writable_folder
 
 
 def evaluate(

@@ -26,8 +26,13 @@ from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
 from train.class_names import require_others, with_classes_of_meshes
-from train.command import read_settings
-from train.functions.meshes import MeshItem, as_mappings, find_positive_classes
+from train.cli import read_settings
+from train.functions.meshes import (
+    MeshItem,
+    as_mappings,
+    find_positive_classes,
+    folder_or_temporary,
+)
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
 from train.run_folder import sole_writer
@@ -39,7 +44,6 @@ from train.settings import (
     TrainSettings,
     read_objects,
 )
-from train.system.folders import folder_or_temporary
 from train.training.initial import initial_of
 from train.training.inputs import load_data
 from train.training.run import Run

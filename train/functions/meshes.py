@@ -1,7 +1,8 @@
-"""Convert the meshes that a caller gives to a function into settings."""
+"""Arguments of functions that run a command: meshes, and the folder of the results."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +14,7 @@ from renderer.errors import InputError, describe
 from renderer.io.export import export_mesh
 from renderer.io.files import atomic_write
 from renderer.mesh import Mesh
-from renderer.validation import as_list
+from renderer.validation import as_folder, as_list
 from train.class_names import classes_of_meshes
 
 # File of a mesh, solid:NAME, or the mesh itself.
@@ -94,3 +95,16 @@ def find_positive_classes(
     names = classes_of_meshes(mappings, classifier.classes, "meshes")
     # A dictionary has each name once, in the order of the meshes.
     return list(dict.fromkeys(names))
+
+
+@contextmanager
+def folder_or_temporary(out: str | Path | None) -> Iterator[Path]:
+    """Yield a folder for files: the folder of the caller, or a temporary folder.
+
+    A temporary folder is removed at the end of the block.
+    """
+    if out is not None:
+        yield as_folder("out", out)
+        return
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        yield Path(folder)

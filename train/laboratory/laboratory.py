@@ -35,7 +35,7 @@ from train.laboratory.lab_patterns import RESOLUTION
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.run_folder import LOCK, read_json, sole_writer
 from train.settings import OTHER_PREFIX, label_names, read_object, solid_name
-from train.system.user_errors import writable_folder
+from train.user_errors import writable_folder
 
 # Glob pattern of the renders in the folder of the test set. Their paths are
 # LABEL/NUMBER_LIGHTING.png.

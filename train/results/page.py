@@ -45,7 +45,7 @@ from train.results.tables import (
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
-from train.system.user_errors import user_message
+from train.user_errors import user_message
 
 # File name of the page.
 PAGE = "report.html"

@@ -32,7 +32,7 @@ from train.saved_networks import (
     plain_weights,
 )
 from train.settings import WIDERESNET, ExperimentSettings, label_names
-from train.system.user_errors import keyed
+from train.user_errors import keyed
 
 # Entries in the description of a network. They must be equal in two networks if the
 # weights of one are copied to the other.

@@ -24,8 +24,8 @@ from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_
 from train.device import choose_rasterizer
 from train.processes import main_process_first
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
-from train.system.user_errors import keyed, keys_of
 from train.training.initial import Initial, load_initial
+from train.user_errors import keyed, keys_of
 
 # Pixels per side of the images if neither the setting `size` nor the network with
 # whose weights a run begins gives a size.

@@ -47,7 +47,6 @@ from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.saved_networks import NORMALIZE_LIGHT, export
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
-from train.system.user_errors import keyed, keys_of
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.initial import (
     Initial,
@@ -64,6 +63,7 @@ from train.training.inputs import (
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.run_log import RunLog
+from train.user_errors import keyed, keys_of
 
 # If the training images are on disk, the mean and the standard deviation of their color
 # channels are estimated from this number of images.

@@ -19,13 +19,13 @@ from train.data.batches import Batch
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import wrap_ddp
 from train.settings import RELIGHT, TrainSettings
-from train.system.user_errors import keyed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.losses import TrainingLoss
 from train.training.recipe import build_optimizer, learning_rate
 from train.training.relit_batches import RelitBatches
 from train.training.shared_teacher import share_layers
+from train.user_errors import keyed
 
 
 class TrainingStep:

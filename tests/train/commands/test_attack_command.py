@@ -14,7 +14,7 @@ from PIL import Image
 from augment.attacks.attack import ZERO_GRADIENT
 from renderer.io.meshes import load_mesh
 from renderer.light.presets import load_light
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [

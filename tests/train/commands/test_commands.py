@@ -22,7 +22,7 @@ from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network
 from train import console
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut

@@ -11,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from renderer.settings import facts_of, field_types
-from train.command import Command
+from train.cli import Command
 from train.run_config import format_command
 from train.settings import dotted
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from tests.train.helpers import read_markdown
+from train import system as verbosity
 from train.commands.sweep import format_sweep
-from train.system import verbosity
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 MAX_LINES = 15

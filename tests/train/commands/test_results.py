@@ -8,7 +8,7 @@ import pytest
 
 import renderer
 from tests.train.helpers import save_noise, save_untrained_network
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 from train.results.overwrite import require_new_run, require_replaceable
 from train.run_config import write_config
 from train.run_folder import LAST

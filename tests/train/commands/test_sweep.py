@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.train.helpers import read_markdown
 from train import __main__ as command
-from train.command import USER_ERROR
+from train.cli import USER_ERROR
 from train.commands import sweep
 from train.commands.sweep import format_sweep
 from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
@@ -249,7 +249,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
     [
         ("train.learning_rat=1", "train.learning_rat is not a setting"),
         ("train.learning_rate=0.05,-1", "train.learning_rate=-1.0"),
-        ("train.epochs=1,many", "train.epochs=many must be a whole number"),
+        ("train.epochs=1,many", "train.epochs: Value 'many'"),
         ("augment=none,randm", "augment=randm is not a choice"),
         ("train.soup=false,true", "train.soup=True needs a network to begin with"),
         ("data.path=missing.npz", "data.path=missing.npz does not exist"),

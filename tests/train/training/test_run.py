@@ -32,10 +32,10 @@ from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
 from train.saved_networks import load_run
-from train.system.user_errors import user_message
 from train.training import loop
 from train.training.initial import choose_validation, load_initial
 from train.training.inputs import describe_test_images, load_data
+from train.user_errors import user_message
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 

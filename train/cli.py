@@ -18,19 +18,17 @@ Python argument, and `InputError.within` puts the key in front.
 
 from __future__ import annotations
 
-import gc
+import json
 import os
-import shlex
 import signal
 import sys
-import threading
-import warnings
+import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
-from importlib import import_module
 from pathlib import Path
+from types import NoneType, UnionType
 from typing import Any, TypeVar, cast, get_args, get_origin
 
 import hydra
@@ -42,41 +40,73 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
+import conf
 from renderer.errors import InputError
-from renderer.settings import Settings
-from train.help import CONF, HelpText, types_below, without_none
-from train.system.memory import reuse_freed_memory
-from train.system.verbosity import take_flag
+from renderer.settings import Settings, facts_of, field_types
+from train.system import (
+    INTERRUPTED,
+    exits_on_sigterm,
+    import_function,
+    require_current_folder,
+    set_up_process,
+    skip_last_collection,
+    take_flag,
+)
 
 # Exit status after an error of the user.
 USER_ERROR = 2
 # Exit status of a process that SIGPIPE ends: 128 plus the number of the signal.
 # Windows does not have that signal.
 BROKEN_PIPE = 141
-INTERRUPTED = "ended by SIGINT"
-# The names of all installed commands begin with this text.
-PREFIX = "pnb-"
 SWEEP_FLAGS = {"--multirun", "-m"}
 HELP_FLAGS = {"--help", "-h"}
-# If an import takes more seconds than this, `import_function` prints a line about it.
-IMPORT_DELAY = 5.0
-# Words of error messages for the types of settings.
-NOUNS = {
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    str: "text",
-    list: "a list, such as [a,b]",
-}
 # Hydra and OmegaConf raise these errors for some mistakes of the user. The errors do not
 # name the setting.
-INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
-# The largest float has 309 digits before the decimal point. A whole number with more
-# digits than MAX_DIGITS is reported as too large.
-MAX_DIGITS = 300
+INTERNAL_ERRORS = (AssertionError, AttributeError)
 # Quotation marks. Hydra does not parse the text between two of them.
 QUOTES = "'\""
+CONF = Path(conf.__path__[0])
+# Width of the left column of --help, which has "key=value", in characters.
+KEY_WIDTH = 44
+# Width of the right column of --help, which explains the setting, in characters.
+TEXT_WIDTH = 80
+VERBOSE_HELP = "Print details. Without it, a command prints its result in at most 15 lines."
 Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class HelpText:
+    """Texts that --help of a command shows before the list of its settings.
+
+    Args:
+        about: Sentence that says what the command does.
+        examples: Command lines.
+        common: Keys of the settings that are changed most often.
+        groups: Groups of choices, such as "experiment" for experiment=NAME. A group is a folder
+            of conf/ with a file for each choice. "attack@augment.attack" is the folder conf/attack,
+            whose files set augment.attack.
+    """
+
+    about: str
+    examples: Sequence[str] = ()
+    common: Sequence[str] = ()
+    groups: Sequence[str] = ()
+
+    def format(self, config: DictConfig) -> str:
+        """Return the whole text of --help."""
+        lines = dict(_setting_lines(config))
+        sections = [
+            self.about,
+            "\n".join(["Examples:", *(f"  {example}" for example in self.examples)]),
+        ]
+        if self.common:
+            common = (lines[key] for key in self.common)
+            sections.append("\n".join(["Changed most often:", *common]))
+        if self.groups:
+            sections.append("\n".join(["Choices:", *_choice_lines(self.groups)]))
+        sections.append("\n".join(["Options:", _format_line("-v, --verbose", VERBOSE_HELP)]))
+        sections.append("\n".join(["Settings:", *lines.values()]))
+        return "\n\n".join(sections)
 
 
 @dataclass(frozen=True)
@@ -201,7 +231,7 @@ class Command:
                 print(INTERRUPTED, file=sys.stderr)
                 sys.exit(128 + signal.SIGINT)
             # This import takes time, and only errors need it.
-            from train.system.user_errors import user_message
+            from train.user_errors import user_message
 
             sentence = explain(error, self.keys, sys.argv[1:]) or user_message(error)
             if sentence is None:
@@ -218,16 +248,6 @@ class Command:
         return self.help.format(self.compose(overrides))
 
 
-def require_current_folder() -> None:
-    """Raise InputError if the current folder was deleted, so that relative paths mean nothing."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        raise InputError(
-            f"the current folder cannot be used ({error.strerror}): change to another folder"
-        ) from error
-
-
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     """Compose the configuration of a command from the files of conf/ and from overrides."""
     # While a command runs, Hydra is initialized, and must not be initialized again.
@@ -237,99 +257,94 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
         return hydra.compose(name, list(overrides))
 
 
-def set_up_process() -> None:
-    """Set environment variables, warnings and output streams as all commands need them.
+def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
+    """Return the type annotation of each setting in a settings class and in its groups.
 
-    This must happen before torch is imported.
+    Keys are dotted, and groups have entries, too. Settings of any type that are shown as text have
+    the type `str`.
     """
-    # Hydra raises errors instead of printing them if this variable is set.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Threads of torch sleep while they wait if this variable is set. Otherwise they
-    # slow down other processes.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    reuse_freed_memory()
-    if Path(sys.argv[0]).stem.startswith(PREFIX):
-        # Child processes would import a file train.py of the current folder instead
-        # of this package if this variable were not set.
-        os.environ["PYTHONSAFEPATH"] = "1"
-    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-    warnings.simplefilter("once", UserWarning, append=True)
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            # Characters that the terminal cannot show are printed as escapes.
-            stream.reconfigure(errors="backslashreplace")
+    found: dict[str, Any] = {}
+    for name, hint in field_types(kind).items():
+        found[f"{prefix}{name}"] = str if facts_of(kind, name).is_text else hint
+        field_type = without_none(hint)
+        if is_dataclass(field_type):
+            found |= types_below(cast(type, field_type), f"{prefix}{name}.")
+    return found
 
 
-@contextmanager
-def exits_on_sigterm() -> Iterator[None]:
-    """Raise SystemExit if the signal SIGTERM comes during the block.
+def without_none(hint: Any) -> Any:
+    """Remove None from a type annotation: `int | None` becomes `int`.
 
-    Python's cleanup then runs, in which launchers end their child processes.
+    A union of several types with None stays as it is.
     """
-    previous_handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous_handler)
+    options = [option for option in get_args(hint) if option is not NoneType]
+    return options[0] if isinstance(hint, UnionType) and len(options) == 1 else hint
 
 
-def import_function(path: str) -> Callable[..., Any]:
-    """Import a function by its path "module:function"."""
-    module, _, name = path.partition(":")
-    is_torch_imported = "torch" in sys.modules
-    with _announced_if_slow(), _ended_by_ctrl_c():
-        function = getattr(import_module(module), name)
-    if not is_torch_imported:
-        skip_last_collection()
-    return cast(Callable[..., Any], function)
+def _choice_lines(groups: Sequence[str]) -> Iterator[str]:
+    """Yield the lines of --help about choices, such as "attack=lighting" and its explanation."""
+    for group in groups:
+        folder = CONF / group.partition("@")[0]
+        for path in sorted(folder.glob("*.yaml")):
+            yield _format_line(f"{group}={path.stem}", _first_comment(path))
 
 
-@contextmanager
-def _announced_if_slow() -> Iterator[None]:
-    """Print that libraries are being loaded if the block takes longer than IMPORT_DELAY."""
-    line = "loading PyTorch and other libraries ..."
-    timer = threading.Timer(IMPORT_DELAY, print, [line], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+def _first_comment(path: Path) -> str:
+    """Return the first sentence of the comment at the start of a file of conf/.
 
-
-@contextmanager
-def _ended_by_ctrl_c() -> Iterator[None]:
-    """End the process at once if Ctrl-C is pressed during the block.
-
-    Some modules catch KeyboardInterrupt while they are imported, and would continue.
+    The sentence explains the choice that the file stands for.
     """
-    # Python lets only the main thread set a handler.
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous_handler = signal.getsignal(signal.SIGINT)
-    # A job in the background of a shell ignores SIGINT, and must still do so.
-    if previous_handler is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _end_at_once)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous_handler)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comments = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
+    text = " ".join(line for line in comments if not line.startswith("@package"))
+    return text.partition(". ")[0].removesuffix(".")
 
 
-def _end_at_once(number: int, frame: object) -> None:
-    """Handle a signal: print a line and end the process without cleanup."""
-    os.write(2, f"{INTERRUPTED}\n".encode())
-    os._exit(128 + number)
+def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the line of --help about each setting in a configuration or in a group of it."""
+    kind = cast(type, OmegaConf.get_type(node))
+    values = cast(dict[str, Any], OmegaConf.to_container(node))
+    for name in field_types(kind):
+        key = f"{prefix}{name}"
+        child = node._get_node(name)
+        is_group = isinstance(child, DictConfig) and is_dataclass(OmegaConf.get_type(child))
+        if is_group and values[name] is not None:
+            yield key, _format_line(f"{key}.", facts_of(kind, name).about)
+            yield from _setting_lines(cast(DictConfig, child), f"{key}.")
+        else:
+            shown = f"{key}={_format_value(values[name])}"
+            yield key, _format_line(shown, format_facts(kind, name))
 
 
-def skip_last_collection() -> None:
-    """Exclude all present objects from garbage collection, so that Python exits faster.
+def _format_value(value: Any) -> str:
+    """Format the value of a setting as a user types it on the command line."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
-    At its exit, Python looks for reference cycles among all objects. This takes seconds after
-    PyTorch is imported, and a fifth of the time of --help.
+
+def format_facts(kind: type, name: str) -> str:
+    """Format the explanation of a setting with its choices, its unit and its range.
+
+    The text is such as "Weight decay. [≥ 0, ≤ 100000]".
     """
-    gc.freeze()
+    facts = facts_of(kind, name)
+    limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits]
+    notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
+    given = "; ".join(note for note in notes if note)
+    return f"{facts.about} [{given}]" if given else facts.about
+
+
+def _format_line(left: str, right: str) -> str:
+    """Format two columns. A long text on the left gets a line of its own above the right text."""
+    indent = " " * (KEY_WIDTH + 2)
+    wrapped = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = [indent + line for line in wrapped]
+    key = f"  {left}"
+    fits = len(key) <= KEY_WIDTH
+    if lines and fits:
+        lines[0] = key.ljust(len(indent)) + wrapped[0]
+    else:
+        lines.insert(0, key)
+    return "\n".join(lines)
 
 
 def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
@@ -490,17 +505,14 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
             return str(wrong)
         case ConfigKeyError() | ConfigAttributeError():
             return f"{key} is not a setting{place}: {_suggest(key, keys)}"
-        case OmegaConfBaseException():
-            return _explain_value(wrong, key, keys, place)
         case OverrideParseException():
             advice = "quote the value for Hydra, and the quotes for the shell"
             return f"{wrong.override} cannot be read: {advice}"
         case MissingConfigException() if wrong.missing_cfg_file:
             return _explain_choice(str(wrong.missing_cfg_file))
-        case HydraException():
-            return _first_line(wrong)
-        case OverflowError():
-            return _explain_overflow(words)
+        case OmegaConfBaseException() | HydraException():
+            text = _first_line(wrong)
+            return text if text.startswith(key) else f"{key}: {text}{place}"
         case AssertionError() | AttributeError():
             return _explain_null_group(keys, words)
     return None
@@ -522,33 +534,14 @@ def _first_line(error: BaseException) -> str:
 
 
 def _suggest(key: str, keys: Collection[str]) -> str:
-    """Suggest the key that is most similar to a wrong key, or --help if no key is similar."""
-    close = get_close_matches(key, keys, 1, 0.5)
+    """Suggest the key that is most similar to a wrong key, or --help if no key is similar.
+
+    A key of the same name in another group is the most similar one.
+    """
+    name = key.rpartition(".")[2]
+    moved = [known for known in keys if known.rpartition(".")[2] == name]
+    close = moved or get_close_matches(key, keys, 1, 0.5)
     return f"did you mean {close[0]}?" if close else "--help shows all settings"
-
-
-def _explain_value(
-    error: OmegaConfBaseException,
-    key: str,
-    keys: Mapping[str, Any],
-    place: str,
-) -> str:
-    """Explain the error of a value that does not have the type of its setting."""
-    hint = without_none(keys.get(key))
-    # The origin of list[str] is list.
-    kind = get_origin(hint) or hint
-    if kind in NOUNS:
-        value = getattr(error, "value", None)
-        shown = "null" if value is None else value
-        return f"{key}={shown} must be {NOUNS[kind]}{place}"
-    if is_dataclass(hint):
-        first_field = fields(cast(Any, hint))[0].name
-        example = f"{key}.{first_field}=..."
-        return f"{key} is a group of settings{place}: set one of them, such as {example}"
-    text = _first_line(error)
-    if key and key not in text:
-        text = f"{key}: {text}"
-    return f"{text}{place}"
 
 
 def _explain_choice(file: str) -> str:
@@ -556,15 +549,6 @@ def _explain_choice(file: str) -> str:
     group, _, choice = file.removesuffix(".yaml").rpartition("/")
     options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
     return f"{group}={choice} is not a choice: choose one of {', '.join(options)}"
-
-
-def _explain_overflow(words: Sequence[str]) -> str | None:
-    """Explain the error of the first whole number too large for a float. None if there is none."""
-    for word in words:
-        key, _, value = word.partition("=")
-        if value.lstrip("-").isdigit() and len(value) > MAX_DIGITS:
-            return f"{key} is too large: give a smaller number"
-    return None
 
 
 def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
@@ -581,31 +565,3 @@ def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | 
             if is_dataclass(without_none(hint)) and get_args(hint):
                 return f"{name} is null: choose it first, as --help shows"
     return None
-
-
-def program(name: str, as_called: bool = False) -> list[str]:
-    """Return the start of a command line that runs a command in the way of this process.
-
-    It is "pnb-NAME", or "python -m MODULE" if the package is not installed, after torchrun and its
-    options if that started this process. `as_called` gives full paths.
-    """
-    called = Path(sys.argv[0])
-    process_count = int(os.environ.get("WORLD_SIZE", "1"))
-    installed_name = f"{PREFIX}{name}"
-    is_installed = bool(sys.flags.safe_path) or called.stem.startswith(PREFIX)
-    python = sys.executable if as_called else "python"
-    if is_installed:
-        has_path = as_called and called.stem == installed_name
-        words = [str(called) if has_path else installed_name]
-    else:
-        words = ["-m", "train" if name == "train" else f"scripts.{name}"]
-    if process_count > 1:
-        torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
-        no_python = ["--no-python"] if is_installed else []
-        return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
-    return words if is_installed else [python, *words]
-
-
-def command_line(name: str) -> str:
-    """Return the command line of this process, as a user can type it again."""
-    return shlex.join([*program(name), *sys.argv[1:]])

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from train.system.memory import VARIABLES
+from train.system import VARIABLES
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only glibc has mallopt")
 
@@ -24,7 +24,7 @@ for _ in range(10):
     fill()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
-REUSE = "from train.system.memory import reuse_freed_memory\nreuse_freed_memory()\n"
+REUSE = "from train.system import reuse_freed_memory\nreuse_freed_memory()\n"
 
 
 def count_faults(code, **environment):

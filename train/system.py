@@ -1,0 +1,217 @@
+"""The process of a command: its start, signals, memory, verbosity and command line.
+
+This module imports neither torch nor NumPy, because --help would wait for them.
+"""
+
+import ctypes
+import gc
+import os
+import shlex
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, cast
+
+from renderer.errors import InputError
+
+INTERRUPTED = "ended by SIGINT"
+# The names of all installed commands begin with this text.
+PREFIX = "pnb-"
+# If an import takes more seconds than this, `import_function` prints a line about it.
+IMPORT_DELAY = 5.0
+# Options of the command line that ask for details.
+VERBOSE_FLAGS = frozenset({"--verbose", "-v"})
+# Environment variable that is set if commands print details.
+VERBOSE = "PNB_VERBOSE"
+# Largest number of lines about its result that a command prints without --verbose. Lines
+# with the paths of written files may follow.
+MAX_LINES = 12
+# Number of a parameter of the function mallopt of the C library glibc: free memory above
+# this number of bytes is returned to the system.
+M_TRIM_THRESHOLD = -1
+# Number of a parameter of mallopt: the memory of an array of at least this number of
+# bytes is returned to the system as soon as the array is freed.
+M_MMAP_THRESHOLD = -3
+# Environment variables with which a user can set these parameters.
+VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
+# Largest array in bytes whose memory is reused. For larger arrays, the time to get new
+# memory is small beside the time to fill it.
+LARGEST_REUSED = 2**30
+
+
+def take_flag(words: list[str]) -> list[str]:
+    """Remove --verbose and -v from a command line, and make the process verbose if one is there."""
+    others = [word for word in words if word not in VERBOSE_FLAGS]
+    if len(others) < len(words):
+        os.environ[VERBOSE] = "1"
+    return others
+
+
+def is_verbose() -> bool:
+    """Return whether commands of this process print details in addition to their result."""
+    return VERBOSE in os.environ
+
+
+def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
+    """Shorten a list of lines that a command prints, unless the command is verbose.
+
+    The last line says how many were left out.
+    """
+    if is_verbose() or len(lines) <= limit:
+        return list(lines)
+    kept = limit - 1
+    return [*lines[:kept], f"... {len(lines) - kept} more lines: -v shows them"]
+
+
+def require_current_folder() -> None:
+    """Raise InputError if the current folder was deleted, so that relative paths mean nothing."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            f"the current folder cannot be used ({error.strerror}): change to another folder"
+        ) from error
+
+
+def set_up_process() -> None:
+    """Set environment variables, warnings and output streams as all commands need them.
+
+    This must happen before torch is imported.
+    """
+    # Hydra raises errors instead of printing them if this variable is set.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    # Threads of torch sleep while they wait if this variable is set. Otherwise they
+    # slow down other processes.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    reuse_freed_memory()
+    if Path(sys.argv[0]).stem.startswith(PREFIX):
+        # Child processes would import a file train.py of the current folder instead
+        # of this package if this variable were not set.
+        os.environ["PYTHONSAFEPATH"] = "1"
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    warnings.simplefilter("once", UserWarning, append=True)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            # Characters that the terminal cannot show are printed as escapes.
+            stream.reconfigure(errors="backslashreplace")
+
+
+def reuse_freed_memory() -> None:
+    """Make the C library reuse the memory of large arrays instead of returning it to the system.
+
+    By default, glibc returns the memory of an array above 32 MB when the array is
+    freed. For the next array, Linux fills new memory with zeros, which takes
+    longer than a depthwise convolution. Nothing changes if the user has set one
+    of the environment variables VARIABLES, or if the C library is another one.
+    """
+    if sys.platform != "linux" or any(name in os.environ for name in VARIABLES):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, LARGEST_REUSED)
+        mallopt(M_TRIM_THRESHOLD, LARGEST_REUSED)
+
+
+@contextmanager
+def exits_on_sigterm() -> Iterator[None]:
+    """Raise SystemExit if the signal SIGTERM comes during the block.
+
+    Python's cleanup then runs, in which launchers end their child processes.
+    """
+    previous_handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous_handler)
+
+
+def import_function(path: str) -> Callable[..., Any]:
+    """Import a function by its path "module:function"."""
+    module, _, name = path.partition(":")
+    is_torch_imported = "torch" in sys.modules
+    with _announced_if_slow(), _ended_by_ctrl_c():
+        function = getattr(import_module(module), name)
+    if not is_torch_imported:
+        skip_last_collection()
+    return cast(Callable[..., Any], function)
+
+
+@contextmanager
+def _announced_if_slow() -> Iterator[None]:
+    """Print that libraries are being loaded if the block takes longer than IMPORT_DELAY."""
+    line = "loading PyTorch and other libraries ..."
+    timer = threading.Timer(IMPORT_DELAY, print, [line], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _ended_by_ctrl_c() -> Iterator[None]:
+    """End the process at once if Ctrl-C is pressed during the block.
+
+    Some modules catch KeyboardInterrupt while they are imported, and would continue.
+    """
+    # Python lets only the main thread set a handler.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous_handler = signal.getsignal(signal.SIGINT)
+    # A job in the background of a shell ignores SIGINT, and must still do so.
+    if previous_handler is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end_at_once)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous_handler)
+
+
+def _end_at_once(number: int, frame: object) -> None:
+    """Handle a signal: print a line and end the process without cleanup."""
+    os.write(2, f"{INTERRUPTED}\n".encode())
+    os._exit(128 + number)
+
+
+def skip_last_collection() -> None:
+    """Exclude all present objects from garbage collection, so that Python exits faster.
+
+    At its exit, Python looks for reference cycles among all objects. This takes seconds after
+    PyTorch is imported, and a fifth of the time of --help.
+    """
+    gc.freeze()
+
+
+def program(name: str, as_called: bool = False) -> list[str]:
+    """Return the start of a command line that runs a command in the way of this process.
+
+    It is "pnb-NAME", or "python -m MODULE" if the package is not installed, after torchrun and its
+    options if that started this process. `as_called` gives full paths.
+    """
+    called = Path(sys.argv[0])
+    process_count = int(os.environ.get("WORLD_SIZE", "1"))
+    installed_name = f"{PREFIX}{name}"
+    is_installed = bool(sys.flags.safe_path) or called.stem.startswith(PREFIX)
+    python = sys.executable if as_called else "python"
+    if is_installed:
+        has_path = as_called and called.stem == installed_name
+        words = [str(called) if has_path else installed_name]
+    else:
+        words = ["-m", "train" if name == "train" else f"scripts.{name}"]
+    if process_count > 1:
+        torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
+        no_python = ["--no-python"] if is_installed else []
+        return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
+    return words if is_installed else [python, *words]
+
+
+def command_line(name: str) -> str:
+    """Return the command line of this process, as a user can type it again."""
+    return shlex.join([*program(name), *sys.argv[1:]])

@@ -1,1 +1,0 @@
-"""The machine: devices, processes, and errors that a user can fix."""
