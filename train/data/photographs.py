@@ -161,7 +161,9 @@ def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
     return sorted(name for name in classes if composed(name) in names)
 
 
-def choose_labels(folder: Path, classes: Sequence[str], label: Label | None) -> list[str]:
+def choose_labels(
+    folder: Path, classes: Sequence[str], label: str | int | Sequence[str | int] | None
+) -> list[str]:
     """Choose the positive classes, on whose photographs recall is measured.
 
     None chooses all classes of the network that have a sub-folder.
