@@ -13,8 +13,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks.common import Row, write_csv
-from train.results.epoch_metrics import attack_success
-from train.run_folder import read_metrics
+from train.run_folder import attack_success, read_metrics
 
 # Measures of a round of attacks, with the titles of their axes.
 MEASURES = {

@@ -33,12 +33,13 @@ from train.auditing import page
 from train.auditing.lights import (
     KINDS,
     QUERIES,
+    PlainViews,
     Views,
+    find_plain_views,
     recognize_in_environments,
     success_by_light,
     transfer_success,
 )
-from train.auditing.plain_light import PlainViews, find_plain_views
 from train.auditing.relit import (
     RELIT_FOLDER,
     measure_photographs,

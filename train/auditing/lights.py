@@ -5,8 +5,9 @@ of the size that each classifier takes. No lighting has negative radiance in any
 direction.
 """
 
+import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from torch import Tensor
 from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
 from augment.attacks.attack import attack
 from augment.attacks.checks import success_by_radius
+from augment.attacks.find_scene import EXPOSURES
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions
@@ -39,10 +41,10 @@ from renderer.image import to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
-from renderer.light.presets import load_light, perturb
+from renderer.light.presets import UNIFORM, load_light, perturb
+from renderer.rendering import light_sphere
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizer import choose
-from train.auditing.frames import SIDE, frames_of
 
 # Number of images that a classifier classifies in one pass.
 BATCH = 16
@@ -73,6 +75,21 @@ ADDITIONAL_STEPS = 20
 STEPS_PER_RADIUS = 4
 # The background of the views is medium gray, in sRGB.
 BACKGROUND = 0.5
+
+# Names of the plain lights that are tried: an environment map, and uniform light.
+PLAIN_LIGHTS = (LIGHT, UNIFORM)
+# The objects are scaled by each of these factors.
+SIZES = (1.0, 0.75, 1.2)
+# The search ends as soon as this fraction of the views is recognized.
+ENOUGH = 0.75
+# Number of positions of the slider, from the natural to the attacked light.
+FRAME_COUNT = 21
+# Number of classes whose probabilities are shown beside the slider.
+CLASS_COUNT = 5
+# Width and height of the image of the object, in pixels.
+SIDE = 200
+# Width and height of the image of a white ball, which shows the light, in pixels.
+BALL_SIDE = 120
 
 
 class LightKind(NamedTuple):
@@ -356,3 +373,119 @@ class _TransferTest:
         is_fooled_without_noise = self.objective.criterion.reached(predicted)
         masks = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
         return [int(mask.sum()) for mask in masks]
+
+
+def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
+    """Render an example in lights between the start and the end of an attack.
+
+    Frame i of n has the light start + i / (n - 1) · (end - start). If the attack may use two
+    lights, it may use all lights between them, too. "classes" are the right class and the
+    CLASS_COUNT - 1 most probable others. Each of "frames" has "image", "ball" (a white ball in the
+    same light), both JPEG in base64, and "probabilities" of these classes.
+    """
+    start = result.problem.start[example]
+    end = result.descent.values[example]
+    weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
+    values = start + weights * (end - start)
+    examples = torch.full((FRAME_COUNT,), example, device=start.device)
+    with torch.no_grad():
+        images = result.problem.render(values, examples)
+        conditions = result.problem.conditions(values, examples)
+        logits = result.objective().logits(images)[:, 0]
+    probabilities = logits.softmax(1).cpu()
+    label = int(result.criterion.source[example, 0])
+    highest_probability = probabilities.amax(dim=0)
+    ranked = highest_probability.argsort(descending=True).tolist()
+    other_classes = [index for index in ranked if index != label]
+    shown_classes = [label, *other_classes][:CLASS_COUNT]
+    frames = []
+    for index in range(FRAME_COUNT):
+        basis = result.problem.scene.basis_under(conditions, index)
+        ball = light_sphere(conditions.light[index], BALL_SIDE, basis=basis)
+        shown_probabilities = probabilities[index, shown_classes].tolist()
+        frames.append(
+            {
+                "image": _encode_jpeg(images[index, 0], SIDE),
+                "ball": _encode_jpeg(ball, BALL_SIDE),
+                "probabilities": [round(value, 4) for value in shown_probabilities],
+            }
+        )
+    names = [result.classifier.classes[index] for index in shown_classes]
+    return {"classes": names, "label": names[0], "frames": frames}
+
+
+def _encode_jpeg(image: Float[Tensor, "3 H W"], side: int) -> str:
+    """Resize an image in [0, 1] to a square, and encode it as a JPEG file in base64."""
+    pixels = to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy()
+    file = io.BytesIO()
+    Image.fromarray(pixels).resize((side, side)).save(file, "JPEG", quality=85)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+@dataclass(frozen=True)
+class PlainViews:
+    """Lighting and size at which a classifier recognizes most views in plain light.
+
+    Attributes:
+        light: Name of the environment lighting.
+        exposure: Factor by which this lighting is multiplied.
+        size: Factor by which the objects are scaled.
+        recognized: Number of views that are classified correctly.
+        n: Number of views.
+        recognized_as_given: Number of views that are classified correctly
+            before the search, with an exposure and a size of 1.
+    """
+
+    light: str
+    exposure: float
+    size: float
+    recognized: int
+    n: int
+    recognized_as_given: int
+
+    def apply_to(self, views: Views) -> Views:
+        """Return a copy of views with the light, the exposure and the size of this result."""
+        return replace(views, light=self.light, exposure=self.exposure, size=self.size)
+
+
+def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
+    """Find the plain light, exposure and size at which a classifier recognizes most views.
+
+    All combinations are tried, until one is found at which the classifier recognizes a fraction of
+    ENOUGH. If no view is ever recognized, the first combination is returned.
+    """
+    best: PlainViews | None = None
+    candidates = list(_candidates(views))
+    for candidate in progress(candidates, "search for plain light"):
+        recognized = _count_recognized(classifier, candidate)
+        if best is None or recognized > best.recognized:
+            best = PlainViews(
+                light=candidate.light,
+                exposure=candidate.exposure,
+                size=candidate.size,
+                recognized=recognized,
+                n=views.count,
+                recognized_as_given=recognized if best is None else best.recognized_as_given,
+            )
+        if best.recognized >= ENOUGH * views.count:
+            break
+    assert best is not None
+    return best
+
+
+def _candidates(views: Views) -> Iterator[Views]:
+    """Yield a copy of views for each combination of size, exposure and plain light."""
+    for size in SIZES:
+        for exposure in EXPOSURES:
+            for light in PLAIN_LIGHTS:
+                yield replace(views, light=light, exposure=exposure, size=size)
+
+
+def _count_recognized(classifier: Classifier, views: Views) -> int:
+    """Render views in their own light, and count those that are classified correctly."""
+    scene = views.scene(classifier.size)
+    light = load_light(views.light).to(scene.lights) * views.exposure
+    examples = torch.arange(views.count, device=views.device)
+    with torch.no_grad():
+        images = scene.render(Conditions(light.expand(len(scene), -1, -1)), examples)
+    return int(is_correct(classifier, scene, images).sum())

@@ -14,8 +14,7 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
-from train.auditing.plain_light import PlainViews
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS, PlainViews
 from train.auditing.relit import relit_sections
 from train.auditing.remedies import (
     CLASSIFIER,
@@ -32,7 +31,7 @@ from train.auditing.screen import (
     screen_of_one,
     withstood_sentence,
 )
-from train.results import compare, plots, store
+from train.results import compare, store
 from train.results.first_screen import (
     NETWORKS,
     Compared,
@@ -44,7 +43,7 @@ from train.results.first_screen import (
 )
 from train.results.metrics import Metrics, Units, leave_out, weighted_means
 from train.results.page import scores_section, write_page
-from train.results.plots import Picture
+from train.results.pictures import Picture, encode_picture
 from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
 from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
@@ -483,4 +482,4 @@ def _draw_image(folders: Mapping[str, Path], scored: Predictions, item: _ScoredI
         texts.append(f"{network}: {describe_prediction(prediction).text}")
     caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
     image = Image.fromarray(read_square(folders[item.images] / photograph.path, SIDE))
-    return plots.encoded(image, caption, caption)
+    return encode_picture(image, caption, caption)

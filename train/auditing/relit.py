@@ -13,10 +13,9 @@ from augment.attack_settings import RelightingSettings
 from augment.network import Classifier
 from augment.photographs import ADVERSARIAL, RANDOM, SLIDE
 from train.command_settings import AuditSettings
-from train.results import plots
 from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.page import write_page
-from train.results.plots import Picture
+from train.results.pictures import Picture, read_pictures
 from train.results.relit import (
     MODELED,
     TITLES,
@@ -173,7 +172,7 @@ def _section(name: str, folder: Path) -> RelitSection:
     pictures: list[Picture] = []
     for index, file in scores.pictures.items():
         caption = _caption(scores.photographs[index])
-        pictures += plots.from_file(folder / file, caption, MAX_PICTURE_WIDTH, caption)
+        pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
     tables = [scores.summary_table(), scores.class_table()]
     return RelitSection(name, tables, pictures, sentences)
 

@@ -9,9 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from train.auditing.lights import KINDS, LightKind
-from train.auditing.plain_light import PlainViews
-from train.results import plots
+from train.auditing.lights import KINDS, LightKind, PlainViews
 from train.results.first_screen import (
     ComparedImage,
     FirstScreen,
@@ -19,6 +17,7 @@ from train.results.first_screen import (
     ShownPrediction,
 )
 from train.results.metrics import Pool
+from train.results.pictures import Picture, plot_by_radius, read_pictures
 from train.results.tables import Estimate, fraction, join_words
 from train.settings import in_words
 
@@ -136,7 +135,7 @@ def attack_pictures(folder: Path, counts: Counts) -> list[ComparedImage]:
             continue
         path = folder / f"{kind}.png"
         alt_text = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
-        for picture in plots.from_file(path, alt_text, PAIR_WIDTH):
+        for picture in read_pictures(path, alt_text, PAIR_WIDTH):
             lost = f"{counts[kind]['adversarial'][-1]} of {counts[kind]['correct']} views lost"
             caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
             compared.append(ComparedImage(picture, caption, *answers))
@@ -170,7 +169,7 @@ def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
     ]
 
 
-def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
+def charts(counts_by_network: Mapping[str, Counts]) -> list[Picture]:
     """Plot the fraction of recognized views against the radius of attacks.
 
     Each network has a line for the attack and one for random draws, unless it recognizes no view
@@ -200,6 +199,6 @@ def _remaining(attack_counts: Mapping[str, Any], method: str) -> list[Estimate]:
     return [fraction(correct - count, correct) for count in misclassified_by_radius]
 
 
-def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> plots.Picture:
+def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> Picture:
     """Plot fractions of recognized views against the radius of attacks on one kind of lighting."""
-    return plots.by_radius(lines, (0, *light.radii), light.title, f"radius ({light.unit})")
+    return plot_by_radius(lines, (0, *light.radii), light.title, f"radius ({light.unit})")

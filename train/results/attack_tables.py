@@ -15,7 +15,7 @@ from torch import Tensor
 from augment.attacks.checks import warnings
 from augment.attacks.result import AttackResult
 from renderer.io.files import atomic_write
-from train.results.plots import COLORS
+from train.results.pictures import COLORS
 from train.results.tables import Proportion, Table, format_fraction, fraction
 
 if TYPE_CHECKING:

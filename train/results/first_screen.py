@@ -13,8 +13,8 @@ from PIL import Image
 
 from renderer.io.images import read_square
 from train.data.photographs import DESCRIPTION
-from train.results import compare, plots
-from train.results.plots import Picture
+from train.results import compare
+from train.results.pictures import Picture, encode_picture
 from train.results.predictions import Prediction
 from train.results.tables import Estimate, Table, describe_intervals, join_words
 from train.settings import in_words
@@ -491,7 +491,7 @@ def _draw_image(pair: Pair, images: Path) -> ComparedImage:
     hardened = describe_prediction(pair[1])
     alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
     pixels = Image.fromarray(read_square(images / photograph.path, SIDE))
-    return ComparedImage(plots.encoded(pixels, alt), subject, original, hardened)
+    return ComparedImage(encode_picture(pixels, alt), subject, original, hardened)
 
 
 def describe_prediction(prediction: Prediction) -> ShownPrediction:

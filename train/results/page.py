@@ -19,8 +19,7 @@ from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.laboratory.kept_aside import can_be_generated
-from train.results import compare, plots, store
-from train.results.epoch_metrics import attack_success
+from train.results import compare, store
 from train.results.first_screen import (
     NETWORKS,
     Compared,
@@ -30,9 +29,15 @@ from train.results.first_screen import (
     describe_place,
     is_laboratory,
 )
-from train.results.plots import Picture
+from train.results.pictures import (
+    Picture,
+    Points,
+    evenly_spaced,
+    plot_curves,
+    plot_roc,
+    read_pictures,
+)
 from train.results.predictions import CONTACT_SHEET
-from train.results.sheet import evenly_spaced
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import (
     Table,
@@ -43,7 +48,7 @@ from train.results.tables import (
     join_words,
 )
 from train.run_config import CONFIG, read_config
-from train.run_folder import RENDERS
+from train.run_folder import RENDERS, attack_success
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
 from train.user_errors import user_message
 
@@ -236,17 +241,17 @@ def _plot_metrics(methods: Epochs) -> list[Picture]:
     pictures = []
     for name, title in CURVES.items():
         # Each run of a method has a line, which is a list of pairs (epoch, metric).
-        lines: dict[str, list[plots.Points]] = {}
+        lines: dict[str, list[Points]] = {}
         for method, runs in methods.items():
             lines[method] = []
             for run in runs:
                 lines[method].append([(epoch["epoch"], epoch.get(name)) for epoch in run])
-        pictures.append(plots.curves(lines, title))
+        pictures.append(plot_curves(lines, title))
     rates = {}
     for method, runs in methods.items():
         rates[method] = [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
     title = "attack success on clean-correct renders"
-    pictures.append(plots.curves(rates, title, "round of renders"))
+    pictures.append(plot_curves(rates, title, "round of renders"))
     return [picture for picture in pictures if picture is not None]
 
 
@@ -278,7 +283,7 @@ def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
     pictures = []
     for epoch in evenly_spaced(sorted(path_of_epoch), SHOWN_EPOCHS):
         alt = f"{title}, epoch {epoch}, {run.method}"
-        pictures += plots.from_file(path_of_epoch[epoch], alt, GRID_WIDTH, f"epoch {epoch}")
+        pictures += read_pictures(path_of_epoch[epoch], alt, GRID_WIDTH, f"epoch {epoch}")
     return pictures
 
 
@@ -449,7 +454,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     for method, scored_runs in group.items():
         path = scored_runs[0].folder / CONTACT_SHEET
         alt = f"predictions of {method} on {title}"
-        sheets[method] = plots.from_file(path, alt, SHEET_WIDTH)
+        sheets[method] = read_pictures(path, alt, SHEET_WIDTH)
     tables = [store.score_table("", group)]
     rocs: list[Picture | None] = []
     problem = ""
@@ -486,7 +491,7 @@ def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None
             scores[method] = [
                 pool_of.scores for item in evaluations if (pool_of := item.find(subset))
             ]
-        pictures.append(plots.roc(scores, f"{pool.label}, {name}"))
+        pictures.append(plot_roc(scores, f"{pool.label}, {name}"))
     return pictures
 
 
@@ -507,7 +512,7 @@ def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
         alt = f"{title}; before, after, their difference and the lights; "
         alt += f"predicted {row.before}, then {row.after}"
         path = attack.folder / f"example_{row.number:03d}.png"
-        images[title] = plots.from_file(path, alt, SHEET_WIDTH)
+        images[title] = read_pictures(path, alt, SHEET_WIDTH)
     # The folder of an attack may have no config.yaml.
     config: Mapping[str, Any] = {}
     with suppress(InputError):

@@ -30,7 +30,7 @@ from renderer.io.images import write_image
 from renderer.short_repr import ShortRepr
 from train.data.photo import Photograph
 from train.data.photographs import find_unlabeled, load_photographs
-from train.results.sheet import evenly_spaced
+from train.results.pictures import evenly_spaced
 from train.results.tables import Proportion, Table, format_fraction, fraction
 from train.run_folder import read_json
 

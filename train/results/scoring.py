@@ -59,6 +59,7 @@ from train.results.metrics import (
     thresholds,
     within_rank,
 )
+from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import (
     CONTACT_SHEET,
     PREDICTIONS,
@@ -66,7 +67,6 @@ from train.results.predictions import (
     Prediction,
     write_predictions,
 )
-from train.results.sheet import contact_sheet, write_roc
 from train.results.tables import (
     Estimate,
     Proportion,

@@ -31,8 +31,7 @@ from train.data.batches import Batch, Round, TrainingImages, rounds_of_epoch, tr
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.processes import SignalHandler, all_reduce_sum
-from train.results.epoch_metrics import epoch_metrics, format_epoch
-from train.run_folder import PHASES
+from train.run_folder import PHASES, epoch_metrics, format_epoch
 from train.settings import TrainSettings
 from train.training.averages import Averages
 from train.training.recipe import set_training_mode

@@ -19,9 +19,15 @@ from renderer.light.basis import parts_of
 from renderer.light.presets import load_light
 from train.auditing import audit, lights, page
 from train.auditing.audit import run_audit
-from train.auditing.frames import frames_of
-from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
-from train.auditing.plain_light import find_plain_views
+from train.auditing.lights import (
+    KINDS,
+    Views,
+    adversaries,
+    find_plain_views,
+    frames_of,
+    success_by_light,
+    transfer_success,
+)
 from train.auditing.screen import withstood_sentence
 from train.command_settings import AuditSettings
 from train.laboratory import lab_patterns as patterns

@@ -2,7 +2,7 @@
 
 import pytest
 
-from train.results.epoch_metrics import attack_success
+from train.run_folder import attack_success
 
 
 def test_attack_success_is_the_fraction_of_the_clean_correct_examples():

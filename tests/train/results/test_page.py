@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from renderer.errors import InputError
-from train.results import plots
 from train.results.compare import format_comparison, format_short_comparison, format_table
 from train.results.page import report_of, write_report
+from train.results.pictures import plot_curves
 from train.results.store import summarize
 from train.run_config import write_config
 from train.run_folder import locked
@@ -176,8 +176,8 @@ def test_a_page_shows_once_the_command_of_a_run(page):
 
 
 def test_a_figure_is_drawn_if_a_line_has_different_points():
-    assert plots.curves({"a": [[(1, 0.5)]], "b": [[(1, 1), (2, 1)]]}, "x") is None
-    assert plots.curves({"a": [[(1, 0.5)]], "b": [[(1, 0), (2, 1)]]}, "x") is not None
+    assert plot_curves({"a": [[(1, 0.5)]], "b": [[(1, 1), (2, 1)]]}, "x") is None
+    assert plot_curves({"a": [[(1, 0.5)]], "b": [[(1, 0), (2, 1)]]}, "x") is not None
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
@@ -203,7 +203,7 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
     tmp_path,
     monkeypatch,
 ):
-    monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
+    monkeypatch.setattr(page, "plot_curves", lambda *_: 1 / 0)
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback")
     assert last.startswith("ZeroDivisionError")

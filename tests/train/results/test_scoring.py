@@ -15,6 +15,7 @@ from scipy.special import logsumexp, softmax
 from renderer.errors import InputError
 from train.data.photo import Photograph
 from train.results.metrics import AT_THRESHOLD, METRICS
+from train.results.pictures import FRAME_WIDTH, IMAGE_SIZE
 from train.results.predictions import Prediction, read_predictions, write_predictions
 from train.results.scoring import (
     Predictor,
@@ -27,7 +28,6 @@ from train.results.scoring import (
     score,
     write,
 )
-from train.results.sheet import FRAME_WIDTH, IMAGE_SIZE
 from train.results.tables import THESE_OBJECTS, fraction
 
 

@@ -1,19 +1,23 @@
-"""Images of a report: plots as SVG for light and dark pages, and small images."""
+"""Pictures of results: plots as SVG for light and dark pages, contact sheets and ROC curves."""
 
 import base64
+import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Int
-from PIL import Image
+from PIL import Image, ImageOps
+from torch import Tensor
 
+from renderer.io.files import atomic_write
 from renderer.io.images import open_image
-from train.results.metrics import auc_and_recalls
-from train.results.sheet import Pair, draw_roc
+from renderer.io.tiles import PAPER, Tile, draw_grid
+from train.results.metrics import RATES, auc_and_recalls, roc_curve
+from train.results.predictions import ROC_FIGURE, ROC_TABLE, Prediction, by_label
 from train.results.tables import Estimate
 
 if TYPE_CHECKING:
@@ -28,7 +32,7 @@ MARKERS = "osD^vP"
 # The size of a plot in inches, and its width on the page in CSS pixels.
 SIZE = (4.4, 3.3)
 WIDTH = 440
-# `encoded` writes images of at most this many pixels per side as PNG, and larger
+# `encode_picture` writes images of at most this many pixels per side as PNG, and larger
 # ones as JPEG.
 SMALL = 192
 # Lines with fewer points than this have a marker at each point.
@@ -56,6 +60,30 @@ PLOT = {
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
+# Each section of the contact sheet, such as the false positives, shows at most 40
+# photographs.
+MAX_IMAGES = 40
+# Each row of the contact sheet has 10 photographs.
+COLUMNS = 10
+# Width and height of a photograph on the contact sheet, in pixels.
+IMAGE_SIZE = 96
+# Width of the colored frame around a photograph, in pixels.
+FRAME_WIDTH = 4
+# A caption with more characters is cut off.
+MAX_CAPTION_LENGTH = 18
+LEGEND = (
+    "Under each image: the predicted class and its probability. "
+    "If the prediction is wrong, the true class follows in gray."
+)
+# Colors of the frames: true positives, false negatives and false positives.
+GREEN = "#2e9e5b"
+RED = "#d03b3b"
+YELLOW = "#e8a317"
+
+Item = TypeVar("Item")
+# Data of one ROC curve: the log-odds of the positives, shape (n,), and of the
+# negatives, shape (m,).
+Pair = tuple[np.ndarray, np.ndarray]
 # Points of a line: pairs of x and y. None stands for an unknown y.
 Points = Sequence[tuple[float, float | None]]
 
@@ -89,7 +117,7 @@ def style(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(
+def plot_curves(
     methods: Mapping[str, Sequence[Points]],
     title: str,
     x_title: str = "epoch",
@@ -137,7 +165,7 @@ def _draw_curves(
     axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
 
-def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
+def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     """Plot ROC curves, with a curve for each seed of each method.
 
     A pair has the scores of the positive and of the negative images of a seed. None if no seed has
@@ -165,7 +193,7 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     return _plot(lambda axes: draw_roc(axes, known, styles), f"ROC: {label}", alt)
 
 
-def by_radius(
+def plot_by_radius(
     lines: Mapping[str, Sequence[Estimate]],
     radii: Sequence[float],
     title: str,
@@ -245,7 +273,7 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
     return Picture(page.encode(), "svg+xml", alt, WIDTH, title)
 
 
-def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
+def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
     """Encode an image for a page: a small image as PNG, a larger one as JPEG."""
     file = io.BytesIO()
     if max(image.size) <= SMALL:
@@ -255,7 +283,7 @@ def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
     return Picture(file.getvalue(), "jpeg", alt, image.width, caption)
 
 
-def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
+def read_pictures(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
     """Read an image from a file, and encode it for a page.
 
     A wider image is reduced to `widest` pixels. The list is empty if the file is missing or
@@ -267,4 +295,156 @@ def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Pict
     except Exception:  # Pillow raises errors of many types for a damaged file.
         return []
     pixels.thumbnail((widest, 4 * widest))
-    return [encoded(pixels, alt, caption)]
+    return [encode_picture(pixels, alt, caption)]
+
+
+def contact_sheet(predictions: Sequence[Prediction], images: Tensor) -> Image.Image:
+    """Draw a contact sheet of right and wrong predictions for each positive class.
+
+    Each positive class has three sections: true positives, false negatives and
+    false positives. A section has at most MAX_IMAGES images. If there are more,
+    it shows images at equal distances in the order of probability. The images are enlarged without
+    smoothing, so that pixels stay visible.
+    """
+    grids = [draw_grid([], heading=LEGEND)]
+    for label, of_label in by_label(predictions).items():
+        shown = sorted(zip(of_label, images, strict=True), key=lambda pair: -pair[0].probability)
+        positives = [pair for pair in shown if pair[0].positive]
+        negatives = [pair for pair in shown if not pair[0].positive]
+        found = [pair for pair in positives if pair[0].predicted == label]
+        missed = [pair for pair in positives if pair[0].predicted != label]
+        mistaken = [pair for pair in negatives if pair[0].predicted == label]
+        sections = {
+            "true positives": (GREEN, found, positives),
+            "false negatives": (RED, missed, positives),
+            "false positives": (YELLOW, mistaken, negatives),
+        }
+        for name, (color, pairs, all_of_kind) in sections.items():
+            heading = f"{label}: {len(pairs)} {name} of {len(all_of_kind)}"
+            grids.append(_draw_section(heading, color, pairs))
+    width = max(grid.width for grid in grids)
+    sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
+    top = 0
+    for grid in grids:
+        sheet.paste(grid, (0, top))
+        top += grid.height
+    return sheet
+
+
+def _draw_section(
+    heading: str, color: str, shown: Sequence[tuple[Prediction, Tensor]]
+) -> Image.Image:
+    """Draw images with frames of a color in a grid below a heading."""
+    if len(shown) > MAX_IMAGES:
+        heading += f" ({MAX_IMAGES} shown, evenly by probability)"
+    tiles = [_tile(*pair, color) for pair in evenly_spaced(shown, MAX_IMAGES)]
+    rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
+    return draw_grid(rows, heading=heading)
+
+
+def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
+    """Choose items of a list at equal distances, including the first and the last one.
+
+    All, if there are at most `count`.
+    """
+    indices = np.linspace(0, len(items) - 1, min(count, len(items)))
+    return [items[index] for index in indices.round().astype(int)]
+
+
+def _tile(prediction: Prediction, image: Tensor, color: str) -> Tile:
+    """Enlarge an image, and add a colored frame and captions.
+
+    The first caption is the predicted class with its probability. If the
+    prediction is wrong, the second caption is the true class.
+    """
+    pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
+    enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
+    lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
+    if prediction.true_rank != 1:
+        label = prediction.photograph.label
+        probability = prediction.true_probability
+        lines.append(label if probability is None else f"{probability:.0%} {label}")
+    captions = tuple(_shortened(line) for line in lines)
+    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME_WIDTH, color)), captions)
+
+
+def _shortened(caption: str) -> str:
+    """Cut off the end of a caption that is too long, and add "…"."""
+    if len(caption) <= MAX_CAPTION_LENGTH:
+        return caption
+    return f"{caption[: MAX_CAPTION_LENGTH - 1]}…"
+
+
+def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
+    """Write ROC curves to the table roc.csv and to the figure roc.png.
+
+    There is a curve for all images, and one for each source or label. A curve
+    is left out if it lacks positives or negatives. A pair has the log-odds of positives and of
+    negatives.
+    """
+    # This import is here because it takes half a second.
+    from matplotlib.figure import Figure
+
+    # `all(map(len, pair))` is True if there are both positives and negatives.
+    known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
+    has_overall = all(map(len, overall))
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
+    if has_overall:
+        writer.writerows(_curve_rows("", overall))
+    for name, pair in known.items():
+        writer.writerows(_curve_rows(name, pair))
+    atomic_write(folder / ROC_TABLE, table.getvalue())
+
+    figure = Figure(figsize=(7, 7), layout="constrained")
+    axes = figure.subplots()
+    # A source or a label can have the name "all", too.
+    title = "all images" if "all" in known else "all"
+    curves = {title: [overall]} if has_overall else {}
+    curves |= {name: [pair] for name, pair in known.items()}
+    bold = {title: {"color": "black", "linewidth": 2.5, "zorder": 3}}
+    draw_roc(axes, curves, bold)
+    axes.set_title(f"ROC: {label}")
+    axes.set_aspect("equal")
+    if curves:
+        axes.legend(loc="lower right")
+    image = io.BytesIO()
+    figure.savefig(image)
+    atomic_write(folder / ROC_FIGURE, image.getbuffer())
+
+
+def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
+    """Make a row of roc.csv for each point of a ROC curve.
+
+    A row has the name (empty for all images), false-positive rate, recall and threshold.
+    """
+    points = zip(*roc_curve(*pair), strict=True)
+    return [(name, *map(float, point)) for point in points]
+
+
+def draw_roc(
+    axes: "Axes",
+    scores: Mapping[str, Sequence[Pair]],
+    styles: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Draw ROC curves, with the AUC in the legend.
+
+    Dotted vertical lines mark the false-positive rates in `RATES`. `scores` has pairs of log-odds
+    of positives and negatives. Several runs have a curve each in one style, and their mean AUC in
+    the legend.
+    """
+    # The ROC curve of a random classifier is the diagonal.
+    axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
+    for rate in map(float, RATES):
+        axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
+    for name, pairs in scores.items():
+        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
+        legend: str | None = f"{name}: AUC {np.mean(areas):.3f}" if areas else None
+        for pair in pairs:
+            rates, recalls, _ = roc_curve(*pair)
+            axes.plot(rates, recalls, label=legend, **styles.get(name, {}))
+            # Further curves of the same name have no entry in the legend.
+            legend = None
+    axes.set(xlabel="false positive rate", ylabel="recall")
+    axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))
