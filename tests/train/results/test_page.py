@@ -203,7 +203,7 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
     tmp_path,
     monkeypatch,
 ):
-    monkeypatch.setattr(page, "plot_curves", lambda *_: 1 / 0)
+    monkeypatch.setattr("train.results.page.plot_curves", lambda *_: 1 / 0)
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback")
     assert last.startswith("ZeroDivisionError")
