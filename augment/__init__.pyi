@@ -19,8 +19,8 @@ from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
 from augment.projected_light import relight_photographs as relight_photographs
 from augment.scene.build import build_scene as build_scene
-from augment.scene.conditions import Conditions as Conditions
-from augment.scene.conditions import Example as Example
+from augment.scene.objects import Conditions as Conditions
+from augment.scene.objects import Example as Example
 from augment.scene.objects import SceneObject as SceneObject
 from augment.scene.scene import Scene as Scene
 from augment.service import AugmentationService as AugmentationService

@@ -21,8 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from augment.random_streams import generator
-from augment.scene.patterns import luminance
-from augment.scene.slides import draw_slides, interpolate_smoothly
+from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed

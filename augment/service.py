@@ -26,11 +26,10 @@ from augment.losses import NO_CLASS, is_correct, label_loss, require_known
 from augment.network import NetworkCall, compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
-from augment.scene.build import MeshSource, build_scene
-from augment.scene.conditions import Conditions
-from augment.scene.degree import with_needed_degree
+from augment.scene.build import MeshSource, build_scene, with_needed_degree
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
-from augment.scene.variation import vary
+from augment.scene.vary import vary
 from augment.settings import AugmentationSettings
 from renderer.errors import InputError, describe
 from renderer.image import to_unit

@@ -44,7 +44,7 @@ from augment import AugmentationService, AugmentationSettings
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
-from augment.scene.variation import vary
+from augment.scene.vary import vary
 from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, record, with_median
 from train import checkpoints, run_folder

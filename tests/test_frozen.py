@@ -39,7 +39,7 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attack_settings import EOTSettings
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from renderer.light.presets import directional
 from renderer.light.skylight import coefficients as skylight
 

@@ -17,7 +17,7 @@ import augment
 import renderer
 from augment.attacks.result import AttackResult
 from augment.progress import Phases
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.settings import RandomLightSettings
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from augment.scene.conditions import Conditions, Example
-from augment.scene.objects import SceneObject
+from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
 from renderer.errors import (

@@ -24,7 +24,7 @@ from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
-from augment.scene.degree import MAX_IRRADIANCE_ERROR, with_needed_degree
+from augment.scene.build import MAX_IRRADIANCE_ERROR, with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, is_whole

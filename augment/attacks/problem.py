@@ -13,7 +13,7 @@ from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.skylight import Skylight
 from augment.progress import progress
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 
 

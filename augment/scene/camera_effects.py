@@ -2,15 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.scene.image_files import draw_image_files
+from augment.progress import progress
 from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.settings import CameraEffectSettings
+from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
+from renderer.io.images import SUFFIXES, read_image
 from renderer.settings import ImageSettings
 
 # A Gaussian blur averages each pixel with this number of neighbors on each side.
@@ -136,3 +139,15 @@ def _blur(
     )
     # A Gaussian blur is separable: the first matrix blurs along columns, the second along rows.
     return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)
+
+
+def draw_image_files(
+    folder: str | Path, key: str, count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 3 size size"]:
+    """Read randomly chosen images of a folder, with replacement."""
+    files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not files:
+        raise InputError(f"{key}={folder} has no images: give a folder of .jpg or .png files")
+    chosen = torch.randint(len(files), (count,), generator=draws).tolist()
+    images = [read_image(files[index], size) for index in progress(chosen, f"reading {key}")]
+    return torch.stack(images)

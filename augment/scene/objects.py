@@ -1,4 +1,8 @@
-"""Load the objects of a scene: a mesh with the name of its class, props beside it and a table."""
+"""What a scene shows: objects, examples and conditions.
+
+An object is a mesh with the name of its class, props beside it and a table. An example is an object
+seen by cameras. Conditions are the light, the shape and the colors with which it is rendered.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
 from renderer.camera import Camera
@@ -21,8 +28,13 @@ from renderer.mesh import (
     select_faces,
     subdivide,
 )
+from renderer.short_repr import ShortRepr
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
+from renderer.validation import as_tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Smallest distance of the sides of a table from its center below the object, in world units.
 MIN_TABLE_REACH = 1.2
@@ -308,3 +320,144 @@ def _as_gloss(values: Sequence[float]) -> Gloss:
     """
     roughness, *others = [float(value) for value in values]
     return Gloss(roughness, *others)
+
+
+# Each face has three numbers: roughness, metallic and specular factor. These are the positions of
+# the first two.
+ROUGHNESS = 0
+METALLIC = 1
+
+# Roughness, metallic and specular factor of a matte surface, which is neither specular nor
+# metallic.
+MATTE = (1.0, 0.0, 0.0)
+# Roughness, metallic and specular factor with which an attack on a matte object starts.
+SPECULAR_LAYER = (0.5, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class FaceMaterials:
+    """Specular materials of the F faces of a mesh: an object, its props and its table.
+
+    Attributes:
+        face_gloss: Roughness, metallic and specular factor of each face, shape (F, 3).
+        object_mask: Mask of the faces that belong to the object itself,
+            shape (F,).
+    """
+
+    face_gloss: Float[Tensor, "F 3"]
+    object_mask: Bool[Tensor, " F"]
+
+    def average(self) -> Tensor:
+        """Average roughness, metallic and specular factor over the object's faces, shape (3,)."""
+        return self.face_gloss[self.object_mask].mean(0)
+
+    def is_uniform(self) -> bool:
+        """Return whether all faces belong to the object and have the same material."""
+        has_same_gloss = (self.face_gloss == self.face_gloss[0]).all()
+        return bool(self.object_mask.all() and has_same_gloss)
+
+    def first_face(self) -> FaceMaterials:
+        """Return the material of the first face only. In a uniform mesh, it is that of all."""
+        return FaceMaterials(face_gloss=self.face_gloss[:1], object_mask=self.object_mask[:1])
+
+
+def initial_materials(item: SceneObject) -> FaceMaterials:
+    """Return the materials with which an attack on the material of an object starts.
+
+    They are those of the mesh. If the object is matte (metallic and specular
+    factor are zero on all its faces), its faces get the material
+    `SPECULAR_LAYER`. Props and table keep their materials.
+    """
+    object_mask = torch.from_numpy(item.own_faces)
+    if item.mesh.gloss is None:
+        face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
+    else:
+        face_gloss = torch.from_numpy(item.mesh.gloss)
+    metallic_and_specular = face_gloss[object_mask, METALLIC:]
+    is_matte = not metallic_and_specular.any()
+    if is_matte:
+        specular_layer = face_gloss.new_tensor(SPECULAR_LAYER)
+        face_gloss = torch.where(object_mask[:, None], specular_layer, face_gloss)
+    return FaceMaterials(face_gloss=face_gloss, object_mask=object_mask)
+
+
+# Fields of `Conditions` whose second axis is the vertices of a mesh. `Conditions.row` cuts it to
+# the number of vertices of a mesh.
+OF_VERTICES = ("vertices",)
+# Fields of `Conditions` whose second axis is the faces of a mesh.
+OF_FACES = ("albedo", "gloss", "hue")
+
+
+@dataclass(frozen=True)
+class Example:
+    """Example of a scene: an object in front of a background, seen from V cameras.
+
+    Attributes:
+        object: Index of the object among the objects of the scene.
+        cameras: The V cameras.
+        background: Index of the background among the backgrounds of the scene.
+        exposure: Factor that multiplies the light of the scene.
+    """
+
+    object: int
+    cameras: tuple[Camera, ...]
+    background: int
+    exposure: float = 1.0
+
+
+@dataclass(frozen=True, repr=False)
+class Conditions(ShortRepr):
+    """Light, shape and colors with which A examples are rendered.
+
+    N and F are the numbers of vertices and faces of the largest mesh of the scene. A smaller mesh
+    uses only the first of the N or F entries. A field that is None changes nothing in the scene.
+
+    Attributes:
+        light: RGB coefficients of all lights in the scene's basis, shape (A, coefficients, 3).
+        vertices: Positions of the vertices, shape (A, N, 3).
+        albedo: Linear RGB that is added to the albedo of each face, shape (A, F, 3).
+        pixels: Offsets that are added to the pixel values of the V images, shape
+            (A, V, 3, size, size).
+        positions: Positions of the L lamps, shape (A, L, 3).
+        cameras: Change of the polar angle in degrees, change of the azimuth in degrees, and
+            change of the logarithm of the distance, shape (A, 3). They apply to all V cameras of
+            an example.
+        gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
+            faces, shape (A, 1, 3). Textures of gloss are multiplied by them.
+        hue: Angle in degrees by which the hue of the albedo of each face is turned, after the
+            addition of `albedo`, shape (A, F).
+    """
+
+    light: Float[Tensor, "A coefficients 3"]
+    vertices: Float[Tensor, "A N 3"] | None = None
+    albedo: Float[Tensor, "A F 3"] | None = None
+    pixels: Float[Tensor, "A V 3 size size"] | None = None
+    positions: Float[Tensor, "A L 3"] | None = None
+    cameras: Float[Tensor, "A 3"] | None = None
+    gloss: Float[Tensor, "A F 3"] | Float[Tensor, "A 1 3"] | None = None
+    hue: Float[Tensor, "A F"] | None = None
+
+    def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            if values is not None and not isinstance(values, Tensor):
+                object.__setattr__(self, name, as_tensor(name, values))
+
+    def row(self, index: int, mesh: Mesh) -> Conditions:
+        """Return the conditions of one example, without the dimension of the examples.
+
+        Args:
+            index: Index of the example in the first dimension of all fields.
+            mesh: Mesh of the example. Entries of vertices and faces are cut to the numbers of
+                its vertices and faces.
+        """
+        rows = {}
+        for name, values in vars(self).items():
+            if values is None:
+                continue
+            row = values[index]
+            if name in OF_VERTICES:
+                row = row[: len(mesh.vertices)]
+            elif name in OF_FACES:
+                row = row[: len(mesh.faces)]
+            rows[name] = row
+        return Conditions(**rows)

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from augment.memory import attack_bytes
 from augment.progress import progress
-from augment.scene.conditions import Conditions, Example
-from augment.scene.direct_rendering import DirectRenderer
-from augment.scene.objects import SceneObject
-from augment.scene.relighting import Layer, Relighting
+from augment.scene.objects import Conditions, Example, SceneObject
+from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
 from renderer.camera import Camera
 from renderer.errors import InputError, describe, require_bounded
 from renderer.image import background_term, clamp, encode
@@ -42,7 +40,7 @@ class Scene:
     """E examples, each of which shows an object from V cameras in front of a background.
 
     If only the light changes, each view is rasterized once into a transfer operator, a matrix
-    from light to image (see `Relighting`). If vertices, colors or gloss change, each view is
+    from light to image (see `OperatorRenderer`). If vertices, colors or gloss change, each view is
     rasterized each time (see `DirectRenderer`).
 
     Args:
@@ -144,7 +142,7 @@ class Scene:
         )
         count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
         require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
-        self._relighting = self._build_relighting()
+        self._operator_renderer = self._build_operator_renderer()
         self._direct_renderer = DirectRenderer(
             self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
         )
@@ -155,7 +153,7 @@ class Scene:
         cameras = tuple(camera.with_clip_range(radius) for camera in example.cameras)
         return replace(example, cameras=cameras)
 
-    def _build_relighting(self) -> Relighting:
+    def _build_operator_renderer(self) -> OperatorRenderer:
         """Prepare rendering with transfer operators, which are matrices from light to image.
 
         The operators are built when an image first needs them.
@@ -173,7 +171,7 @@ class Scene:
         )
         # Index of the background of each image, shape (E · V,).
         image_to_background = self._background.repeat_interleave(self.views)
-        return Relighting(
+        return OperatorRenderer(
             self.objects,
             views,
             image_to_background,
@@ -254,7 +252,7 @@ class Scene:
     @property
     def stacks(self) -> list[OperatorStack]:
         """Return the transfer operators (matrices from light to image) of all views, in stacks."""
-        return self._relighting.stacks
+        return self._operator_renderer.stacks
 
     def mesh(self, example: int) -> Mesh:
         """Return the mesh of the example with the given index."""
@@ -388,10 +386,10 @@ class Scene:
         if self.one_light or is_surface_changed:
             return self._render_directly(light, conditions, examples)
         if conditions.positions is not None:
-            return self._relight_with_moved_lamps(light, conditions.positions, examples)
-        return self._relight(light, examples)
+            return self._render_with_moved_lamps(light, conditions.positions, examples)
+        return self._render_with_operators(light, examples)
 
-    def _relight(
+    def _render_with_operators(
         self, light: Float[Tensor, "A K 3"], examples: Int[Tensor, " A"]
     ) -> Iterator[Layer]:
         """Render the V views of examples with transfer operators, which map light to images.
@@ -405,9 +403,9 @@ class Scene:
         if self.views > 1:
             # All views of an example have the same light, shape (A · V, K, 3).
             light = light.repeat_interleave(self.views, dim=0)
-        return self._relighting.layers(light, images)
+        return self._operator_renderer.layers(light, images)
 
-    def _relight_with_moved_lamps(
+    def _render_with_moved_lamps(
         self,
         light: Float[Tensor, "A K 3"],
         positions: Float[Tensor, "A L 3"],
@@ -421,7 +419,7 @@ class Scene:
         other_light = light.clone()
         other_light[:, lamp_rows] = 0
         batch_images = torch.arange(len(light) * self.views, device=light.device)
-        for rows, pixels, composite in self._relight(other_light, examples):
+        for rows, pixels, composite in self._render_with_operators(other_light, examples):
             lamp_radiances = []
             for image in batch_images[rows].tolist():
                 row, view = divmod(image, self.views)

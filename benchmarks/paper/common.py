@@ -22,8 +22,7 @@ from torch import Tensor
 from augment import AttackSettings, Classifier, Scene, StepSettings
 from augment.network import compute_outputs
 from augment.random_streams import generator
-from augment.scene.conditions import Example
-from augment.scene.objects import SceneObject, load_object
+from augment.scene.objects import Example, SceneObject, load_object
 from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light

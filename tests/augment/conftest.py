@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 import augment
-from augment.scene.conditions import Example
-from augment.scene.objects import SceneObject
+from augment.scene.objects import Example, SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
 from renderer.light.presets import ambient

@@ -13,7 +13,7 @@ from augment.projected_light import (
     relight_photographs,
 )
 from augment.random_streams import generator
-from augment.scene.slides import draw_cells, draw_slides
+from augment.scene.patterns import draw_cells, draw_slides
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, encode
 

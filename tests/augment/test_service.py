@@ -14,7 +14,7 @@ from augment.losses import complementary_label
 from augment.parameter_settings import StepSettings
 from augment.progress import Phases
 from augment.scene.build import build_scene
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.service import AugmentationService, Renders
 from augment.settings import (

@@ -30,10 +30,9 @@ from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.build import build_local_light
-from augment.scene.conditions import Conditions
-from augment.scene.objects import SceneObject
+from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
-from augment.scene.variation import vary
+from augment.scene.vary import vary
 from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from augment.attacks.parameters.mesh_parameter import MeshParameter
 from augment.parameter_settings import StepSettings
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 
 

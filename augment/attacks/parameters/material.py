@@ -13,8 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import MaterialSettings
-from augment.scene.conditions import Conditions
-from augment.scene.materials import METALLIC, initial_materials
+from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS

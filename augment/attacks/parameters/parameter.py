@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attacks.norm_ball import NormBalls
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 
 
 class Parameter(NormBalls, ABC):

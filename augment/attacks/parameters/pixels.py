@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import StepSettings
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 
 

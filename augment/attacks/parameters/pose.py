@@ -15,8 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import PoseSettings
-from augment.scene.conditions import Conditions
-from augment.scene.objects import SceneObject
+from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError

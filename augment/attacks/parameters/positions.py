@@ -7,7 +7,7 @@ from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import StepSettings
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.light.local_lights import LOCAL_LIGHTS

@@ -10,7 +10,7 @@ from torch import Tensor
 from augment.attacks.parameters.light_parameter import environment_light, replace_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import SkylightSettings
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.basis import HARMONICS

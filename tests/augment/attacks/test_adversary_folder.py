@@ -13,8 +13,7 @@ import torch
 import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
 from augment.parameter_settings import PARAMETER_NAMES
-from augment.scene.conditions import Example
-from augment.scene.objects import SceneObject, add_table, with_props
+from augment.scene.objects import Example, SceneObject, add_table, with_props
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.mesh import Mesh, normalize

@@ -12,10 +12,9 @@ from torch import Tensor
 import augment
 from augment.attacks.parameters import make_parameter
 from augment.parameter_settings import MaterialSettings
-from augment.scene.build import build_scene
-from augment.scene.degree import Smoothest, degree_of_scene, reached_gloss
+from augment.scene.build import Smoothest, build_scene, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
-from augment.scene.variation import vary
+from augment.scene.vary import vary
 from augment.settings import ObjectSettings, PropSettings, SpecularLayerSettings, VariationSettings
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.image import decode, encode
 from renderer.mesh import Mesh

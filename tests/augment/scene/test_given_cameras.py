@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import augment
 import renderer
-from augment.scene.variation import vary
+from augment.scene.vary import vary
 from augment.settings import VariationSettings
 from renderer.errors import InputError
 

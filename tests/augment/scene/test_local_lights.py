@@ -14,7 +14,7 @@ from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import StepSettings
 from augment.scene.build import build_local_light
-from augment.scene.conditions import Conditions
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from renderer.errors import InputError

@@ -16,11 +16,10 @@ from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import SkylightSettings, StepSettings
-from augment.scene import relighting
+from augment.scene import render
 from augment.scene.build import build_scene, load_backgrounds
-from augment.scene.conditions import Conditions, Example
-from augment.scene.direct_rendering import NEAR
-from augment.scene.objects import load_object
+from augment.scene.objects import Conditions, Example, load_object
+from augment.scene.render import NEAR
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings, count_views
 from renderer.camera import orbit_cameras
@@ -245,7 +244,7 @@ def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized)
     assert rasterized == [4, 4]
 
 
-STACK_SIZES = {"one stack": relighting.PIXELS_PER_STACK, "a stack per view": 1}
+STACK_SIZES = {"one stack": render.PIXELS_PER_STACK, "a stack per view": 1}
 
 
 @pytest.fixture(scope="module", params=STACK_SIZES.values(), ids=STACK_SIZES)
@@ -267,7 +266,7 @@ def several(request) -> Iterator[Scene]:
     names = ("plate", "cup")
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in names]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(relighting, "PIXELS_PER_STACK", request.param)
+        patch.setattr(render, "PIXELS_PER_STACK", request.param)
         yield Scene(objects, examples, backgrounds, lights, SETTINGS, RASTERIZER)
 
 

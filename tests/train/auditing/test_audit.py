@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 
 import augment
-from augment.scene.conditions import Conditions
-from augment.scene.objects import load_object
+from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of

@@ -19,8 +19,8 @@ from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
-from augment.scene import direct_rendering
-from augment.scene.conditions import Conditions
+from augment.scene import render
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
@@ -202,7 +202,7 @@ def test_an_attack_on_the_sky_starts_at_the_sky_of_its_settings(make_scene, dtyp
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
     """Show each camera what it saw first, which is what the analytic gradient assumes."""
-    build = direct_rendering.build_fragments
+    build = render.build_fragments
     seen_by_camera = {}
 
     def build_once(vertices, faces, cameras, settings, rasterizer, closed=False):
@@ -212,7 +212,7 @@ def fixed_visibility(monkeypatch) -> None:
             seen_by_camera[camera] = fragments
         return seen_by_camera[camera]
 
-    monkeypatch.setattr(direct_rendering, "build_fragments", build_once)
+    monkeypatch.setattr(render, "build_fragments", build_once)
 
 
 MIXTURE = ["skylight", "geometry", "albedo", "pixels"]

@@ -13,10 +13,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.progress import progress
-from augment.scene.camera_effects import draw_camera_effects
-from augment.scene.conditions import Example
-from augment.scene.image_files import draw_image_files
-from augment.scene.objects import SceneObject, add_specular_layer, resample_instance, rotated
+from augment.scene.camera_effects import draw_camera_effects, draw_image_files
+from augment.scene.objects import (
+    Example,
+    SceneObject,
+    add_specular_layer,
+    resample_instance,
+    rotated,
+)
 from augment.scene.patterns import pixel_centers, random_colors
 from augment.scene.scene import Scene
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
