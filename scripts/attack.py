@@ -25,7 +25,7 @@ def list_parameters(words: list[str]) -> list[str]:
 main = Command(
     name="attack",
     settings=AttackExperimentSettings,
-    body="train.commands.attack_meshes:run",
+    body="train.commands.attack:run",
     help=HelpText(
         about="Attack a classifier through the lighting, the shape, the colors or the pixels of a "
         "mesh.",

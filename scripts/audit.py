@@ -6,7 +6,7 @@ from train.command_settings import AuditSettings
 main = Command(
     name="audit",
     settings=AuditSettings,
-    body="train.commands.audit:audit",
+    body="train.commands.audit:run",
     help=HelpText(
         about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
         "Your own network: network=torchvision:NAME weights=FILE classes=FILE, a file of "

@@ -1,12 +1,12 @@
 """pnb-compare: print Markdown tables of finished runs."""
 
 from train.cli import Command, HelpText
-from train.command_settings import CompareSettings
+from train.commands.compare import CompareSettings
 
 main = Command(
     name="compare",
     settings=CompareSettings,
-    body="train.commands.compare:print_comparison",
+    body="train.commands.compare:run",
     help=HelpText(
         about="Print a Markdown table of finished runs. With -v, print all tables.",
         examples=[

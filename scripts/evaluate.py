@@ -6,7 +6,7 @@ from train.command_settings import EvaluateSettings
 main = Command(
     name="evaluate",
     settings=EvaluateSettings,
-    body="train.commands.evaluate:evaluate",
+    body="train.commands.evaluate:run",
     help=HelpText(
         about="Score a network on a folder of photographs.",
         examples=[

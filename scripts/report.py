@@ -3,7 +3,7 @@
 import os
 
 from train.cli import Command, HelpText, quoted
-from train.command_settings import ReportSettings
+from train.commands.report import ReportSettings
 
 
 def name_folders(words: list[str]) -> list[str]:
@@ -33,7 +33,7 @@ def names_folder(word: str) -> bool:
 main = Command(
     name="report",
     settings=ReportSettings,
-    body="train.commands.report:report",
+    body="train.commands.report:run",
     help=HelpText(
         about="Write a page of runs, sweeps and attacks.",
         examples=[

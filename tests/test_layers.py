@@ -102,6 +102,7 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
     gets_settings = re.compile("ExperimentSettings|DictConfig")
     command_layer = (
         "train.cli",
+        "train.commands",
         "train.__main__",
         "train.results",
         "train.user_errors",

@@ -4,9 +4,9 @@ from train.auditing.report import AuditReport as AuditReport
 from train.command_settings import AuditSettings as AuditSettings
 from train.command_settings import EvaluateSettings as EvaluateSettings
 from train.command_settings import LabSettings as LabSettings
-from train.functions.audit import audit as audit
-from train.functions.evaluate import evaluate as evaluate
-from train.functions.harden import harden as harden
+from train.commands.audit import audit as audit
+from train.commands.evaluate import evaluate as evaluate
+from train.commands.harden import harden as harden
 from train.publication import load as load
 from train.publication import publish as publish
 from train.saved_networks import load_run as load_run

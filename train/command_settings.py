@@ -479,34 +479,6 @@ class AuditSettings(ClassifierSettings):
 
 
 @dataclass
-class CompareSettings(Settings):
-    """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
-
-    runs: list[str] = setting(
-        REQUIRED, "Folders of finished runs and of sweeps. Folders below them count, too."
-    )
-    exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
-    by: str = setting("source", "Groups of the tables.", choices=GROUPS)
-    photos: str = setting(
-        "photographs",
-        "Sub-folder of the scores to compare: its name in `photos`.",
-    )
-
-    def __post_init__(self) -> None:
-        """Check all values, and that each run is named once."""
-        super().__post_init__()
-        if not self.runs:
-            raise InputError(
-                "runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]",
-                "runs",
-            )
-        folders = [Path(run).resolve() for run in self.runs]
-        for run, folder in zip(self.runs, folders, strict=True):
-            if folders.count(folder) > 1:
-                raise InputError(f"runs names {run} twice: name each run once", "runs")
-
-
-@dataclass
 class EvaluateSettings(ClassifierSettings):
     """Settings of the command pnb-evaluate, which scores a network on photographs."""
 
@@ -632,24 +604,3 @@ class FitSettings(Settings):
                 f"mask={self.mask} and box={self.box}: give one of them, "
                 "either mask=FILE or box=[left,top,right,bottom]"
             )
-
-
-@dataclass
-class ReportSettings(Settings):
-    """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
-
-    runs: list[str] = setting(
-        REQUIRED,
-        "Folders of runs, sweeps and attacks. Folders below them count, too.",
-    )
-    out: str | None = setting(
-        None,
-        "Folder of the page and its images. null: the common parent of the runs, whose page is "
-        "replaced.",
-    )
-    overwrite: bool = setting(False, "Replace results in the folder `out`.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.runs:
-            raise InputError("runs is empty: give the folders of runs, sweeps or attacks", "runs")

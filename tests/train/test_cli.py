@@ -18,7 +18,7 @@ from renderer.errors import InputError
 from train import console, system
 from train import user_errors as errors
 from train.cli import USER_ERROR, Command, HelpText
-from train.command_settings import CompareSettings
+from train.commands.compare import CompareSettings
 from train.commands.experiment import logged_to
 from train.data.cache import content_hash
 from train.run_folder import LAST, locked

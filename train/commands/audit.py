@@ -1,11 +1,155 @@
-"""pnb-audit: how safe a network is in unusual lighting."""
+"""pnb-audit and nb.audit: how safe a network is in unusual lighting."""
 
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment.network import Classifier
+from augment.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    device_of,
+    gradient_flags_kept,
+)
+from augment.settings import NormalizeLight
+from renderer.errors import InputError
+from renderer.validation import as_list
 from train.auditing.audit import run_audit
-from train.command_settings import AuditSettings
+from train.auditing.remedies import CLASSIFIER, HARDENED
+from train.auditing.report import AuditReport, read_audit
+from train.command_settings import ENVIRONMENTS, AuditSettings
+from train.commands.arguments import (
+    MeshItem,
+    as_mappings,
+    find_positive_classes,
+    folder_or_temporary,
+)
+from train.results.overwrite import require_replaceable
 
 
-def audit(settings: AuditSettings) -> None:
+def run(settings: AuditSettings) -> None:
     """Test a network in unusual lighting, and print the main numbers and the path of the report."""
     audited = run_audit(settings)
     print(audited.screen)
     print(f"report: {audited.path}")
+
+
+def audit(
+    network: Classifier | Callable[[Tensor], Tensor],
+    meshes: Sequence[MeshItem],
+    label: str | int | None = None,
+    *,
+    hard_negatives: Sequence[MeshItem] = (),
+    hardened: Classifier | Callable[[Tensor], Tensor] | None = None,
+    classes: Sequence[str] | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
+    photos: str | Path | None = None,
+    laboratory: str | Path | None = None,
+    environments: Sequence[str] = ENVIRONMENTS,
+    budget: float = 1.0,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> AuditReport:
+    """Measure how safe a network is in unusual lighting.
+
+    Nothing is written unless `out` is given.
+
+    Args:
+        network: A classifier, or a plain network from images to logits, such as
+            a `torch.nn.Module`.
+        meshes: Meshes of one class: files, solids such as "solid:orange",
+            `nb.Mesh`, or pairs of these and the class.
+        label: Class of all meshes, by name or index. None if each mesh is given
+            in a pair with its class, or if its name is the class, as in
+            "orange.glb".
+        hard_negatives: Meshes of other classes, rendered in the same lighting,
+            with or without a class. None for generated fruit and balls.
+        hardened: Hardened network, which is audited in the same way and shown
+            beside `network`. None to audit one network.
+        classes: Names of the classes of plain networks, in the order of their
+            outputs. None for "0", "1" and so on.
+        size: Pixels per side of the images of plain networks. None for its own, or 224.
+        normalization: "imagenet", or mean and standard deviation, as `attack`
+            takes it.
+        value_range: Values of black and white that plain networks take before
+            normalization.
+        normalize_light: Normalization of the light of each image before it
+            enters `network`, and `hardened` if that is a plain network. Values
+            are as for `load_classifier`. Attacks take it into account.
+        photos: Folder of photographs with a sub-folder for each class, as
+            for `evaluate`. None to use no photographs.
+        laboratory: Folder of renders with a sub-folder for each class, such as
+            "pretrained/laboratory". None to render them from the meshes, for
+            which Mitsuba is needed.
+        environments: Names of environment lightings, or files of maps.
+        budget: Factor of the number of views, lightings and renders. With 1, a
+            network of 224 pixels takes about 20 minutes on one core.
+        seed: Seed of all random draws.
+        device: Device that computes. None for the device of the network.
+        out: Folder for the files of the audit. None to write no files.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        Report with all numbers. `save("audit.html")` writes it as a page.
+
+    Raises:
+        InputError: If an input cannot be read, or if a network lacks a class.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> report = nb.audit(
+        ...     network,
+        ...     ["solid:orange"],
+        ...     classes=["orange", "apple"],
+        ...     size=32,
+        ...     laboratory="pretrained/laboratory",
+        ... )  # doctest: +SKIP
+        >>> report.network.attacks["lamps"].adversarial  # doctest: +SKIP
+        (0, 1, 5, 12)
+    """
+    device = device_of(network) if device is None else device
+    options = (size, classes, normalization, value_range, device)
+    with gradient_flags_kept(network), gradient_flags_kept(hardened):
+        networks = {CLASSIFIER: as_classifier(network, *options, normalize_light=normalize_light)}
+        if hardened is not None:
+            is_classifier = isinstance(hardened, Classifier)
+            networks[HARDENED] = as_classifier(
+                hardened,
+                *options,
+                argument="hardened",
+                normalize_light=None if is_classifier else normalize_light,
+            )
+        classifier = networks[CLASSIFIER]
+        with folder_or_temporary(out) as folder:
+            require_replaceable(folder, "out", overwrite)
+            items = as_mappings("meshes", meshes, classifier, folder)
+            positive_classes = find_positive_classes(label, meshes, items, classifier)
+            if len(positive_classes) > 1:
+                raise InputError(
+                    f"meshes are of several classes ({', '.join(positive_classes)}): "
+                    "give meshes of one class"
+                )
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
+            settings = AuditSettings(
+                network=classifier.name,
+                label=positive_classes[0],
+                meshes=items,
+                hard_negatives=negatives,
+                photos=None if photos is None else str(photos),
+                laboratory=None if laboratory is None else str(laboratory),
+                environments=as_list("environments", environments, str, "a list of names"),
+                budget=budget,
+                seed=seed,
+                device=str(device),
+                out=str(folder),
+                overwrite=overwrite,
+            )
+            return read_audit(run_audit(settings, networks))

@@ -1,19 +1,52 @@
 """pnb-compare: tables that compare finished training runs."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from train.command_settings import CompareSettings
-from train.results.compare import format_comparison, format_short_comparison
-from train.results.store import finished_runs
+from renderer.errors import InputError
+from renderer.settings import REQUIRED, Settings, setting
+from train.settings import GROUPS
 from train.system import is_verbose, shortened
 
 
-def print_comparison(settings: CompareSettings) -> None:
+@dataclass
+class CompareSettings(Settings):
+    """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
+
+    runs: list[str] = setting(
+        REQUIRED, "Folders of finished runs and of sweeps. Folders below them count, too."
+    )
+    exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
+    by: str = setting("source", "Groups of the tables.", choices=GROUPS)
+    photos: str = setting(
+        "photographs",
+        "Sub-folder of the scores to compare: its name in `photos`.",
+    )
+
+    def __post_init__(self) -> None:
+        """Check all values, and that each run is named once."""
+        super().__post_init__()
+        if not self.runs:
+            raise InputError(
+                "runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]",
+                "runs",
+            )
+        folders = [Path(run).resolve() for run in self.runs]
+        for run, folder in zip(self.runs, folders, strict=True):
+            if folders.count(folder) > 1:
+                raise InputError(f"runs names {run} twice: name each run once", "runs")
+
+
+def run(settings: CompareSettings) -> None:
     """Print a Markdown table that compares finished training runs.
 
     With --verbose, intervals, settings, differences and other tables are
     printed, too.
     """
+    # --help does not wait for these imports.
+    from train.results.compare import format_comparison, format_short_comparison
+    from train.results.store import finished_runs
+
     runs = finished_runs([Path(run) for run in settings.runs])
     options = (settings.exclude, settings.photos, settings.by)
     if is_verbose():

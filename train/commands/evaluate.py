@@ -1,22 +1,39 @@
-"""pnb-evaluate: scores of a network on a folder of photographs."""
+"""pnb-evaluate and nb.evaluate: scores of a network on a folder of photographs."""
 
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
-from augment.network import Classifier
-from augment.plain_networks import as_facts, require_no_facts
-from train.command_settings import EvaluateSettings
-from train.data.photographs import class_folders
-from train.device import choose_device
-from train.functions.evaluate import evaluate as evaluate_network
-from train.results.scoring import format_overall, format_scores
+import torch
+from torch import Tensor
+
+from augment.network import Classifier, Label, OperatingPoint
+from augment.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    as_facts,
+    device_of,
+    gradient_flags_kept,
+    require_no_facts,
+)
+from augment.settings import NormalizeLight
+from renderer.validation import as_folder
+from train.command_settings import EvaluateSettings, require_calibration
+from train.data.photographs import choose_labels, class_folders, require_outside
+from train.device import MixedPrecision, choose_device, choose_precision
+from train.results import scoring
+from train.results.overwrite import require_replaceable
+from train.results.scoring import Predictor, Scores, format_overall, format_scores
 from train.results.store import trained_labels
+from train.run_folder import sole_writer
 from train.saved_networks import load_chosen, load_run
 from train.settings import label_names, published
 from train.system import is_verbose
-from train.user_errors import keyed
+from train.user_errors import keyed, writable_folder
 
 
-def evaluate(settings: EvaluateSettings) -> None:
+def run(settings: EvaluateSettings) -> None:
     """Score a network on photographs, write tables and images, and print a summary."""
     network = _load_network(settings)
     label = settings.label
@@ -29,7 +46,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     with keyed("label"):
         for name in [] if label is None else label_names(label):
             network.label(name)
-    scores = evaluate_network(
+    scores = evaluate(
         network,
         settings.photos,
         label,
@@ -62,3 +79,140 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
     classifier = load_run(settings.run, settings.weights, settings.network, settings.trust)
     # The returned copy normalizes the light of each image, unless the setting is None.
     return classifier.normalizing_light(settings.normalize_light)
+
+
+def evaluate(
+    network: Classifier | Callable[[Tensor], Tensor],
+    photos: str | Path,
+    label: str | int | Sequence[str | int] | None = None,
+    *,
+    classes: Sequence[str] | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
+    by: str = "source",
+    calibrate: str | Path | None = None,
+    false_positive_rate: float | None = None,
+    skip_unreadable: bool = False,
+    precision: str = "auto",
+    device: torch.device | str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> Scores:
+    """Score a network on the photographs of a folder.
+
+    Nothing is written unless `out` is given.
+
+    Args:
+        network: A classifier, or a plain network from images to logits, such as
+            a `torch.nn.Module`.
+        photos: Folder with a sub-folder of photographs for each class. A
+            sub-folder of any other name holds negatives: photographs of other
+            objects. "pretrained/laboratory" is installed with the library.
+        label: Positive class, or several, by name or index. Recall is the
+            fraction of the photographs of a positive class that the network
+            finds. None for all classes that have a sub-folder.
+        classes: Names of the classes of a plain network, in the order of its
+            outputs. None for "0", "1" and so on.
+        size: Pixels per side of the images of a plain network. None for its own, or 224.
+        normalization: "imagenet", or mean and standard deviation, as `attack`
+            takes it.
+        value_range: Values of black and white that a plain network takes before
+            normalization.
+        normalize_light: Normalization of the light of each photograph before it
+            enters the network. Values are as for `load_classifier`.
+        by: Groups of photographs that are scored one by one, in addition to all
+            photographs: "class", or a column of the file photos.csv in `photos`,
+            "source" or "mesh".
+        calibrate: Folder like `folder`. The threshold on the log-odds of each
+            positive class is chosen on its photographs, so that their
+            false-positive rate is `false_positive_rate`. None for the thresholds
+            that are stored with the network, if any.
+        false_positive_rate: False-positive rate of these thresholds, in (0, 1).
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+        precision: "auto" (bfloat16 if the hardware computes in it), "bfloat16"
+            or "float32".
+        device: Device that computes. None for the device of the network.
+        out: Folder to which tables and images of the scores are written. None to
+            write no files.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        Scores. `overall` has the metrics of all photographs, `by_label` the
+        metrics of each positive class, and `by_class` the recall of each class
+        of the folder.
+
+    Raises:
+        InputError: If the network does not fit its arguments, if it lacks a
+            class, or if the photographs cannot be read.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> def logits(images):
+        ...     return images.mean((2, 3))
+        >>> classes = ["orange", "lemon", "pear"]
+        >>> folder = "pretrained/laboratory"
+        >>> scores = nb.evaluate(logits, folder, "orange", classes=classes, size=8)
+        >>> scores.overall.recall.n
+        280
+    """
+    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    folder = published(as_folder("photos", photos))
+    device = device_of(network) if device is None else torch.device(device)
+    with gradient_flags_kept(network):
+        classifier = as_classifier(
+            network,
+            size,
+            classes,
+            normalization,
+            value_range,
+            device,
+            normalize_light=normalize_light,
+        )
+        labels = choose_labels(folder, classifier.classes, label)
+        model = MixedPrecision(classifier.to(device), choose_precision(precision, device))
+        predictor = Predictor(model, classifier.classes, classifier.size, device)
+        target = None
+        if out is not None:
+            target = writable_folder(str(out), "out")
+            require_replaceable(target, "out", overwrite)
+            require_outside(target, folder)
+        with sole_writer("out", target) if target else nullcontext():
+            points = _stored_operating_points(classifier, labels)
+            if calibrate is not None and false_positive_rate is not None:
+                points = _choose_operating_points(
+                    predictor, calibrate, labels, false_positive_rate, skip_unreadable
+                )
+            predictions = predictor.predict(folder, labels, skip_unreadable)
+            scores = scoring.score(predictions, by, points)
+            if target:
+                scoring.write(scores, target)
+    return scores
+
+
+def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
+    """Return the operating points (thresholds on the log-odds) that are stored with a network.
+
+    The list is empty if one of the classes has none.
+    """
+    by_label = {point.label: point for point in classifier.operating_points}
+    has_all = by_label.keys() >= set(labels)
+    return [by_label[name] for name in labels] if has_all else []
+
+
+def _choose_operating_points(
+    predictor: Predictor,
+    folder: str | Path,
+    labels: Label,
+    rate: float,
+    skip_unreadable: bool,
+) -> list[OperatingPoint]:
+    """Choose a threshold on the log-odds of each positive class, on a folder of photographs.
+
+    `rate` is the false-positive rate of the thresholds, in (0, 1).
+    """
+    path = published(Path(folder))
+    # The caller of `evaluate` knows this folder as the argument `calibrate`.
+    with keyed(folder="calibrate"):
+        return scoring.choose_operating_points(predictor, path, labels, rate, skip_unreadable)

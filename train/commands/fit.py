@@ -19,7 +19,7 @@ from renderer.image import decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.files import save_light
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
-from train.commands.attack_meshes import build_attacked
+from train.commands.attack import build_attacked
 from train.data.masks import read_mask
 from train.results.overwrite import require_replaceable
 from train.settings import read_object

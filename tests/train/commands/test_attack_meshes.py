@@ -16,7 +16,7 @@ from renderer.visibility import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
-from train.commands.attack_meshes import attacks, overrides
+from train.commands.attack import attacks, overrides
 from train.results.attack_tables import format_attack
 
 

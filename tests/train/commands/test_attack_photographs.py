@@ -10,7 +10,7 @@ from PIL import Image
 from renderer.errors import InputError
 from scripts.attack import list_parameters, main
 from tests.helpers import bright_or_dark
-from train.commands.attack_meshes import run
+from train.commands.attack import run
 from train.results.relit import PICTURE_COUNT, RELIT, read_relit
 
 

@@ -27,7 +27,7 @@ from train import console
 from train.__main__ import main
 from train.class_names import require_others, with_classes_of_meshes
 from train.cli import read_settings
-from train.functions.meshes import (
+from train.commands.arguments import (
     MeshItem,
     as_mappings,
     find_positive_classes,

@@ -42,7 +42,6 @@ from renderer.errors import InputError
 from renderer.visibility.rasterizer import Rasterizer
 from train.class_names import class_name, class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
-from train.commands import attack_photographs
 from train.device import choose_device, choose_rasterizer
 from train.results.attack_tables import (
     FIGURE,
@@ -55,14 +54,17 @@ from train.results.attack_tables import (
     write_transfers,
 )
 from train.results.overwrite import remove_attack, require_replaceable
+from train.results.relit import MODELED, RELIT, attack_folder
 from train.results.tables import Table
 from train.run_config import write_config
 from train.run_folder import sole_writer
 from train.saved_networks import load_chosen, load_network
-from train.settings import read_object, read_objects
+from train.settings import published, read_object, read_objects
 from train.system import command_line, is_verbose, shortened
 from train.user_errors import keyed, keys_of, writable_folder
 
+# Warnings about at most 3 unreadable files are printed if --verbose is not set.
+MAX_UNREADABLE = 3
 # The search for a scene in which a mesh is recognized may change these settings.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
 
@@ -143,7 +145,7 @@ def run(settings: AttackExperimentSettings) -> None:
     the attack, if there is one, starts at this adversary.
     """
     if settings.attack.relighting is not None:
-        attack_photographs.run(settings)
+        _attack_photographs(settings)
         return
     _require_attack_settings(settings)
     adversary = reload(settings.reload) if settings.reload else None
@@ -498,3 +500,37 @@ def format_reloaded(
         line += f"; values differ from the saved image's by {difference:.3g}/255 at most"
         lines.append(line)
     return lines
+
+
+def _attack_photographs(settings: AttackExperimentSettings) -> None:
+    """Attack a network by the light of a projector on photographs, and print the results."""
+    relighting = settings.attack.relighting
+    if relighting is None or settings.unlabeled is None:
+        raise InputError(
+            "attack=relighting needs unlabeled=FOLDER, and unlabeled=FOLDER needs "
+            "attack=relighting: set both"
+        )
+    device = choose_device(settings.device)
+    with keyed(name="network"):
+        classifier = load_chosen(settings).to(device)
+    out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
+    with sole_writer("out", out):
+        remove_attack(out)
+        with keyed("unlabeled"):
+            scores = attack_folder(
+                classifier,
+                published(Path(settings.unlabeled)),
+                relighting,
+                out,
+                sensor_noise=settings.attack.sensor_noise,
+                batch_size=settings.attack.batch_size,
+                seed=settings.seed,
+            )
+        write_config(out, settings, command=command_line("attack"))
+    print(f"{scores.summary_table()}\n")
+    print(f"{MODELED}\n")
+    unreadable = [f"warning: {path} cannot be read" for path in scores.unreadable]
+    for line in shortened(unreadable, MAX_UNREADABLE):
+        print(line)
+    print(f"predictions and pictures: {out / RELIT}")

@@ -1,1 +1,0 @@
-"""Functions for any network: `load`, `evaluate`, `audit` and `harden`."""
