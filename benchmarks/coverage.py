@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri, stdtrit
 
-from train.results.metrics import (
-    ROC_METRICS,
+from train.results.intervals import (
     Jackknife,
     Units,
     auc_and_recalls,
@@ -32,6 +31,7 @@ from train.results.metrics import (
     leave_out_of_roc,
     weighted_means,
 )
+from train.results.metrics import ROC_METRICS
 from train.results.tables import Table
 
 METRICS = (*ROC_METRICS, "recall", "FPR", "top-1")

@@ -40,14 +40,7 @@ from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.laboratory.laboratory import write_laboratory
-from train.results.metrics import (
-    Jackknife,
-    Units,
-    average,
-    change,
-    leave_out,
-    weighted_means,
-)
+from train.results.intervals import Jackknife, Units, average, change, leave_out, weighted_means
 from train.results.tables import Estimate, Table, format_fraction, format_interval, fraction
 
 TEST = "test"

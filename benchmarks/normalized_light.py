@@ -30,7 +30,8 @@ from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
-from train.results.metrics import Pooled, auc_and_recalls, metric_title
+from train.results.intervals import auc_and_recalls
+from train.results.metrics import Pooled, metric_title
 from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
 from train.results.tables import Table, format_interval

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from benchmarks.common import Row
 from benchmarks.paper.common import last_run
 from train.results import tables
-from train.results.metrics import Units, leave_out, weighted_means
+from train.results.intervals import Units, leave_out, weighted_means
 
 # Titles of the columns of norm_balls, by the counts in its records.
 COUNTS = {

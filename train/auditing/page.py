@@ -41,7 +41,8 @@ from train.results.first_screen import (
     describe_place,
     describe_prediction,
 )
-from train.results.metrics import Metrics, Units, leave_out, weighted_means
+from train.results.intervals import Units, leave_out, weighted_means
+from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture
 from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions

@@ -13,15 +13,8 @@ from statistics import fmean
 
 from augment.settings import MODES
 from renderer.errors import InputError
-from train.results.metrics import (
-    METRICS,
-    TOP_RANKS,
-    Jackknife,
-    Pool,
-    Pooled,
-    change,
-    metric_title,
-)
+from train.results.intervals import Jackknife, change
+from train.results.metrics import METRICS, TOP_RANKS, Pool, Pooled, metric_title
 from train.results.predictions import CONTACT_SHEET, Prediction
 from train.results.store import (
     INITIAL,

@@ -1,17 +1,14 @@
-"""Metrics of an evaluation with 95% intervals: recall, false-positive rate, AUC and top-1.
+"""Metrics of an evaluation: recall, false-positive rate, AUC and top-1.
 
 A `Pool` is a set of predictions that are scored together. It computes their
 `Metrics`. `Pooled` has all pools of one evaluation: the pool of all images, and
-the pools of each label, source, mesh and class. The functions below them compute
-the statistics: the jackknife and its intervals, the AUC, the recall at a given
-false-positive rate, and means over classes.
+the pools of each label, source, mesh and class.
 
 A label is the name of a positive class. A prediction scores how well an image
 fits a label. The image is a positive if it shows this class. Otherwise it is a
 negative.
 """
 
-import fractions
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -19,9 +16,17 @@ from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num
 
 from renderer.short_repr import ShortRepr
+from train.results.intervals import (
+    RATES,
+    Jackknife,
+    Units,
+    class_means,
+    leave_out,
+    leave_out_of_roc,
+    weighted_means,
+)
 from train.results.predictions import Prediction
 from train.results.tables import (
     IMAGES,
@@ -32,9 +37,6 @@ from train.results.tables import (
     fraction,
 )
 
-# False-positive rates at which the recall is reported. Decimal strings are exact,
-# while a float such as 0.1 is not.
-RATES = ("0.05", "0.10", "0.20")
 # Names of the metrics that depend on the ranking of the images, in the order in which
 # `auc_and_recalls` returns them.
 ROC_METRICS = ("auc", *(f"recall_at/{rate}" for rate in RATES))
@@ -77,13 +79,6 @@ Thresholds = Mapping[str, float]
 # Smallest number of objects of each kind for intervals over objects. With fewer objects,
 # the interval of an AUC covers more than half of [0, 1] (benchmarks/coverage.py).
 MIN_OBJECTS = 5
-# Largest number of groups into which the objects are divided, each of which is left out
-# once. More groups would hardly change the interval, but the variance of a recall at a
-# false-positive rate, which depends on a quantile, needs groups of several images.
-MAX_GROUPS = 30
-# Smallest ratio of the errors without a group to all errors. It keeps the logit finite if
-# all errors are in one group.
-MIN_RATIO = 0.2
 
 
 @dataclass(frozen=True)
@@ -349,19 +344,6 @@ class Pool(ShortRepr):
         return {**outcomes, **self._ranked}
 
 
-class Units(NamedTuple):
-    """Units over which an interval is taken: objects, or images.
-
-    Attributes:
-        groups: For each group of images, the index of the unit that each image
-            belongs to, from 0, shape (n,).
-        over: What the units are: OBJECTS, IMAGES or THESE_OBJECTS.
-    """
-
-    groups: Sequence[np.ndarray]
-    over: str
-
-
 def choose_units(*groups: Sequence[Prediction]) -> Units:
     """Choose objects as units if each group shows enough of them, and otherwise images.
 
@@ -530,372 +512,6 @@ def _group(
         if name is not None:
             groups.setdefault(name, []).append(prediction)
     return {name: groups[name] for name in sorted(groups)}
-
-
-@dataclass(frozen=True)
-class Jackknife:
-    """Statistics in [0, 1], and their values if one unit is left out.
-
-    Attributes:
-        value: Values on all images, shape (...).
-        without: For each group of units, such as the positive and the negative
-            objects, the values without each unit, shape (..., k).
-        unit_count: Smallest number of units in a group.
-        over: What the units are.
-        at_ends: Values at both ends of the interval of the threshold, shape (2, ...),
-            for a recall whose threshold depends on the second group. Otherwise None.
-    """
-
-    value: np.ndarray
-    without: Sequence[np.ndarray]
-    unit_count: int
-    over: str
-    at_ends: np.ndarray | None = None
-
-    @cached_property
-    def interval(self) -> np.ndarray:
-        """Ends of the 95% intervals, logit(value) ± t · standard error, shape (2, ...).
-
-        The variance of logit(value) is the sum of the jackknife variances of
-        the groups (Efron and Stein 1981). The degrees of freedom of the
-        quantile t are the harmonic mean of those of the groups, weighted by
-        variance. They do not exceed those of Welch and Satterthwaite, which
-        cover too little if effects of objects have heavy tails. Without
-        variance, as at a value of 1, the interval is Wilson's for a fraction of
-        the units.
-
-        With `at_ends`, this is the interval at a fixed threshold. Its distances from the value and
-        those of `at_ends` are added in squares (Zou and Donner 2008).
-        """
-        value = np.asarray(self.value)
-        if self.at_ends is not None:
-            positives, _, *seeds = self.without
-            fixed = replace(self, without=[positives, *seeds], at_ends=None).interval
-            down, up = np.hypot(fixed - value, self.at_ends - value)
-            return np.clip([value - down, value + up], 0, 1)
-        if min((item.shape[-1] for item in self.without), default=0) < 2:
-            return np.stack([np.zeros_like(value), np.ones_like(value)])
-        is_inner = (value > 0) & (value < 1)
-        inner = np.where(is_inner, value, 0.5)
-        errors = [_keep_errors(item, inner[..., None]) for item in self.without]
-        spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
-        half_width = spread.quantile * spread.variance**0.5
-        ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
-        wilson = _wilson(value, self.unit_count, spread.quantile)
-        return np.where(spread.variance > 0, ends, wilson)
-
-    @property
-    def is_open(self) -> np.ndarray:
-        """Whether no positive exceeds the high end of the threshold, shape (...)."""
-        return np.zeros_like(self.value, bool) if self.at_ends is None else self.at_ends[0] == 0
-
-    @property
-    def estimate(self) -> Estimate:
-        """Value with its 95% interval."""
-        return Estimate(float(self.value), *map(float, self.interval), self.over)
-
-
-def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
-    """Evaluate M statistics without each unit, or without each of MAX_GROUPS groups of units.
-
-    Images of the same object are not independent, so an object is left out with
-    all its images. The groups of units depend only on `units`. Metrics of two
-    networks on the same images are therefore paired. `statistic` takes, for each group, how often
-    each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
-    """
-    counts = [np.ones((1, len(unit_of_image)), int) for unit_of_image in units.groups]
-    values = statistic(*counts)
-    unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
-    without = []
-    for group, unit_of_image in enumerate(units.groups):
-        unit_count = unit_counts[group]
-        if unit_count == 1:
-            without.append(values)
-            continue
-        part_count = min(unit_count, MAX_GROUPS)
-        # A random order divides the units into parts of about equal size.
-        order = np.random.default_rng(0).permutation(unit_count)
-        part_of_image = (order * part_count // unit_count)[unit_of_image]
-        is_kept = part_of_image != np.arange(part_count)[:, None]
-        kept = [*counts[:group], is_kept.astype(int), *counts[group + 1 :]]
-        without.append(statistic(*kept))
-    rows = zip(values[..., 0], *without, strict=True)
-    return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]
-
-
-def leave_out_of_roc(
-    positives: Num[np.ndarray, "... n"], negatives: Num[np.ndarray, "... m"], units: Units
-) -> list[Jackknife]:
-    """Evaluate ROC_METRICS without each unit, and the recalls at the ends of their thresholds.
-
-    The false-positive rate at the estimated threshold has an interval around the nominal rate. The
-    ends of the interval of the threshold are the scores that these fractions of the negatives
-    exceed (Woodruff 1952). If less than half a negative exceeds an end, it may be above all scores.
-    """
-    # The axis before the last is for the units that are left out.
-    statistic = partial(auc_and_recalls, positives[..., None, :], negatives[..., None, :])
-    auc, *recalls = leave_out(statistic, units)
-    count = negatives.shape[-1]
-    descending = -np.sort(-negatives, axis=-1)
-    results = [auc]
-    levels = thresholds(negatives, np.ones(count, int))
-    for rate, recall, threshold in zip(RATES, recalls, levels, strict=True):
-        is_above = negatives > threshold[..., None]
-        is_tied = negatives == threshold[..., None]
-        # Negatives at the threshold count in part, so that the rate is the nominal one.
-        missing = float(rate) * count - is_above.sum(axis=-1, keepdims=True)
-        hits = is_above + is_tied * missing / is_tied.sum(axis=-1, keepdims=True)
-        (rates,) = leave_out(partial(weighted_means, hits[None]), Units(units.groups[1:], ""))
-        exceeding = rates.interval * count
-        places = exceeding.astype(int).clip(max=count - 1)[..., None]
-        is_detected = positives > _take(descending, places)
-        at_ends = np.where(exceeding < 0.5, 0.0, is_detected.mean(axis=-1))
-        results.append(replace(recall, at_ends=at_ends))
-    return results
-
-
-def average(runs: Sequence[Jackknife]) -> Jackknife:
-    """Average a metric over training runs. Several runs are a further group of units."""
-    values = np.stack([run.value for run in runs])
-    groups = zip(*(run.without for run in runs), strict=True)
-    without = [np.mean(group, axis=0) for group in groups]
-    over = runs[0].over
-    if len(runs) > 1:
-        without.append(np.moveaxis((values.sum(axis=0) - values) / (len(runs) - 1), 0, -1))
-        over = f"seeds and {over}"
-    all_ends = [run.at_ends for run in runs if run.at_ends is not None]
-    at_ends = np.mean(all_ends, axis=0) if all_ends else None
-    return Jackknife(values.mean(axis=0), without, runs[0].unit_count, over, at_ends)
-
-
-def change(
-    after: Sequence[Jackknife], before: Sequence[Jackknife], is_paired: bool = True
-) -> Estimate:
-    """Subtract the means of a metric over two groups of runs, with the 95% interval.
-
-    The interval combines those of both means and their correlation (Zou and
-    Donner 2008), so it is as asymmetric as they are. If both groups have the
-    same values without each unit, it is that of 0 changes in Wilson's sense. `is_paired` says that
-    run i of both has the same seed.
-    """
-    one, other = average(after), average(before)
-    over = max(one.over, other.over, key=len)
-    ends = change_ends(one, other, is_paired)
-    return Estimate(float(one.value - other.value), *map(float, ends), over)
-
-
-def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.ndarray:
-    """Compute the ends of the interval of `change` from averages over runs, shape (2, ...)."""
-    value = one.value - other.value
-    if min((item.shape[-1] for item in [*one.without, *other.without]), default=0) < 2:
-        return np.stack([np.full_like(value, -1), np.full_like(value, 1)])
-    # Runs that are not paired are the last group.
-    group_count = len(one.without) if is_paired else -1
-    pairs = list(zip(one.without[:group_count], other.without, strict=False))
-    product = _Spread.of(one.without).variance * _Spread.of(other.without).variance
-    covariance = np.sum([_covariance(*pair) for pair in pairs], axis=0)
-    correlation = np.where(product > 0, covariance / np.where(product > 0, product, 1) ** 0.5, 0)
-    low, high = one.interval
-    other_low, other_high = other.interval
-    down = _half_width(one.value - low, other_high - other.value, correlation, one.is_open)
-    up = _half_width(high - one.value, other.value - other_low, correlation, other.is_open)
-    ends = np.clip([value - down, value + up], -1, 1)
-    is_same = (value == 0) & np.all([(a == b).all(axis=-1) for a, b in pairs], axis=0)
-    if one.at_ends is not None and other.at_ends is not None:
-        is_same &= (one.at_ends == other.at_ends).all(axis=0)
-    margin = fraction(0, one.unit_count).high
-    assert margin is not None
-    return np.where(is_same, np.multiply.outer([-margin, margin], np.ones_like(value)), ends)
-
-
-def _half_width(
-    a: np.ndarray, b: np.ndarray, correlation: np.ndarray, is_open: np.ndarray
-) -> np.ndarray:
-    """Half width of a difference whose parts have the half widths a and b.
-
-    If the threshold of a recall may be above all scores (`is_open`), the recall has no lower limit.
-    Its distance is then no error that partly cancels, and the distances are added.
-    """
-    squared = np.where(is_open, (a + b) ** 2, a * a + b * b - 2 * correlation * a * b)
-    return np.maximum(0.0, squared) ** 0.5
-
-
-def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Jackknife covariance of two statistics, from their values without each of k units."""
-    count = one.shape[-1]
-    deviations = (x - x.mean(axis=-1, keepdims=True) for x in (one, other))
-    return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
-
-
-class _Spread(NamedTuple):
-    """Jackknife variance of a statistic, and the quantile of Student's t for its interval."""
-
-    variance: np.ndarray
-    quantile: np.ndarray
-
-    @classmethod
-    def of(cls, without: Sequence[np.ndarray]) -> "_Spread":
-        """Add the variances of the groups of units, from the values without each unit."""
-        # This import is here because it takes a second.
-        from scipy.special import stdtrit
-
-        degrees = np.array([item.shape[-1] - 1 for item in without])
-        variances = np.stack([_covariance(values, values) for values in without], axis=-1)
-        total = variances.sum(axis=-1)
-        terms = (variances / degrees).sum(axis=-1)
-        freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
-        return cls(total, stdtrit(freedom, 0.975))
-
-
-def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Keep at least MIN_RATIO of the distance of a value from 0 and from 1."""
-    return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
-
-
-def _logit(values: np.ndarray) -> np.ndarray:
-    """Log-odds of values in (0, 1)."""
-    return np.log(values) - np.log1p(np.negative(values))
-
-
-def _wilson(value: np.ndarray, n: int, quantile: np.ndarray) -> np.ndarray:
-    """Ends of Wilson's interval of a fraction of n units, with a quantile of Student's t."""
-    shift = quantile**2 / n
-    center = (value + shift / 2) / (1 + shift)
-    half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
-    return np.clip([center - half_width, center + half_width], 0, 1)
-
-
-def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Compute means over images that count several times: (..., n) and (k, n) to (..., k)."""
-    return values @ counts.T / counts.sum(axis=-1)
-
-
-def class_means(
-    hits: Bool[np.ndarray, "... n"], names: Sequence[str], counts: Num[np.ndarray, "k n"]
-) -> Float[np.ndarray, "... k"]:
-    """Compute the fraction of hits in each class, and average it over the classes.
-
-    This is the mean over all images if an image of a class with n images has
-    the weight 1 / n. `functools.partial(class_means, hits, names)` is a
-    statistic for `leave_out`. `hits` has a row for each definition of a hit, such as top-1, and
-    `counts` says how often each image counts.
-    """
-    _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
-    weights = 1 / class_sizes[class_of_image]
-    # Sums in the same order make a mean of ones exactly 1.
-    weight_of_image = weights * counts
-    return (hits[..., None, :] * weight_of_image).sum(axis=-1) / weight_of_image.sum(axis=-1)
-
-
-def auc_and_recalls(
-    positives: Num[np.ndarray, "... n"],
-    negatives: Num[np.ndarray, "... m"],
-    positive_counts: Int[np.ndarray, "... n"] | None = None,
-    negative_counts: Int[np.ndarray, "... m"] | None = None,
-) -> Float[np.ndarray, "4 ..."]:
-    """Compute the AUC, and the recall at each false-positive rate in `RATES`.
-
-    The AUC is the probability that a random positive has a higher score than a
-    random negative. A tie counts half (Mann and Whitney 1947). The recall is the
-    fraction of the positives that score above the threshold for a
-    false-positive rate. A positive at the threshold counts as missed. The counts say how often each
-    image counts. None counts each once.
-    """
-    if positive_counts is None:
-        positive_counts = np.ones(positives.shape[-1], int)
-    if negative_counts is None:
-        negative_counts = np.ones(negatives.shape[-1], int)
-    positive_total = positive_counts.sum(axis=-1)
-
-    order = negatives.argsort(axis=-1)
-    sorted_negatives = _take(negatives, order)
-    # Entry i of `counts_below` is the sum of the counts of the i negatives with the
-    # lowest scores, for i from 0 to m, shape (..., m + 1).
-    counts_below = np.insert(_take(negative_counts, order).cumsum(axis=-1), 0, 0, axis=-1)
-    negative_total = counts_below[..., -1]
-    # Number of negatives with a lower score than each positive, shape (..., n).
-    lower = _take(counts_below, _search(sorted_negatives, positives, "left"))
-    # Number of negatives whose score is lower than that of each positive, or equal to it.
-    lower_or_equal = _take(counts_below, _search(sorted_negatives, positives, "right"))
-    wins = (positive_counts * lower).sum(axis=-1)
-    wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)
-    # The mean of both numbers counts a tie half.
-    auc = (wins + wins_and_ties) / (2 * positive_total * negative_total)
-
-    recalls = []
-    for threshold in thresholds(negatives, negative_counts):
-        is_above = positives > threshold[..., None]
-        recalls.append((positive_counts * is_above).sum(axis=-1) / positive_total)
-    return np.stack([auc, *recalls])
-
-
-def thresholds(
-    negatives: Num[np.ndarray, "... m"],
-    counts: Int[np.ndarray, "... m"],
-    rates: Sequence[str] = RATES,
-) -> list[np.ndarray]:
-    """Find the score threshold for each false-positive rate.
-
-    The threshold is the score of a negative. It is the lowest such score that
-    at most the given fraction of the negatives exceed. With the rate 0.10 and
-    20 negatives, at most 2 negatives exceed the threshold. `rates` are decimal strings, because
-    these are exact.
-    """
-    order = negatives.argsort(axis=-1)
-    sorted_negatives = _take(negatives, order)
-    # Entry i is the sum of the counts of the i + 1 negatives with the lowest scores,
-    # shape (..., m).
-    counts_up_to = _take(counts, order).cumsum(axis=-1)
-    total = counts_up_to[..., -1]
-    thresholds_by_rate = []
-    for rate in rates:
-        # A float would be inexact: 0.29 * 100 is less than 29 and would become 28.
-        exact_rate = fractions.Fraction(rate)
-        allowed_above = exact_rate.numerator * total // exact_rate.denominator
-        needed_up_to = total - allowed_above
-        # The index is the number of scores that too many negatives exceed.
-        index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
-        thresholds_by_rate.append(_take(sorted_negatives, index[..., None])[..., 0])
-    return thresholds_by_rate
-
-
-def _take(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Take entries of the last axis: (..., n) and (..., k) to (..., k)."""
-    shape = np.broadcast_shapes(values.shape[:-1], indices.shape[:-1])
-    values, indices = (np.broadcast_to(item, shape + item.shape[-1:]) for item in (values, indices))
-    return np.take_along_axis(values, indices, axis=-1)
-
-
-def _search(ascending: np.ndarray, scores: np.ndarray, side: str) -> np.ndarray:
-    """Find the places of scores in sorted arrays: (..., m) and (..., n) to (..., n)."""
-    search = np.vectorize(partial(np.searchsorted, side=side), signature="(m),(n)->(n)")
-    return search(ascending, scores)
-
-
-def roc_curve(
-    positives: Float[np.ndarray, " n"],
-    negatives: Float[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Compute the points of the ROC curve, from (0, 0) to (1, 1).
-
-    An image counts as detected if its score exceeds a threshold. Each distinct
-    score is the threshold of one point of the curve. The last point has the
-    threshold minus infinity, which all scores exceed. Return the false-positive rates, the recalls
-    and the descending thresholds.
-    """
-    distinct_scores = np.unique([*positives, *negatives])
-    descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
-    false_positive_rate = _fraction_above(negatives, descending_thresholds)
-    recall = _fraction_above(positives, descending_thresholds)
-    return false_positive_rate, recall, descending_thresholds
-
-
-def _fraction_above(
-    scores: Float[np.ndarray, " n"], thresholds: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, " k"]:
-    """Compute the fraction of the scores that exceed each threshold."""
-    count_at_or_below = np.sort(scores).searchsorted(thresholds, "right")
-    return (len(scores) - count_at_or_below) / len(scores)
 
 
 def metric_title(name: str) -> str:

@@ -45,6 +45,7 @@ from train.data.photographs import (
     require_outside,
     unsupported_files,
 )
+from train.results.intervals import thresholds
 from train.results.metrics import (
     COUNTED_EACH,
     FRACTION_METRICS,
@@ -56,7 +57,6 @@ from train.results.metrics import (
     Pooled,
     describe_point,
     metric_title,
-    thresholds,
     within_rank,
 )
 from train.results.pictures import contact_sheet, write_roc

@@ -12,7 +12,7 @@ from scipy.stats import t as student_t
 
 from benchmarks.coverage import Setup, heavy_tails, measure, two_modes
 from train.data.photo import Photograph
-from train.results.metrics import (
+from train.results.intervals import (
     RATES,
     Jackknife,
     Units,
@@ -21,10 +21,10 @@ from train.results.metrics import (
     class_means,
     leave_out,
     leave_out_of_roc,
-    pool,
     thresholds,
     weighted_means,
 )
+from train.results.metrics import pool
 from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
 
