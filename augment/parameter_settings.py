@@ -8,19 +8,16 @@ imports neither torch nor NumPy; see `renderer.settings`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
+from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError
 from renderer.settings import TURBIDITY, Settings, setting
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
-MAX_JOINT_ANGLE = 180.0  # degrees
 
-# Names of the fields of `PoseSettings` that have the units of an attack on the pose, except
-# `joints`.
+# Names of the fields of `PoseSettings` that have the units of an attack on the pose.
 POSE_PARTS = ("rotation", "shift", "scale", "view", "distance")
 
 # Names of the fields of `MaterialSettings` that have the units of the four values of an attack on
@@ -140,32 +137,18 @@ class PoseSettings(StepSettings):
         minimum=0,
         maximum=1,
     )
-    joints: Any = setting(
-        0.0,
-        "Largest rotation of the joints of a skinned mesh about each axis: of all joints, or "
-        "{name: degrees} of some.",
-        "degrees",
-    )
 
     def __post_init__(self) -> None:
-        """Check the limits of the joints, and that the attack can change something.
+        """Check that the attack can change something.
 
         Raises:
-            InputError: If a limit is not a number of degrees, or if all settings are 0.
+            InputError: If all settings are 0.
         """
         super().__post_init__()
-        limits = self.joints if isinstance(self.joints, Mapping) else {"joints": self.joints}
-        for name, degrees in limits.items():
-            if isinstance(degrees, bool) or not isinstance(degrees, int | float):
-                message = f"joints={self.joints}: give degrees, or {{name: degrees}}"
-                raise InputError(message, "joints")
-            argument = "joints" if name == "joints" else f"joints.{name}"
-            require_range(argument, degrees, 0, MAX_JOINT_ANGLE)
-        units = [getattr(self, name) for name in POSE_PARTS]
-        if not any([*limits.values(), *units]):
+        if not any(getattr(self, name) for name in POSE_PARTS):
             raise InputError(
-                f"{', '.join(POSE_PARTS)} and joints "
-                "are all 0, so the pose cannot change: set one of them above 0",
+                f"{', '.join(POSE_PARTS)} are all 0, so the pose cannot change: "
+                "set one of them above 0",
             )
 
 

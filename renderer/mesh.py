@@ -23,7 +23,6 @@ from renderer.creases import CREASE, normal_groups
 from renderer.errors import InputError, describe, require_choice, require_range
 from renderer.normals import doubled_area_vectors, plain_face_normals, vertex_normals
 from renderer.settings import MAX_VERTICES, NORMALS
-from renderer.skin import Skin
 from renderer.validation import as_array, require_whole
 
 # Affine matrix, shape (4, 4), that rotates the y-axis
@@ -89,8 +88,6 @@ class Mesh:
         gloss_textures: For each texture, a texture with factors for roughness
             and metallic, uint8, shape (H, W, 2) each, with 255 for the factor 1.
             Empty if the mesh has no gloss textures.
-        skin: Joints that move the vertices (linear blend skinning). None without
-            joints.
         normal_ids: Index of the normal of each of the three corners of each face,
             int64, shape (F, 3). With `normals="smooth"`, corners with the same
             index share a normal, which is computed anew if the vertices move. If
@@ -121,7 +118,6 @@ class Mesh:
     textures: tuple[np.ndarray, ...] = ()
     gloss: np.ndarray | None = None
     gloss_textures: tuple[np.ndarray, ...] = ()
-    skin: Skin | None = None
     # Always an array after `__post_init__`.
     normal_ids: np.ndarray = None  # type: ignore[assignment]
 
@@ -297,7 +293,7 @@ class Mesh:
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     def moved(self, vertices: np.ndarray) -> Mesh:
-        """Return a copy of the mesh with other vertex positions and without a skin.
+        """Return a copy of the mesh with other vertex positions.
 
         Args:
             vertices: Vertex positions of the copy, shape (V, 3).
@@ -305,7 +301,7 @@ class Mesh:
         Returns:
             Copy of the mesh, which shares the packed textures with this mesh.
         """
-        moved_mesh = replace(self, vertices=vertices, skin=None)
+        moved_mesh = replace(self, vertices=vertices)
         # Packing the textures again would take long. A
         # cached property stores its value in `__dict__`.
         moved_mesh.__dict__["packed_textures"] = self.packed_textures
@@ -406,8 +402,7 @@ def require_mesh(name: str, value: object) -> None:
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """Join several meshes to one mesh, which has the faces of all meshes in order.
 
-    Vertices are not merged. The result has the joints of the first mesh. These
-    joints do not move the vertices of meshes that have no joints.
+    Vertices are not merged.
     """
     faces = []
     texture_ids = []
@@ -434,7 +429,6 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
         gloss=_concatenate_gloss(meshes),
         gloss_textures=_concatenate_gloss_textures(meshes),
-        skin=_concatenate_skins(meshes),
         normal_ids=np.concatenate(normal_ids),
     )
 
@@ -464,18 +458,6 @@ def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...
         neutral_textures = (_NEUTRAL_GLOSS,) * len(mesh.textures)
         gloss_textures += mesh.gloss_textures or neutral_textures
     return tuple(gloss_textures)
-
-
-def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
-    """Create a skin for several meshes with the joints of the first one, or None if it has none."""
-    skin = meshes[0].skin
-    if skin is None:
-        return None
-    carried_by_mesh = []
-    for mesh in meshes:
-        zeros = np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32)
-        carried_by_mesh.append(mesh.skin.carried if mesh.skin else zeros)
-    return replace(skin, carried=np.concatenate(carried_by_mesh))
 
 
 def normalize(mesh: Mesh) -> Mesh:
@@ -511,11 +493,7 @@ def normalize(mesh: Mesh) -> Mesh:
     center, extent = center_and_extent(mesh)
     centered = mesh.vertices - center
     normalized = (centered / extent).astype(np.float32).astype(np.float64)
-    # Affine matrix that subtracts the center and divides by the extent.
-    matrix = np.eye(4)
-    matrix[:3] = np.column_stack([np.eye(3), -center]) / extent
-    skin = mesh.skin and mesh.skin.transformed(matrix)
-    return replace(mesh, vertices=normalized, skin=skin)
+    return replace(mesh, vertices=normalized)
 
 
 def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
@@ -550,7 +528,6 @@ def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
         corner_colors=mesh.corner_colors[:, corner_order],
         corner_uvs=mesh.corner_uvs[:, corner_order],
         normal_ids=mesh.normal_ids[:, corner_order],
-        skin=mesh.skin and mesh.skin.transformed(matrix),
     )
 
 
@@ -637,10 +614,6 @@ def _quartered(mesh: Mesh) -> Mesh:
     """
     edge_ends, edge_of_side = _shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
-    skin = mesh.skin
-    if skin is not None:
-        midpoint_shares = skin.carried[edge_ends].mean(axis=1)
-        skin = replace(skin, carried=np.concatenate([skin.carried, midpoint_shares]))
     # The midpoints follow the old vertices, so their indices begin at V.
     midpoint_vertices = len(mesh.vertices) + edge_of_side
     # Vertices of the three corners and of the
@@ -658,7 +631,6 @@ def _quartered(mesh: Mesh) -> Mesh:
         corner_uvs=_interpolate_quarters(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
-        skin=skin,
         normal_ids=normals[:, _QUARTERS].reshape(-1, 3),
     )
 

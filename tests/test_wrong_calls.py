@@ -980,7 +980,6 @@ ATTACKS = [
         NAN,
     ),
     *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", None, NAN),
-    *calls_of("joints", lambda x: augment.PoseSettings(joints=x), "elbow", None, 200.0, [30.0]),
     *calls_of("roughness", lambda x: augment.MaterialSettings(roughness=x), 2, "rough", None),
     *calls_of("zenith", lambda x: augment.SkylightSettings(zenith=x), "noon", None),
     *calls_of(

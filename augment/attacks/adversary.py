@@ -202,7 +202,7 @@ def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> S
         hue = None if changed.hue is None else _as_numpy(changed.hue)
         mesh, albedo_scale = with_added_albedo(mesh, added_albedo, encoding, albedo_scale, hue)
     if changed.vertices is not None:
-        mesh = replace(mesh, vertices=_as_numpy(changed.vertices), skin=None)
+        mesh = replace(mesh, vertices=_as_numpy(changed.vertices))
     if changed.gloss is not None:
         mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
     return replace(item, mesh=mesh, albedo_scale=albedo_scale)

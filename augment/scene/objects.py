@@ -252,7 +252,7 @@ def _load_prop(item: PropSettings) -> Mesh:
     turned = item.scale * mesh.vertices @ rotation.T
     used_vertices = np.unique(mesh.faces)
     lowest = turned[used_vertices, 2].min()
-    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]), skin=None)
+    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
 
 
 def _load(item: MeshSettings) -> Mesh:
@@ -291,7 +291,7 @@ def _load_with_color(item: MeshSettings) -> Mesh:
             "remove color, and set albedo_scale to make them brighter or darker",
         )
     colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
-    return replace(colored, gloss=mesh.gloss, skin=mesh.skin)
+    return replace(colored, gloss=mesh.gloss)
 
 
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:

@@ -21,7 +21,6 @@ from renderer.io.cutout import cut_out
 from renderer.io.gltf_file import GltfFile
 from renderer.io.gltf_material import QUANTIZATION, Material, ignored_features, read_material
 from renderer.io.mesh_file import MeshFile, Part, require_bounded
-from renderer.io.skins import Skeleton
 from renderer.memory import require_memory
 from renderer.mesh import NO_TEXTURE, Mesh
 
@@ -43,10 +42,14 @@ ATTRIBUTES = {
 # Beginnings of the names of attributes that joints use.
 SKINNING = ("JOINTS", "WEIGHTS")
 DRACO = "KHR_draco_mesh_compression"
-# Bytes that a face, a vertex, and a joint of a vertex take while the parts are read and joined.
+# Bytes that a face and a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
 VERTEX_BYTES = 400
-JOINT_BYTES = 200
+# The same for a vertex that joints move.
+SKINNED_VERTEX_BYTES = 1000
+# The weights of the joints of a vertex should add up to 1. Their sum may
+# differ from 1 by at most this much, because weights with 8 bits are rounded.
+MAX_WEIGHT_ERROR = 0.01
 
 
 @dataclass(frozen=True)
@@ -75,23 +78,20 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for feature in ignored_features(file.tree):
         mesh_file.ignore(feature)
     nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
-    skeleton = Skeleton(file) if file.tree.get("skins") else None
-    _require_memory(file, nodes, 0 if skeleton is None else len(skeleton))
+    _require_memory(file, nodes)
     material = cache(lambda index: read_material(file, index, gloss))
     part = cache(lambda *key: _read_part(file, material, *key))
     placed_parts = []
     for index in nodes:
         node = file.tree["nodes"][index]
         mesh = file.entry("meshes", node["mesh"])
-        if "skin" in node:
-            file.entry("skins", node["skin"])
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
             if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
                 mesh_file.ignore("points and lines")
             else:
                 read = part(node["mesh"], number, weights)
-                placed_parts += _place(file, index, read, skeleton)
+                placed_parts += _place(file, index, read)
     if not placed_parts and any(
         m.get("alphaMode") == "MASK" for m in file.tree.get("materials", ())
     ):
@@ -99,7 +99,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     return placed_parts
 
 
-def _require_memory(file: GltfFile, nodes: list[int], joint_count: int) -> None:
+def _require_memory(file: GltfFile, nodes: list[int]) -> None:
     """Check that the faces that the nodes show fit into the memory, before arrays are read.
 
     A small file can show one mesh very often, or declare an array of zeros.
@@ -114,7 +114,7 @@ def _require_memory(file: GltfFile, nodes: list[int], joint_count: int) -> None:
                 corners = file.entry("accessors", primitive["indices"])["count"]
             faces = corners / 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else corners
             copies = file.instance_count(index)
-            vertex_bytes = VERTEX_BYTES + JOINT_BYTES * joint_count
+            vertex_bytes = SKINNED_VERTEX_BYTES if "skin" in node else VERTEX_BYTES
             needed += copies * int(FACE_BYTES * faces + vertex_bytes * vertices)
     require_memory("its faces", needed, torch.device("cpu"))
 
@@ -216,25 +216,25 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
     return faces[is_face]
 
 
-def _place(file: GltfFile, node: int, part: _Primitive, skeleton: Skeleton | None) -> list[Part]:
+def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
     """Place a part in the scene, once for each copy that a node shows, and cut out its holes."""
     if not len(part.faces):
         return []
-    poses = file.instances(node)
+    poses = file.instances(index)
     vertices = part.positions
-    if skeleton is not None:
+    node = file.tree["nodes"][index]
+    if "skin" in node:
         if len(poses) > 1:
-            raise ValueError("it shows several copies of a mesh in a file with joints")
-        carried, placed, pose = skeleton.posed(node, part.positions, part.joints)
+            raise ValueError("it shows several copies of a mesh that joints move")
+        vertices, pose = _posed(file, file.entry("skins", node["skin"]), part)
         poses = pose[None]
-        vertices = np.concatenate([vertices, placed, carried.reshape(len(vertices), -1)], axis=1)
     vertices, faces, corners = _visible(part, vertices)
     if not len(faces):
         return []
     texture_id = NO_TEXTURE if part.material.texture is None else 0
     gloss = part.material.gloss
     mesh = Mesh(
-        vertices=vertices[:, :3],
+        vertices=vertices,
         faces=faces,
         corner_colors=encode(torch.from_numpy(corners[..., 3:6]), "srgb").float().numpy(),
         corner_uvs=corners[..., :2].astype(np.float32),
@@ -248,13 +248,52 @@ def _place(file: GltfFile, node: int, part: _Primitive, skeleton: Skeleton | Non
         ),
     )
     normals = corners[..., 6:] if corners[..., 6:].any() else None
-    if skeleton is None:
+    if "skin" not in node:
         return [Part(mesh, normals, pose) for pose in poses]
-    carried = vertices[:, 6:].reshape(len(vertices), -1, 4).astype(np.float32)
     # The values of the normals are only compared, so they need not follow the joints.
     posed, normals = Part(mesh, normals, poses[0]).placed()
-    posed = replace(posed, vertices=vertices[:, 3:6], skin=skeleton.skin(carried))
-    return [Part(posed, normals)]
+    return [Part(replace(posed, vertices=vertices), normals)]
+
+
+def _posed(
+    file: GltfFile, skin: dict[str, Any], part: _Primitive
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "4 4"]]:
+    """Move the vertices of a part by the joints of its skin, in the pose of the nodes (3.7.3.3).
+
+    The result is the positions in the scene, and the matrix of the first joint, which tells
+    whether the part is mirrored.
+    """
+    matrices = np.stack([file.poses[joint] for joint in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        # There may be more matrices than joints.
+        bind = file.array(skin["inverseBindMatrices"])[: len(matrices)]
+        if len(bind) < len(matrices):
+            raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
+        matrices = matrices @ bind
+    # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
+    blended = np.zeros((len(part.positions), 4, 4))
+    sums = np.zeros(len(part.positions))
+    for name in part.joints:
+        if not name.startswith("JOINTS"):
+            continue
+        weights = part.joints[name.replace("JOINTS", "WEIGHTS")]
+        # A joint with the weight 0 may be any number, so it is replaced by joint 0.
+        joints = np.where(weights == 0, 0, part.joints[name])
+        if not 0 <= joints.min() <= joints.max() < len(matrices):
+            raise ValueError(
+                f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
+            )
+        for joint, weight in zip(joints.T, weights.T, strict=True):
+            blended += weight[:, None, None] * matrices[joint]
+            sums += weight
+    deviations = np.abs(sums - 1)
+    # A comparison with NaN is False, so `not` also finds NaN.
+    if not (deviations <= MAX_WEIGHT_ERROR).all():
+        worst = sums[deviations.argmax()]
+        raise ValueError(f"the weights of a vertex add up to {worst:g} instead of 1")
+    blended /= sums[:, None, None]
+    positions = np.einsum("vij,vj->vi", blended[:, :3, :3], part.positions) + blended[:, :3, 3]
+    return positions, matrices[0]
 
 
 def _visible(part: _Primitive, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

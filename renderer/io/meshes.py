@@ -47,8 +47,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     the vertex or face colors, as far as the file has them, as linear values.
     Without any of them, the color is white. A glTF file with transparent parts is cut out where its
     material says so (alphaMode MASK), or refused (BLEND). It has the shape of its
-    default morph weights, and the pose and the joints of its skins. What changes
-    neither the shape nor the base color, such as a normal texture, is ignored,
+    default morph weights, and the pose of its skins. What changes neither
+    the shape nor the base color, such as a normal texture, is ignored,
     and a warning names it. Files beside the mesh are read only below its folder.
 
     Args:
@@ -124,27 +124,14 @@ def _share_textures(mesh: Mesh) -> Mesh:
 def _merge_vertices(mesh: Mesh, normals: np.ndarray) -> Mesh:
     """Return a copy of a mesh in which vertices at the same position are merged.
 
-    Vertices that joints move in different ways are not merged. Vertices without
-    faces are dropped. `normals` are those of the file, or zero, shape (F, 3, 3).
+    Vertices without faces are dropped. `normals` are those of the file, or zero, shape (F, 3, 3).
     They decide which edges are sharp.
     """
-    # Vertices with equal keys are merged. The key is the position.
-    vertex_keys = mesh.vertices
-    skin = mesh.skin
-    if skin is not None:
-        # The key also has a number. It is the same
-        # for vertices that all joints move alike.
-        distinct_shares, shares_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
-        vertex_keys = np.column_stack([vertex_keys, shares_of_vertex.ravel()])
-    corner_keys = vertex_keys[mesh.faces].reshape(-1, vertex_keys.shape[1])
-    merged_keys, vertex_of_corner = np.unique(corner_keys, axis=0, return_inverse=True)
-    if skin is not None:
-        shares_of_merged = merged_keys[:, -1].astype(np.int64)
-        skin = replace(skin, carried=distinct_shares[shares_of_merged])
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    vertices, vertex_of_corner = np.unique(corners, axis=0, return_inverse=True)
     faces = vertex_of_corner.reshape(-1, 3)
-    vertices = merged_keys[:, :3]
     normal_ids = normal_groups(vertices, faces, normals)
-    return replace(mesh, vertices=vertices, faces=faces, skin=skin, normal_ids=normal_ids)
+    return replace(mesh, vertices=vertices, faces=faces, normal_ids=normal_ids)
 
 
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:

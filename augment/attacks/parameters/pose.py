@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -15,24 +14,21 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import PoseSettings
-from augment.scene.objects import Conditions, SceneObject
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
 from renderer.light.ball import Ball, nearest_in_box
-from renderer.skin import Skin
 from renderer.vectors import rotation_matrices
 
 # An attack on the pose changes a vector of values. The following constants are positions in it:
 # of the rotation vector of the object, of its shift along x and y, of the logarithm of its scale,
-# of the three changes of the cameras (the last is the logarithm of their distance), and of the
-# first value of the rotation vectors of the joints, which come last.
+# and of the three changes of the cameras (the last is the logarithm of their distance).
 ROTATION = slice(0, 3)
 SHIFT = slice(3, 5)
 SCALE = 5
 CAMERA = slice(6, 9)
 DISTANCE = 8
-JOINTS = 9
 
 # An attack on the pose may let the object grow and the camera approach. Each may close this
 # fraction of the gap between them. The sum is below 1, so they never meet.
@@ -49,12 +45,10 @@ class Pose(Parameter):
     - its shift along x and y (2),
     - the logarithm of its scale (1),
     - the changes of the polar angle, the azimuth and the logarithm of the
-      distance of all cameras (3),
-    - a rotation vector for each joint, if joints are attacked (3 each).
+      distance of all cameras (3).
 
-    Joints rotate before the object does. If another parameter displaces the
-    vertices, it does so before. An object with props or a table keeps standing
-    on the same ground.
+    If another parameter displaces the vertices, it does so before. An object
+    with props or a table keeps standing on the same ground.
     """
 
     name = "pose"
@@ -69,12 +63,10 @@ class Pose(Parameter):
             )
         self._object_of = scene.object_of
         self._vertices = scene.vertices
-        self._movable_objects = _movable_objects(scene, settings)
-        units = [_pose_units(settings, item) for item in scene.objects]
-        # One row of D units for each object. The units of joints that an object lacks are 0.
-        self._unit = pad_sequence(units, batch_first=True).to(scene.lights)
+        self._movable_objects = _movable_objects(scene)
+        self._unit = _pose_units(settings).to(scene.lights)
         self._limit = self._largest_values(scene, settings)
-        used_mask = (self._unit > 0)[scene.object_of]
+        used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
         start = self._unit.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
 
@@ -82,8 +74,7 @@ class Pose(Parameter):
         """Compute the largest magnitude of each attack value, shape (D,).
 
         Scale and distance are limited, so that the object and a perspective
-        camera do not meet. The rotations of joints are at most 1, because their
-        units are their limits. The other values have no limit.
+        camera do not meet. The other values have no limit.
         """
         all_cameras = chain.from_iterable(scene.cameras)
         cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
@@ -94,11 +85,10 @@ class Pose(Parameter):
         log_gap = math.log(min(distances, default=math.inf) / object_radius)
         largest_log_factor = max(MAX_APPROACH * log_gap, 0.0)
 
-        limit = self._unit.new_full((self._unit.shape[1],), math.inf)
-        # The units of scale and distance are the same for all objects. A unit may be 0.
-        units = self._unit[0, [SCALE, DISTANCE]].clamp(min=1e-9)
+        limit = torch.full_like(self._unit, math.inf)
+        # A unit may be 0.
+        units = self._unit[[SCALE, DISTANCE]].clamp(min=1e-9)
         limit[[SCALE, DISTANCE]] = largest_log_factor / units
-        limit[JOINTS:] = 1.0
         return limit
 
     def apply(
@@ -110,7 +100,7 @@ class Pose(Parameter):
         parameter has displaced are moved, too.
         """
         objects = self._object_of[examples]
-        changes = values * self._unit[objects]
+        changes = values * self._unit
         vertices = conditions.vertices
         if vertices is None:
             vertices = self._vertices[objects]
@@ -125,28 +115,26 @@ class Pose(Parameter):
     def project_feasible(
         self, values: Float[Tensor, "A D"], within: Ball | None = None
     ) -> Float[Tensor, "A D"]:
-        """Find the nearest values at which object and camera do not meet and joints can rotate."""
+        """Find the nearest values at which object and camera do not meet."""
         return nearest_in_box(values, -self._limit, self._limit, within)
 
 
-def _pose_units(settings: PoseSettings, item: SceneObject) -> Float[Tensor, " D"]:
+def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
     """Return the units of the attack values of a pose.
 
     They are those of the rotation vector in degrees (3), the shift in world units (2), the
-    logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), the logarithm
-    of their distance (1), and a rotation vector in degrees for each attacked joint (3 each).
+    logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
+    logarithm of their distance (1).
     """
     units = [settings.rotation, settings.rotation, settings.rotation]
     units += [settings.shift, settings.shift]
     units += [math.log1p(settings.scale)]
     units += [settings.view, settings.view]
     units += [math.log1p(settings.distance)]
-    for joint_angle in joint_limits(settings, item):
-        units += [joint_angle, joint_angle, joint_angle]
     return torch.tensor(units, dtype=torch.float64)
 
 
-def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObject]:
+def _movable_objects(scene: Scene) -> list[_MovableObject]:
     """Create a movable copy of each object of a scene, in the order of `scene.objects`."""
     masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
     # One row for each object, one column for each of the N vertices of the largest mesh.
@@ -159,8 +147,6 @@ def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObjec
             _MovableObject(
                 object_mask=object_mask,
                 ground_height=item.lowest if stands_on_ground else None,
-                skin=item.mesh.skin,
-                rotated_joint_count=len(joint_limits(settings, item)),
             )
         )
     return movable_objects
@@ -175,27 +161,20 @@ class _MovableObject:
             not to props or table, shape (N,).
         ground_height: z coordinate of the ground on which the object stands.
             None for an object without props or table, which may float.
-        skin: Joints of the mesh and the vertices that they carry. None for a
-            rigid object.
-        rotated_joint_count: Number of joints that rotate: all joints of the
-            skin, or 0 if joints are not attacked.
     """
 
     object_mask: Bool[Tensor, " N"]
     ground_height: float | None
-    skin: Skin | None
-    rotated_joint_count: int
 
     def move(
         self, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
     ) -> Float[Tensor, "N 3"]:
-        """Move the object: rotate its joints, then scale, rotate and shift it.
+        """Scale, rotate and shift the object.
 
         The change is in degrees, world units and logarithms, in the order of `_pose_units`. Props
         and table do not move, and the lowest vertex of an object on a ground stays on it.
         """
-        bent = self._bend(vertices, change[JOINTS : JOINTS + 3 * self.rotated_joint_count])
-        scaled = change[SCALE].exp() * bent
+        scaled = change[SCALE].exp() * vertices
         rotated = scaled @ rotation_matrices(change[ROTATION]).T
         # Append 0 for the shift along z.
         shift = F.pad(change[SHIFT], (0, 1))
@@ -203,44 +182,4 @@ class _MovableObject:
         if self.ground_height is not None:
             lift = self.ground_height - moved[self.object_mask, 2].amin()
             moved = moved + lift * moved.new_tensor([0, 0, 1])
-        return torch.where(self.object_mask[:, None], moved, bent)
-
-    def _bend(self, vertices: Float[Tensor, "N 3"], joint_rotations: Float[Tensor, " D"]) -> Tensor:
-        """Rotate the J joints, and return all vertices after that, shape (N, 3).
-
-        The rotation vectors of the joints are in degrees, one after the other.
-        """
-        if self.skin is None or not self.rotated_joint_count:
-            return vertices
-        # One rotation matrix for each joint, shape (J, 3, 3).
-        rotations = rotation_matrices(joint_rotations.view(-1, 3))
-        # Displacement of each vertex of this object's mesh.
-        displacement = self.skin.displacements(rotations)
-        # `vertices` has as many rows as the largest mesh of the scene. The additional rows of a
-        # smaller mesh do not move.
-        padding_count = len(vertices) - len(displacement)
-        return vertices + F.pad(displacement, (0, 0, 0, padding_count))
-
-
-def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
-    """Return the largest rotation of each joint of an object, as an attack permits it.
-
-    The limits of each joint of the skin about each axis are in degrees. The list is empty if no
-    joint is attacked.
-    """
-    if not settings.joints:
-        return []
-    if item.mesh.skin is None:
-        message = f"joints: {item.name} has no skin: give a glTF file with one, or joints=0"
-        raise InputError(message, "joints")
-    names = item.mesh.skin.names
-    limits = settings.joints
-    if not isinstance(limits, Mapping):
-        limits = dict.fromkeys(names, limits)
-    for name in limits:
-        if name not in names:
-            raise InputError(
-                f"joints: {item.name} has no joint {name}: choose from {', '.join(names)}",
-                "joints",
-            )
-    return [float(limits.get(name, 0)) for name in names]
+        return torch.where(self.object_mask[:, None], moved, vertices)

@@ -612,7 +612,6 @@ def test_the_mask_of_a_posed_and_mirrored_mesh_is_cut_out(tmp_path):
     assert mesh.face_areas().sum() == pytest.approx(2, rel=1e-6)
     assert mesh.vertices[:, 0].max() == pytest.approx(-1, rel=1e-6)
     assert (mesh.face_normals()[:, 2] > 0.99).all()
-    assert_allclose(mesh.skin.carried.sum(axis=1)[:, :3], mesh.vertices, atol=1e-6)
 
 
 @pytest.mark.parametrize("roots", [[0, 2, 3], [0, 2]])
@@ -731,22 +730,6 @@ def small_file_of_a_large_image() -> Gltf:
     return gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
 
 
-def small_file_of_many_joints() -> Gltf:
-    gltf = Gltf()
-    count = 2000
-    positions = np.tile(np.float32(SQUARE[:3]), (1000, 1))
-    gltf.mesh(
-        {
-            "POSITION": positions,
-            "JOINTS_0": np.zeros((3000, 4), np.uint8),
-            "WEIGHTS_0": np.float32([[1, 0, 0, 0]] * 3000),
-        }
-    )
-    gltf.tree["nodes"] = [{"mesh": 0, "skin": 0}, *({} for _ in range(count))]
-    gltf.tree["skins"] = [{"joints": list(range(1, count + 1))}]
-    return gltf
-
-
 @pytest.mark.parametrize(
     "create",
     [
@@ -754,7 +737,6 @@ def small_file_of_many_joints() -> Gltf:
         small_file_of_zeros,
         small_file_of_unused_vertices,
         small_file_of_a_large_image,
-        small_file_of_many_joints,
     ],
 )
 def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):

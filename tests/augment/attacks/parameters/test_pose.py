@@ -5,19 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import skinned_arm
 import torch
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import pad
 
 import augment
-import renderer
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.problem import SceneProblem
 from augment.parameter_settings import POSE_PARTS
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.mesh import Mesh
 
 ONLY = dict.fromkeys(POSE_PARTS, 0.0)  # Add the parts that may change.
 MESHES = Path(__file__).parents[5] / "shared" / "data" / "meshes"
@@ -169,69 +166,6 @@ def test_an_adversarial_pose_is_read_back_to_its_image_and_camera(result, tmp_pa
     assert camera.polar != result.problem.scene.cameras[0][0].polar
 
 
-# --------------------------------------------------------------- joints
-
-
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory) -> Mesh:
-    """Return an arm with a shoulder, an elbow and a wrist."""
-    path = tmp_path_factory.mktemp("arm") / "arm.glb"
-    return renderer.load_mesh(skinned_arm.write(path))
-
-
-@pytest.fixture(scope="module")
-def bending(arm) -> SceneProblem:
-    """Return an attack on the pose of the arm, whose shoulder is stiff."""
-    options = {"silhouettes": True, "rasterizer": "numpy", "ground": GRAY}
-    scene = augment.build_scene([(arm, "arm")], 16, **options)
-    scene = scene.changed(lights=scene.lights.double())
-    settings = augment.PoseSettings(radius=3.0, joints={"elbow": 60.0, "wrist": 30})
-    return SceneProblem(scene, [Pose(scene, settings)])
-
-
-def test_joints_are_drawn_within_their_limits_and_stiff_ones_not_at_all(bending):
-    draws = random_poses(bending, 100)
-    assert draws[:, :9].max() > 2.5  # the ball's radius is 3
-    assert (draws[:, 9:12] == 0).all()
-    assert (draws[:, 12:].abs().amax(0) == 1).all()
-
-
-def test_joints_bend_before_the_object_turns(bending):
-    values = torch.zeros(1, 18, dtype=torch.float64)
-    values[0, 2] = 9.0  # a quarter turn about the vertical axis
-    values[0, 12] = 0.5  # the elbow about x
-    values[0, 16] = -1.0  # the wrist about y
-    values[0, 17] = 0.2  # the wrist about z
-    moved = bending.conditions(values, FIRST).vertices[0].numpy()
-
-    degrees = [[0, 0, 0], [30, 0, 0], [0, -30, 6]]
-    bends = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
-    item = bending.scene.objects[0]
-    before = item.mesh.vertices
-    bent = before + item.mesh.skin.displacements(torch.tensor(bends)).numpy()
-    expected = Rotation.from_rotvec([0, 0, 90], degrees=True).apply(bent)
-    is_own = item.own_vertices
-    put_on_ground(expected, before, is_own)
-    np.testing.assert_allclose(moved[is_own], expected[is_own], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(moved[~is_own], before[~is_own])
-
-
-def test_descent_by_the_joints_alone_beats_random_poses_and_is_read_back(arm, by_color, tmp_path):
-    """There are as many random poses as descent renders."""
-    colors = np.zeros_like(arm.corner_colors)
-    colors[:] = [0.9, 0.1, 0.1]
-    red = replace(arm, corner_colors=colors)
-    options = {"silhouettes": True, "samples": 4, "rasterizer": "numpy", "width": 2.2}
-    scene = augment.build_scene([(red, "orange")], 8, **options)
-    pose = augment.PoseSettings("linf", 1.0, "sign", 0.2, **ONLY, joints=60.0)
-    settings = augment.AttackSettings(pose=pose, max_steps=12, margin=1000.0, backtracking=True)
-    result = augment.attack(by_color, scene, settings=settings, force=True)
-    best_draw = costs(result, by_color, random_poses(result.problem, 12)).min()
-    assert result.descent.cost[0] < best_draw < result.descent.cost_before[0]
-    [line] = augment.save(result, tmp_path)
-    assert line["versions"]["reload"]["largest_difference"] < 1e-4
-
-
 # --------------------------------------------------------------- errors
 
 
@@ -247,28 +181,6 @@ def test_a_pose_without_outlines_is_refused():
 def test_settings_without_parts_or_out_of_range_are_refused(units, message):
     with pytest.raises(InputError, match=message):
         augment.PoseSettings(**units)
-
-
-@pytest.mark.parametrize(
-    ("joints", "message"),
-    [
-        (200, "joints=200"),
-        ({"elbow": -1}, "joints.elbow=-1"),
-        ({"elbow": "far"}, "degrees"),
-        ({"elbow": True}, "degrees"),
-        (True, "degrees"),
-        ({"elbow": 10, "knee": 10}, "knee: choose from shoulder, elbow, wrist"),
-    ],
-)
-def test_joints_that_cannot_move_are_refused(arm, joints, message):
-    scene = augment.build_scene([(arm, "arm")], 8, silhouettes=True)
-    with pytest.raises(InputError, match=message):
-        problem_of(scene, joints=joints)
-
-
-def test_joints_of_a_mesh_without_a_skin_are_refused():
-    with pytest.raises(InputError, match="pear:0 has no skin"):
-        problem_of(scene_of(), joints=10)
 
 
 @pytest.mark.parametrize(
