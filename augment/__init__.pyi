@@ -9,7 +9,7 @@ from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
 from augment.attacks.files import save as save
 from augment.attacks.result import AttackResult as AttackResult
-from augment.network import Classifier as Classifier
+from augment.classifier import Classifier as Classifier
 from augment.parameter_settings import MaterialSettings as MaterialSettings
 from augment.parameter_settings import ParameterSettings as ParameterSettings
 from augment.parameter_settings import PoseSettings as PoseSettings

@@ -14,19 +14,19 @@ import textwrap
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from augment.network import ArrayFunction, Classifier, Normalized, Wrapper
+from augment.classifier import Classifier
+from augment.network import ARRAYS, Function, Network, unwrapped
 from augment.plain_networks import (
-    NO_FACTS,
     USUAL_SIZE,
     NetworkFacts,
     as_classifier,
@@ -87,7 +87,7 @@ def is_network_file(name: str) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = False) -> Classifier:
+def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
     """Load a classifier from a file that contains its network.
 
     Without a size, that of the file counts or, if it tells none, 224. Without a normalization, the
@@ -108,7 +108,7 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS, trust_code: bool = Fals
     classifier = as_classifier(
         network, size or USUAL_SIZE, facts.classes, facts.normalization, name=name
     )
-    classifier.assumed = assumed_facts(size, normalization_of(classifier.function) or None)
+    classifier.assumed = assumed_facts(size, normalization_of(classifier.network) or None)
     _require_evaluation_outputs(classifier, name)
     return classifier
 
@@ -122,16 +122,9 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
     images = images.view(3, 3, classifier.size, classifier.size)
     with torch.no_grad():
-        first, second = (classifier.function(images[[0, other]]).float() for other in (1, 2))
+        first, second = (classifier.network(images[[0, other]]).float() for other in (1, 2))
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
         raise InputError(f"name={name} {IN_TRAINING_MODE}", "name")
-
-
-def build_file(
-    name: str, size: int, facts: NetworkFacts = NO_FACTS, trust_code: bool = False
-) -> Classifier:
-    """Load a classifier from a file, for images of another size."""
-    return load_file(name, replace(facts, size=size), trust_code)
 
 
 def _read(path: Path, trust_code: bool) -> Content:
@@ -178,7 +171,7 @@ def _read_torchscript(path: Path) -> Content:
         return Content(Scripted(torch.jit.load(path, map_location="cpu").eval()))
 
 
-class Scripted(Wrapper):
+class Scripted(Network):
     """Network of TorchScript that can be copied and then trained.
 
     `copy.deepcopy` of torch gives such a network weights that are not leaves of
@@ -263,7 +256,7 @@ def _is_readable(content: bytes) -> bool:
     return True
 
 
-class Exported(Wrapper):
+class Exported(Network):
     """Network of `torch.export`, which has only the mode in which it was exported."""
 
     def train(self, mode: bool = True) -> Self:
@@ -272,7 +265,7 @@ class Exported(Wrapper):
         return self
 
 
-class InBatches(Wrapper):
+class InBatches(Network):
     """Give a network batches of the one size that it takes, whatever the number of images is.
 
     The last batch is filled up with copies of the first image.
@@ -317,7 +310,7 @@ def read_onnx(path: Path) -> Content:
     def logits(batch: np.ndarray) -> np.ndarray:
         return session.run(None, {images.name: batch.astype(np.float32)})[0]
 
-    return Content(ArrayFunction(logits), sizes)
+    return Content(Function(logits, ARRAYS), sizes)
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
@@ -406,10 +399,10 @@ def is_torchscript(path: Path) -> bool:
 def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
     """Load weights into the network of a classifier.
 
-    The classifier, whose `function` is `Normalized`, is changed in place and returned.
+    The classifier is changed in place and returned.
     """
     try:
-        cast(Normalized, classifier.function).network.load_state_dict(state)
+        unwrapped(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
         raise InputError(

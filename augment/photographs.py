@@ -14,12 +14,12 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from augment.attack_settings import GRADIENT, RANDOM_SEARCH, AttackSettings, RelightingSettings
-from augment.attacks.eot import Quantized
 from augment.attacks.loop import minimize
 from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.optimizers import Gradient, Optimizer
-from augment.network import Classifier, frozen_eval_mode
+from augment.classifier import Classifier
+from augment.network import Network, Quantization, frozen_eval_mode
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import (
     UNIT_RANGE,
@@ -293,7 +293,7 @@ class _PhotographAttack:
         self.success_settings = success_settings
         self.seed = seed
         self.device = device_of(classifier)
-        self.model = Quantized(classifier)
+        self.model = Network(classifier, [Quantization()])
         has_gradients = classifier.is_differentiable(torch.empty(0, device=self.device))
         self.lights = LIGHTS if has_gradients else LIGHTS[:-1]
 

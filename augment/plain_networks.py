@@ -17,8 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from augment.classifier import Classifier, LogitNetwork, as_class_names
 from augment.distributed import rank
-from augment.network import AnyFunction, Classifier, NetworkCall, Normalized, as_class_names
+from augment.network import ChannelNormalization, Function, Network
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_device, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
@@ -39,7 +40,7 @@ USUAL_SIZE = 224
 # could look like probabilities by chance.
 CHECKED_COUNT = 2
 # Names of module classes of torchvision, kornia and this library that normalize images.
-NORMALIZING = frozenset({"Normalize", "Normalized"})
+NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
 # Names of buffers that contain the mean in networks that normalize images themselves.
 MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 
@@ -63,9 +64,6 @@ class NetworkFacts:
     classes: tuple[str, ...] | None = None
     size: int | None = None
     normalization: Normalization = None
-
-
-NO_FACTS = NetworkFacts()
 
 
 def assumed_facts(size: int | None, normalization: Normalization) -> tuple[str, ...]:
@@ -223,7 +221,7 @@ def _preprocessed(
     value_range: tuple[float, float],
 ) -> nn.Module:
     """Return a network that takes images in [0, 1], scales and normalizes them."""
-    module = network if isinstance(network, nn.Module) else AnyFunction(network)
+    module = network if isinstance(network, nn.Module) else Function(network)
     mean, std = mean_and_std(normalization)
     black, white = as_list("value_range", value_range, float | int, "the values of black and white")
     if not black < white:
@@ -242,11 +240,11 @@ def _preprocessed(
             f"white, {white:g}: give the mean in the units of value_range, or another value_range"
         )
     # A value x in [0, 1] becomes (black + span · x - mean) / std for the network. This is equal to
-    # (x - scaled_mean) / scaled_std, which `Normalized` computes.
+    # (x - scaled_mean) / scaled_std, which `ChannelNormalization` computes.
     span = white - black
     scaled_mean = [(value - black) / span for value in mean]
     scaled_std = [value / span for value in std]
-    return Normalized(module, scaled_mean, scaled_std).eval()
+    return Network(module, [ChannelNormalization(scaled_mean, scaled_std)]).eval()
 
 
 def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
@@ -290,8 +288,7 @@ def _count_outputs(
     """Call a network on gray images to find out the number of its classes."""
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
-    call = NetworkCall(argument)
-    return call(network, images.contiguous()).shape[1]
+    return LogitNetwork(network, argument)(images.contiguous()).shape[1]
 
 
 def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
@@ -310,7 +307,7 @@ def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) 
 
 def say_inputs_of(classifier: Classifier) -> None:
     """Log the size and the normalization of the images of a classifier."""
-    say_inputs(classifier.name, classifier.function, classifier.size, classifier.assumed)
+    say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
 
 
 @cache

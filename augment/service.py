@@ -22,8 +22,9 @@ from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
+from augment.classifier import LogitNetwork
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known
-from augment.network import NetworkCall, compute_outputs, frozen_eval_mode
+from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.scene.build import MeshSource, build_scene, with_needed_degree
@@ -289,7 +290,7 @@ class AugmentationService:
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
         require_seed("number", number)
-        model = CheckedNetwork(model)
+        model = LogitNetwork(model, "model")
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
@@ -549,24 +550,6 @@ def _describe_scene(scene: Scene) -> list[object]:
 def _rounded(values: Iterable[float]) -> list[str]:
     """Format numbers with three digits, so that rounding errors do not change the texts."""
     return [f"{float(value):.3g}" for value in values]
-
-
-class CheckedNetwork(nn.Module):
-    """Wrap a network, and check that it returns one row of logits for each image.
-
-    Attributes:
-        model: The network, from images to logits.
-    """
-
-    def __init__(self, model: nn.Module):
-        """Wrap a network."""
-        super().__init__()
-        self.model = model
-        self._call_network = NetworkCall("model")
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Return the logits of images, shape (N, 3, H, W)."""
-        return self._call_network(self.model, images)
 
 
 def select_examples_to_log(

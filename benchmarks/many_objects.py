@@ -33,7 +33,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.network import Classifier, compute_outputs
+from augment.classifier import Classifier
+from augment.network import compute_outputs
 from augment.projected_light import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square

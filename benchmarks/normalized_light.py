@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.settings import NormalizedLightSettings
 from benchmarks.splits import LABEL, TEST, VALIDATION, load, solids
 from train.command_settings import LabSettings

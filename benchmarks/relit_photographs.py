@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 import norm_balls as nb
-from augment.network import Classifier, compute_outputs
+from augment.classifier import Classifier
+from augment.network import compute_outputs
 from benchmarks.many_objects import ScoredGroup, mean_with_interval
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.tables import Estimate, format_interval

@@ -36,7 +36,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.network import Classifier
+from augment.classifier import Classifier
+from augment.plain_networks import NetworkFacts
 from augment.sources import build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
@@ -370,7 +371,7 @@ def load(name: str, size: int) -> Classifier:
     if not is_classifier(source):
         # The name of a folder may contain "=".
         return load_run(name)
-    classifier = build_classifier(source, size)
+    classifier = build_classifier(source, NetworkFacts(size=size))
     classifier.load_state_dict(load_network(source, weights or None).state_dict())
     return classifier
 

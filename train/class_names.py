@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from augment.network import class_index, nearest
+from augment.classifier import class_index, nearest
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.solids import HARD_NEGATIVES, SOLIDS

@@ -6,7 +6,7 @@ Python function.
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.network import Normalized, eval_mode
+from augment.network import ChannelNormalization, Network, eval_mode
+from augment.plain_networks import as_facts
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from train.settings import WIDERESNET
@@ -240,9 +241,8 @@ def build_network(
     """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
-        built = build_classifier(name, size, classes, normalization, trust_code)
-        module = cast(nn.Module, built.function)
-        return module.requires_grad_(True)
+        facts = as_facts(classes, size, normalization)
+        return build_classifier(name, facts, trust_code).network.requires_grad_(True)
     mean, std = mean or MEAN, std or STD
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
@@ -261,7 +261,7 @@ def build_network(
     try:
         if network is None:
             architecture = _build_architecture(name.removeprefix(TORCHVISION), len(classes), size)
-            network = Normalized(architecture, mean, std)
+            network = Network(architecture, [ChannelNormalization(mean, std)])
         _require_logits(network, len(classes), size)
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         raise InputError(
@@ -332,7 +332,11 @@ def describe(
         "encoding": encoding,
         **shape,
     }
+    # A network normalizes images itself, or by its last transform.
+    owner = (
+        network.transforms[-1] if isinstance(network, Network) and network.transforms else network
+    )
     for name in ("mean", "std"):
-        if hasattr(network, name):
-            description[name] = getattr(network, name).flatten().tolist()
+        if hasattr(owner, name):
+            description[name] = getattr(owner, name).flatten().tolist()
     return description

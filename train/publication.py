@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from augment.network import Classifier, OperatingPoint
+from augment.classifier import Classifier, OperatingPoint
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
 from train.command_settings import require_calibration
@@ -69,7 +69,7 @@ def load(name: str) -> PublishedNetwork:
     folder = published(PRETRAINED / name)
     loaded = load_run(folder)
     _, state = load_selected(folder)
-    network = PublishedNetwork(loaded.function, loaded.size, loaded.classes, name)
+    network = PublishedNetwork(loaded.network, loaded.size, loaded.classes, name)
     network.operating_points = loaded.operating_points
     network.results = _read_results(state["scores"])
     return network

@@ -13,8 +13,9 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from augment.classifier import Classifier, OperatingPoint
 from augment.files import is_network_file
-from augment.network import Classifier, OperatingPoint, unwrapped, with_normalized_light
+from augment.network import unwrapped, with_normalized_light
 from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier

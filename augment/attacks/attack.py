@@ -19,7 +19,8 @@ from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult
-from augment.network import Classifier, class_index, compute_outputs, remembering
+from augment.classifier import Classifier, class_index, remembering
+from augment.network import compute_outputs
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress

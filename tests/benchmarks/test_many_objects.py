@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 from torch import nn
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from benchmarks import many_objects, splits
 from train.data.photographs import TABLE
 from train.laboratory import lab_patterns

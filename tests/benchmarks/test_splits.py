@@ -12,8 +12,8 @@ import trimesh
 from PIL import Image
 from torchvision.models import squeezenet1_1
 
+from augment.network import normalize_light
 from augment.settings import NormalizedLightSettings
-from augment.transforms import normalize_light
 from benchmarks import splits
 from train.laboratory import lab_patterns as patterns
 

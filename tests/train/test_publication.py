@@ -35,7 +35,7 @@ class TestAPublishedNetwork:
         assert [path.name for path in published.iterdir()] == [PUBLISHED]
         network = load_run(published)
         assert network.classes == ("apple", "orange", "pear")
-        assert network.function.head.in_features == 64
+        assert network.network.head.in_features == 64
 
     def test_has_the_settings_without_paths(self, published, metadata, finished):
         assert metadata["settings"]["data.path"] == "tiny.npz"

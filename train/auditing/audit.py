@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError

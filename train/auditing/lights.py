@@ -25,7 +25,8 @@ from augment.attacks.find_scene import EXPOSURES
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions
-from augment.network import Classifier, compute_outputs
+from augment.classifier import Classifier
+from augment.network import compute_outputs
 from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from augment.attack_settings import RelightingSettings
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.photographs import ADVERSARIAL, RANDOM, SLIDE
 from train.command_settings import AuditSettings
 from train.results.first_screen import FirstScreen, ShownMetric

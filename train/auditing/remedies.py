@@ -7,7 +7,7 @@ needs no training. Hardening trains the network on renders in unusual lighting.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from train.results.compare import ALL, Evaluation, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.metrics import metric_title

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
 from renderer.io.export import export_mesh

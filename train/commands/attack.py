@@ -31,8 +31,9 @@ from augment.attacks.files import require_renderers, save
 from augment.attacks.find_scene import find_scene
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.result import AttackResult, predictions
+from augment.classifier import Classifier
 from augment.losses import NO_CLASS
-from augment.network import Classifier, compute_outputs
+from augment.network import compute_outputs
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.objects import SceneObject, add_table, load_object

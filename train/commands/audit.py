@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,

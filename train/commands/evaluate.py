@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.network import Classifier, Label, OperatingPoint
+from augment.classifier import Classifier, Label, OperatingPoint
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,

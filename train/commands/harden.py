@@ -11,7 +11,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from augment.network import Classifier, unwrapped
+from augment.classifier import Classifier
+from augment.network import unwrapped
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
@@ -258,7 +259,7 @@ def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.M
     A returned classifier has no operating points, because its logits differ.
     """
     if isinstance(network, Classifier):
-        target = deepcopy(classifier.function)
+        target = deepcopy(classifier.network)
         copy: nn.Module = Classifier(target, classifier.size, classifier.classes, classifier.name)
     else:
         copy = deepcopy(network)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from augment.network import Label, class_index, nearest
+from augment.classifier import Label, class_index, nearest
 from augment.progress import progress
 from renderer.errors import InputError, composed, single_line
 from renderer.io.images import read_square

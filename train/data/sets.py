@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
-from augment.network import class_index
+from augment.classifier import class_index
 from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, single_line

@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attack_settings import RelightingSettings
-from augment.network import Classifier
+from augment.classifier import Classifier
 from augment.photographs import (
     ADVERSARIAL,
     RANDOM,

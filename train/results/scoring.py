@@ -14,22 +14,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_names
 from augment.losses import log_odds
-from augment.network import (
-    Label,
-    NetworkCall,
-    OperatingPoint,
-    as_class_names,
-    compute_outputs,
-    eval_mode,
-)
+from augment.network import compute_outputs
 from augment.progress import progress
 from renderer.errors import InputError, require_choice, require_range
 from renderer.io.files import atomic_write, remove_unfinished
@@ -205,9 +198,8 @@ def compute_logits(
             "the model has a single class, so its log-odds are infinite: "
             "evaluate a model with at least two classes",
         )
-    checked = partial(NetworkCall("model"), model)
-    with eval_mode(model):
-        logits = compute_outputs(checked, images, BATCH, device).cpu()
+    checked = LogitNetwork(model, "model")
+    logits = compute_outputs(checked, images, BATCH, device).cpu()
     expected = (len(images), classes)
     if logits.shape != expected:
         raise InputError(

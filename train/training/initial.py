@@ -7,8 +7,9 @@ from typing import Any, cast
 
 from torch import Tensor, nn
 
+from augment.classifier import Classifier
 from augment.files import is_network_file
-from augment.network import Classifier, without_normalized_light
+from augment.network import without_normalized_light
 from augment.plain_networks import as_facts, require_no_facts
 from augment.sources import load_source
 from renderer.errors import InputError
@@ -204,7 +205,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         facts = as_facts(settings.classes, known_size, settings.normalization)
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
-    network = cast(nn.Module, classifier.function)
+    network = cast(nn.Module, classifier.network)
     if not list(network.parameters()):
         raise InputError(
             f"network={name} is a network without weights that can be trained: "
@@ -223,7 +224,7 @@ def initial_of(classifier: Classifier, size: int | None) -> Initial:
 
     `size` is None for the size that the classifier takes.
     """
-    network = without_normalized_light(classifier.function)
+    network = without_normalized_light(classifier.network)
     shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
     if classifier.normalized_light is not None:
         shape[NORMALIZE_LIGHT] = asdict(classifier.normalized_light)

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from augment.network import eval_mode, nearest
+from augment.classifier import nearest
+from augment.network import eval_mode
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 

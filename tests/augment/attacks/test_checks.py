@@ -143,7 +143,7 @@ def smallest_radii(linear: AttackResult) -> Tensor:
     Within ε in every pixel, the gap of two logits falls by at most ε times |w₀ - w₁|₁.
     Each view has pixels of its own, and the worse of both decides.
     """
-    weight = linear.classifier.function[1].weight
+    weight = linear.classifier.network[1].weight
     gap = linear.logits_before[..., 0] - linear.logits_before[..., 1]
     slope = (weight[0] - weight[1]).abs().sum()
     return (gap / slope).amax(1)

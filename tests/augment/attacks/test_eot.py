@@ -11,7 +11,8 @@ from torch import Tensor, nn
 import augment
 from augment.attack_settings import EOTSettings
 from augment.attacks import eot
-from augment.attacks.eot import ExpectationOverTransformations, Quantized, as_jpeg
+from augment.attacks.eot import ExpectationOverTransformations, as_jpeg
+from augment.network import Network, Quantization
 from augment.random_streams import generator
 
 
@@ -47,7 +48,7 @@ def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list
 def test_a_model_is_given_bytes_and_its_derivative_ignores_the_rounding():
     means = Means()
     images = random_images(2, 3, 8, 8).requires_grad_()
-    Quantized(means)(images).sum().backward()
+    Network(means, [Quantization()])(images).sum().backward()
     [seen] = means.seen
     assert torch.equal((seen * 255).round() / 255, seen)
     assert (seen - images).abs().max() <= 0.5 / 255 + 1e-7

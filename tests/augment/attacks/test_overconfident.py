@@ -26,7 +26,7 @@ def attack(
     """Attack a network, whose logits are multiplied by a factor, in eight views."""
 
     def logits(images: torch.Tensor) -> torch.Tensor:
-        return factor * network.function(images)
+        return factor * network.network(images)
 
     classifier = nb.Classifier(logits, network.size, network.classes)
     settings = nb.AttackSettings(

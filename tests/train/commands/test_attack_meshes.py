@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.attacks.checks import check
 from augment.attacks.result import AttackResult
-from augment.network import Classifier
+from augment.classifier import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
-from augment.network import OperatingPoint
+from augment.classifier import OperatingPoint
 from tests.runs import completed_run
 from train.__main__ import main
 
@@ -169,7 +169,7 @@ def test_a_classifier_is_hardened_as_its_network_is(network, photographs):
     hardened = harden(classifier, photographs, **options)
     expected = harden(network, photographs)
     assert isinstance(hardened, nb.Classifier)
-    assert torch.equal(hardened.function[4].weight, expected[4].weight)
+    assert torch.equal(hardened.network[4].weight, expected[4].weight)
 
 
 def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, photographs):
@@ -178,7 +178,7 @@ def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, 
     hardened = harden(classifier, photographs, classes=None, size=None)
     assert type(plain) is type(network)
     assert hardened.normalized_light == nb.NormalizedLightSettings()
-    assert torch.equal(hardened.function.network[4].weight, plain[4].weight)
+    assert torch.equal(hardened.network.network[4].weight, plain[4].weight)
     assert not torch.equal(plain[4].weight, harden(network, photographs)[4].weight)
 
 

@@ -96,7 +96,7 @@ def test_weights_load_from_the_usual_wrappers(tmp_path, wrap):
     classifier = augment.load_classifier(f"torchvision:{NAME}", tmp_path / "wrapped.pth")
     for name, value in trained_weights().items():
         torch.testing.assert_close(
-            classifier.function.network.state_dict()[name], value, rtol=0, atol=0
+            classifier.network.network.state_dict()[name], value, rtol=0, atol=0
         )
 
 

@@ -11,10 +11,10 @@ from PIL import Image
 from torch import Tensor, nn
 from torchvision.models import get_model
 
+from augment.network import normalize_light
 from augment.plain_networks import _say_once
 from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
-from augment.transforms import normalize_light
 from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command
@@ -200,7 +200,7 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
     test = load_data(train_command.read([*SETTINGS, *files])).test
     classifier = load_classifier(f"torchvision:{NAME}", weights)
     class_of_label = torch.tensor([classifier.label("lemon"), classifier.label("orange")])
-    predicted = classifier.function(test.images / 255.0).argmax(1)
+    predicted = classifier.network(test.images / 255.0).argmax(1)
     is_correct = predicted == class_of_label[test.labels]
     assert scores["test/accuracy_before"] == pytest.approx(is_correct.float().mean().item())
 

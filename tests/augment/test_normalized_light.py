@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.network import Classifier, NormalizedLight
+from augment.classifier import Classifier
+from augment.network import LightNormalization, normalize_light
 from augment.plain_networks import as_classifier
 from augment.settings import NormalizedLightSettings
-from augment.transforms import normalize_light
 from renderer import InputError
 
 SIZE = 12
@@ -149,12 +149,7 @@ def test_light_is_not_normalized_twice():
         classifier.normalizing_light()
 
 
-@pytest.mark.parametrize("value", ["yes", {"exposure": 2}, {"white_balance": 2.0}, 1.5])
-def test_other_values_are_refused(value):
-    with pytest.raises(InputError, match="normalize_light"):
-        Classifier(Spy(), SIZE, ["red", "green", "blue"], normalize_light=value)
-
-
 def test_networks_with_other_settings_are_told_apart():
-    networks = [NormalizedLight(Spy(), NormalizedLightSettings(level=x)) for x in (0.5, 0.6)]
+    """Stored logits have keys with the text of the network."""
+    networks = [LightNormalization(NormalizedLightSettings(level=x)) for x in (0.5, 0.6)]
     assert str(networks[0]) != str(networks[1])
