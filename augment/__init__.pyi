@@ -1,6 +1,11 @@
 from augment.attack_settings import AttackSettings as AttackSettings
 from augment.attack_settings import EOTSettings as EOTSettings
+from augment.attack_settings import MaterialSettings as MaterialSettings
+from augment.attack_settings import ParameterSettings as ParameterSettings
+from augment.attack_settings import PoseSettings as PoseSettings
 from augment.attack_settings import RelightingSettings as RelightingSettings
+from augment.attack_settings import SkylightSettings as SkylightSettings
+from augment.attack_settings import StepSettings as StepSettings
 from augment.attacks.adversary import Adversary as Adversary
 from augment.attacks.adversary import reload as reload
 from augment.attacks.attack import attack as attack
@@ -10,11 +15,6 @@ from augment.attacks.checks import transfer as transfer
 from augment.attacks.files import save as save
 from augment.attacks.result import AttackResult as AttackResult
 from augment.classifier import Classifier as Classifier
-from augment.parameter_settings import MaterialSettings as MaterialSettings
-from augment.parameter_settings import ParameterSettings as ParameterSettings
-from augment.parameter_settings import PoseSettings as PoseSettings
-from augment.parameter_settings import SkylightSettings as SkylightSettings
-from augment.parameter_settings import StepSettings as StepSettings
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
 from augment.projected_light import relight_photographs as relight_photographs

@@ -13,14 +13,19 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from augment.attack_settings import GRADIENT, RANDOM_SEARCH, AttackSettings, RelightingSettings
+from augment.attack_settings import (
+    GRADIENT,
+    RANDOM_SEARCH,
+    AttackSettings,
+    RelightingSettings,
+    StepSettings,
+)
 from augment.attacks.loop import minimize
 from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.optimizers import Gradient, Optimizer
 from augment.classifier import Classifier
 from augment.network import Network, Quantization, frozen_eval_mode
-from augment.parameter_settings import StepSettings
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,

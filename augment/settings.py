@@ -11,8 +11,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.attack_settings import AttackSettings
-from augment.parameter_settings import StepSettings
+from augment.attack_settings import AttackSettings, StepSettings
 from renderer.errors import MAX_SCALE, InputError, describe, is_number, require_choice
 from renderer.settings import (
     MAX_DEGREE,

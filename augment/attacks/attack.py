@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.attack_settings import RANDOM_SEARCH, AttackSettings
+from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import Adversary
 from augment.attacks.eot import NOISE_DRAWS, preprocessed_model
 from augment.attacks.loop import Minimum, minimize
@@ -21,7 +21,6 @@ from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult
 from augment.classifier import Classifier, class_index, remembering
 from augment.network import compute_outputs
-from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator

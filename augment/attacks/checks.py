@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary
 from augment.attacks.attack import ZERO_GRADIENT, final_images
 from augment.attacks.loop import minimize
@@ -21,7 +22,6 @@ from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions, require_result
 from augment.classifier import Classifier
-from augment.parameter_settings import StepSettings
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator

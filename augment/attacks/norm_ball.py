@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.parameter_settings import StepSettings
+from augment.attack_settings import StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import Ball, nearest_in_box
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.parameter_settings import MaterialSettings
+from augment.attack_settings import MaterialSettings
 from augment.progress import progress
 from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_materials, load_object
 from augment.scene.scene import Scene

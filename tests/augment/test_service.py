@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
+from augment.attack_settings import StepSettings
 from augment.losses import complementary_label
-from augment.parameter_settings import StepSettings
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.objects import Conditions

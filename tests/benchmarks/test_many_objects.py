@@ -12,9 +12,9 @@ from PIL import Image
 from torch import nn
 
 from augment.classifier import Classifier
+from augment.scene import patterns
 from benchmarks import many_objects, splits
 from train.data.photographs import TABLE
-from train.laboratory import lab_patterns
 from train.results.tables import Estimate, fraction
 
 CLASSES = ["orange", "lemon", "packet"]
@@ -45,7 +45,7 @@ def data(tmp_path) -> Path:
 @pytest.mark.slow
 def test_each_class_has_equally_many_renders_in_each_light(data, monkeypatch):
     pytest.importorskip("mitsuba")
-    monkeypatch.setattr(lab_patterns, "RESOLUTION", 16)
+    monkeypatch.setattr(patterns, "LAB_RESOLUTION", 16)
     folders = ["--data", str(data), "--packages", str(data / "packages"), "--out", str(data / "o")]
     many_objects.main(["make", *folders, "--renders", "6", "--size", "8", "--spp", "1"])
     found = {split: many_objects.find_renders(data / "o" / split) for split in many_objects.OBJECTS}

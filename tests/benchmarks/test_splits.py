@@ -13,9 +13,9 @@ from PIL import Image
 from torchvision.models import squeezenet1_1
 
 from augment.network import normalize_light
+from augment.scene import patterns
 from augment.settings import NormalizedLightSettings
 from benchmarks import splits
-from train.laboratory import lab_patterns as patterns
 
 # Patterns, lights and meshes of training.
 TRAINING = {
@@ -92,7 +92,7 @@ def made_splits(data, monkeypatch) -> None:
     monkeypatch.setattr(splits, "parts", small_parts)
     small_lab = partial(splits.LabSettings, size=8, spp=1, bounces=1)
     monkeypatch.setattr(splits, "LabSettings", small_lab)
-    monkeypatch.setattr(patterns, "RESOLUTION", 64)
+    monkeypatch.setattr(patterns, "LAB_RESOLUTION", 64)
     splits.main(["make", *ARGUMENTS, "--data", "."])
 
 

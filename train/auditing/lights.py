@@ -18,7 +18,13 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
+from augment.attack_settings import (
+    NOISE_MARGIN,
+    RANDOM_SEARCH,
+    AttackSettings,
+    SkylightSettings,
+    StepSettings,
+)
 from augment.attacks.attack import attack
 from augment.attacks.checks import success_by_radius
 from augment.attacks.find_scene import EXPOSURES
@@ -27,7 +33,6 @@ from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions
 from augment.classifier import Classifier
 from augment.network import compute_outputs
-from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.build import build_local_light

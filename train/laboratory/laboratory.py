@@ -18,6 +18,7 @@ from PIL import Image
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from augment.scene.objects import load_object
+from augment.scene.patterns import LAB_RESOLUTION
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.files import atomic_write
@@ -31,7 +32,6 @@ from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.solids import HARD_NEGATIVES
 from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, TABLE
-from train.laboratory.lab_patterns import RESOLUTION
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.run_folder import LOCK, read_json, sole_writer
 from train.settings import OTHER_PREFIX, label_names, read_object, solid_name
@@ -301,8 +301,8 @@ def _write_render(
 
 
 def _read_slide(path: str) -> np.ndarray:
-    """Read a picture for a projector as linear RGB, shape (RESOLUTION, RESOLUTION, 3)."""
-    return decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy()
+    """Read a picture for a projector as linear RGB, shape (LAB_RESOLUTION, LAB_RESOLUTION, 3)."""
+    return decode(read_image(path, LAB_RESOLUTION), "srgb").permute(1, 2, 0).numpy()
 
 
 def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:

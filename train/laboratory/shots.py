@@ -17,9 +17,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from augment.random_streams import stream_seed
+from augment.scene.patterns import draw_lab_color, draw_lab_pattern
 from renderer.light.harmonics import equirectangular
 from train.command_settings import LabSettings
-from train.laboratory.lab_patterns import draw_color, draw_pattern
 
 # Vertical and horizontal field of view of the camera in degrees.
 FOV = 25.0
@@ -164,10 +164,10 @@ def _draw_shot(
     center = np.array([0, 0, CENTER_HEIGHT * scale])
     aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
     roughness = _draw_between(settings.roughness, extra_rng)
-    patterns = [draw_pattern(first_pattern, rng, slides)]
-    patterns += [draw_pattern(name, extra_rng, slides) for name in other_patterns]
-    ambient = _draw_between(settings.ambient, rng) * draw_color(rng)
-    table = _draw_between(settings.albedo, rng) * draw_color(rng)
+    patterns = [draw_lab_pattern(first_pattern, rng, slides)]
+    patterns += [draw_lab_pattern(name, extra_rng, slides) for name in other_patterns]
+    ambient = _draw_between(settings.ambient, rng) * draw_lab_color(rng)
+    table = _draw_between(settings.albedo, rng) * draw_lab_color(rng)
     projectors = [center + _draw_projector(settings, azimuth, rng)]
     projectors += [center + _draw_projector(settings, azimuth, extra_rng) for _ in other_patterns]
     camera_distance = half_width / math.tan(math.radians(FOV / 2))

@@ -12,13 +12,12 @@ from jaxtyping import Int, UInt8
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import AttackSettings, StepSettings
 from augment.attacks.loop import minimize_from
 from augment.attacks.norm_ball import NormBalls
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.optimizers import Gradient
 from augment.losses import label_loss
-from augment.parameter_settings import StepSettings
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
 from renderer.light.ball import Ball, nearest_in_box

@@ -11,16 +11,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.parameters.local_light import LocalLight
-from augment.parameter_settings import PARAMETER_NAMES
 from renderer.errors import require_choice
 from renderer.light.local_lights import LOCAL_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from augment.attack_settings import StepSettings
     from augment.attacks.parameters.parameter import Parameter
-    from augment.parameter_settings import StepSettings
     from augment.scene.scene import Scene
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from augment.attack_settings import StepSettings
 from augment.attacks.parameters.mesh_parameter import MeshParameter
-from augment.parameter_settings import StepSettings
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 

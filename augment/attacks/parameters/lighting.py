@@ -1,7 +1,7 @@
 """Attacks on the environment lighting."""
 
+from augment.attack_settings import StepSettings
 from augment.attacks.parameters.light_parameter import LightParameter, environment_light
-from augment.parameter_settings import StepSettings
 from augment.scene.scene import Scene
 
 

@@ -1,7 +1,7 @@
 """Attacks on the coefficients of a light within the scene, such as lamps or a projector."""
 
+from augment.attack_settings import StepSettings
 from augment.attacks.parameters.light_parameter import LightParameter
-from augment.parameter_settings import StepSettings
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from augment.attack_settings import MaterialSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.parameter_settings import MaterialSettings
 from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box

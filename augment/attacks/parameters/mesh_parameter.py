@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from augment.attack_settings import StepSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.parameter_settings import StepSettings
 from augment.scene.scene import Scene
 
 

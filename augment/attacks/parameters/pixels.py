@@ -6,8 +6,8 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.attack_settings import StepSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.parameter_settings import StepSettings
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from augment.attack_settings import PoseSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.parameter_settings import PoseSettings
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera

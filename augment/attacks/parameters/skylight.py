@@ -7,9 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from augment.attack_settings import SkylightSettings
 from augment.attacks.parameters.light_parameter import environment_light, replace_light
 from augment.attacks.parameters.parameter import Parameter
-from augment.parameter_settings import SkylightSettings
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box

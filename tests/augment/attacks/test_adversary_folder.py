@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import augment
+from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.parameter_settings import PARAMETER_NAMES
 from augment.scene.objects import Example, SceneObject, add_table, with_props
 from augment.scene.scene import Scene
 from renderer.errors import InputError

@@ -9,12 +9,11 @@ from scipy.special import softmax
 from torch import Tensor, nn
 
 import augment
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import AttackSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import project
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
-from augment.parameter_settings import StepSettings
 from renderer.light.nonnegative import project_nonnegative
 from renderer.light.presets import load_light
 

@@ -9,11 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import STEPS, AttackSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import project, sample, scale_gradient
 from augment.attacks.objective import Criterion, Objective
-from augment.parameter_settings import STEPS, StepSettings
 
 EPS = torch.finfo(torch.float64).eps
 IMAGE_SHAPE = (3, 2, 2)

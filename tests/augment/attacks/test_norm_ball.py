@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
+from augment.attack_settings import NORMS, StepSettings
 from augment.attacks.norm_ball import project, sample, scale_gradient
-from augment.parameter_settings import NORMS, StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import nearest_in_box
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 import augment
+from augment.attack_settings import MaterialSettings
 from augment.attacks.parameters import make_parameter
-from augment.parameter_settings import MaterialSettings
 from augment.scene.build import Smoothest, build_scene, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
 from augment.scene.vary import vary

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 import augment
+from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem
-from augment.parameter_settings import StepSettings
 from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene

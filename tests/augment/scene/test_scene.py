@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 
 import renderer
+from augment.attack_settings import SkylightSettings, StepSettings
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
-from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.scene import render
 from augment.scene.build import build_scene, load_backgrounds
 from augment.scene.objects import Conditions, Example, load_object

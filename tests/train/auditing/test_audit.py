@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 import augment
+from augment.scene import patterns
 from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -29,7 +30,6 @@ from train.auditing.lights import (
 )
 from train.auditing.screen import withstood_sentence
 from train.command_settings import AuditSettings
-from train.laboratory import lab_patterns as patterns
 
 CLASSES = ("orange", "other")
 
@@ -195,7 +195,7 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(audit, "ATTACKED_COUNT", 2)
     monkeypatch.setattr(audit, "SETUPS", 1)
     monkeypatch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
-    monkeypatch.setattr(patterns, "RESOLUTION", 32)
+    monkeypatch.setattr(patterns, "LAB_RESOLUTION", 32)
     monkeypatch.setattr(audit, "load_network", lambda name, **_: CLASSIFIERS[name])
     monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.classifier])
     return {

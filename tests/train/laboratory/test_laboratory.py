@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from augment.scene import patterns
+from augment.scene.patterns import LAB_PATTERNS, draw_lab_pattern
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
-from train.laboratory import lab_patterns as patterns
 from train.laboratory import laboratory as lab
-from train.laboratory.lab_patterns import PATTERN_FUNCTIONS, draw_pattern
 from train.laboratory.laboratory import lab_parts, path_traced
 from train.laboratory.shots import FOV, Shot, draw_shots
 
@@ -38,7 +38,7 @@ MESHES = [
 @pytest.fixture(autouse=True, scope="module")
 def coarse_patterns() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(patterns, "RESOLUTION", 64)
+        patch.setattr(patterns, "LAB_RESOLUTION", 64)
         yield
 
 
@@ -215,13 +215,13 @@ class TestAnEnvironment:
             lab.write_laboratory(lab_settings)
 
 
-@pytest.mark.parametrize("family", PATTERN_FUNCTIONS)
+@pytest.mark.parametrize("family", LAB_PATTERNS)
 @pytest.mark.parametrize("seed", range(3))
 class TestAPattern:
     def test_is_an_image_that_the_seed_decides(self, family, seed):
-        image = draw_pattern(family, np.random.default_rng(seed))
-        same = draw_pattern(family, np.random.default_rng(seed))
-        other = draw_pattern(family, np.random.default_rng(seed + 100))
+        image = draw_lab_pattern(family, np.random.default_rng(seed))
+        same = draw_lab_pattern(family, np.random.default_rng(seed))
+        other = draw_lab_pattern(family, np.random.default_rng(seed + 100))
         assert image.shape == (64, 64, 3)
         assert image.min() >= 0
         assert image.max() <= 1
@@ -229,7 +229,7 @@ class TestAPattern:
         assert not np.array_equal(image, other)
 
     def test_mixes_two_colors_of_which_one_is_black_in_some_families(self, family, seed):
-        image = draw_pattern(family, np.random.default_rng(seed))
+        image = draw_lab_pattern(family, np.random.default_rng(seed))
         colors = np.unique(image.reshape(-1, 3), axis=0)
         has_black = colors.min(axis=0).max() == 0
         if family == "colors":
@@ -259,10 +259,10 @@ def horizontal_cosine(first: np.ndarray, second: np.ndarray) -> float:
 
 
 class TestShots:
-    SHOTS: ClassVar = draw(220, PATTERN_FUNCTIONS, seed=3)
+    SHOTS: ClassVar = draw(220, LAB_PATTERNS, seed=3)
 
     def test_are_equally_many_of_each_family(self):
-        expected = [name for name in PATTERN_FUNCTIONS for _ in range(20)]
+        expected = [name for name in LAB_PATTERNS for _ in range(20)]
         assert [shot.lighting for shot in self.SHOTS] == expected
 
     def test_of_a_family_are_evenly_from_dim_to_bright(self):

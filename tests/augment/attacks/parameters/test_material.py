@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import augment
+from augment.attack_settings import MATERIAL_PARTS
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
 from augment.attacks.files import render_again
 from augment.attacks.parameters.material import Material
 from augment.attacks.problem import SceneProblem
-from augment.parameter_settings import MATERIAL_PARTS
 from augment.scene.objects import SceneObject, add_table
 from augment.scene.scene import Scene
 from renderer.errors import InputError

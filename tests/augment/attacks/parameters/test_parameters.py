@@ -11,14 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import PARAMETER_NAMES, AttackSettings, SkylightSettings, StepSettings
 from augment.attacks import norm_ball
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight
 from augment.attacks.problem import SceneProblem, build_problem
-from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.scene import render
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene

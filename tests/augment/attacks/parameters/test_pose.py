@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import pad
 
 import augment
+from augment.attack_settings import POSE_PARTS
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.problem import SceneProblem
-from augment.parameter_settings import POSE_PARTS
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 
