@@ -26,7 +26,7 @@ from train.run_config import (
     require_same_run,
     write_config,
 )
-from train.run_folder import METRICS, read_metrics
+from train.run_folder import METRICS, attack_success, read_metrics
 from train.settings import ExperimentSettings
 from train.training.run_log import RunLog
 
@@ -266,3 +266,14 @@ def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_
         windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
         windows = [window for window in windows if window.shape == shown.shape]
         assert any((abs(window - 255 * shown) < 1).all() for window in windows)
+
+
+def test_attack_success_is_the_fraction_of_the_clean_correct_examples():
+    """Of ten examples, two were wrong before, and six are wrong after the attack."""
+    diagnostics = {"attack_success_before": 0.2, "attack_success": 0.6}
+    assert attack_success(diagnostics) == pytest.approx(4 / 8)
+
+
+@pytest.mark.parametrize("diagnostics", [{}, {"attack_success_before": 1.0, "attack_success": 1.0}])
+def test_there_is_no_attack_success_without_clean_correct_examples(diagnostics):
+    assert attack_success(diagnostics) is None

@@ -65,8 +65,10 @@ def mean_values(views: Views, power: float) -> torch.Tensor:
     return images.mean((1, 2, 3, 4))
 
 
-def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp_path):
+def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp_path, monkeypatch):
     """Each lamp adds light, so no light within a radius is brighter than all lamps at it."""
+    # Steps of a quarter of the radius reach a corner of the norm-ball in four.
+    monkeypatch.setattr(lights, "STEPS", 5)
     middle_two = mean_values(views, 2.0).sort().values[1:3]
     limit = float(middle_two.mean())
     is_correct = mean_values(views, 0.0) < limit
@@ -119,7 +121,17 @@ def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(views
     assert not adversaries(blind, views, "lamps").success.any()
 
 
-def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views):
+@pytest.fixture
+def lamps_alone(monkeypatch) -> None:
+    """Attack only lamps, with one radius and few steps."""
+    monkeypatch.setattr(lights, "STEPS", 3)
+    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 5)
+    for kind in ("skylight", "projector", "lighting"):
+        monkeypatch.delitem(KINDS, kind)
+    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
+
+
+def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, lamps_alone):
     middle_two = mean_values(views, 2.0).sort().values[1:3]
     result = adversaries(darker_than(float(middle_two.mean())), views, "lamps")
     example = int((result.clean_correct & result.success).nonzero()[0])
@@ -129,16 +141,6 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views):
     assert slider["classes"] == ["orange", "other"]
     for probabilities, logits in zip(ends, expected, strict=True):
         np.testing.assert_allclose(probabilities, logits.softmax(0), atol=1e-4)
-
-
-@pytest.fixture
-def lamps_alone(monkeypatch) -> None:
-    """Attack only lamps, with one radius and few steps."""
-    monkeypatch.setattr(lights, "STEPS", 3)
-    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 5)
-    for kind in ("skylight", "projector", "lighting"):
-        monkeypatch.delitem(KINDS, kind)
-    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
 
 
 def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
@@ -163,16 +165,13 @@ def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
         assert counts[name] == [lost.sum(), is_correct.sum(), lost_without_noise.sum()]
 
 
-def test_classifiers_of_all_sizes_get_the_same_views(views):
+def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_seed(views):
     small = views.scene(8)
     large = views.scene(12, "projector")
     assert small.examples == large.examples
+    assert small.examples != replace(views, seed=1).scene(8).examples
     for one, other in zip(small.objects, large.objects, strict=True):
         np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
-
-
-def test_another_seed_draws_other_views(views):
-    assert views.scene(8).examples != replace(views, seed=1).scene(8).examples
 
 
 CLASSIFIERS = {
@@ -197,9 +196,9 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
     monkeypatch.setattr(patterns, "LAB_RESOLUTION", 32)
     monkeypatch.setattr(audit, "load_network", lambda name, **_: CLASSIFIERS[name])
-    monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.classifier])
+    monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.network])
     return {
-        "classifier": "dark",
+        "network": "dark",
         "environments": [],
         "meshes": ["solid:orange:0"],
         "hard_negatives": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
@@ -378,38 +377,23 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
 
 
 @pytest.mark.parametrize(
-    ("hits", "n", "answer"),
+    ("hits", "n", "adversarial", "answer"),
     [
-        (400, 400, "Yes"),
-        (9, 9, "No fault is shown, but"),
-        (200, 400, "No: it recognizes 50%"),
+        # A classifier is called safe only if the intervals lie above the limit.
+        (400, 400, [0, 0, 1, 1], "Yes"),
+        (9, 9, [0, 0, 1, 1], "No fault is shown, but"),
+        (200, 400, [0, 0, 1, 1], "No: it recognizes 50%"),
+        # Four attacked views, of which all are lost, do not decide alone.
+        (9, 9, [0, 0, 4, 4], "Perhaps not: an attack"),
+        (200, 400, [0, 0, 4, 4], "No: it recognizes"),
+        # Without a view that is recognized in plain light, nothing is known.
+        (0, 400, [0, 0, 0, 0], "Unknown: "),
     ],
 )
-def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
-    tmp_path,
-    hits,
-    n,
-    answer,
-):
-    write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
+def test_the_answer_of_an_audit(tmp_path, hits, n, adversarial, answer):
+    write_parts(tmp_path, hits, n, adversarial)
     text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
-
-
-@pytest.mark.parametrize(
-    ("hits", "n", "answer"), [(9, 9, "Perhaps not: an attack"), (200, 400, "No: it recognizes")]
-)
-def test_a_few_attacked_views_alone_do_not_make_a_headline(tmp_path, hits, n, answer):
-    """Four views are attacked, and all of them are lost. The images of the second case decide."""
-    write_parts(tmp_path, hits, n, adversarial=[0, 0, 4, 4])
-    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
-    assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
-
-
-def test_a_classifier_that_recognizes_nothing_in_plain_light_is_called_neither(tmp_path):
-    write_parts(tmp_path, 0, 400, adversarial=[0, 0, 0, 0])
-    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
-    assert text.startswith("Is dark safe under unusual lighting? Unknown: ")
 
 
 def test_no_interval_of_an_audit_has_zero_width(tmp_path):

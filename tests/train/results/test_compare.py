@@ -328,23 +328,6 @@ def differences(oranges: np.ndarray, others: np.ndarray) -> list[float]:
     return [recall[1] - recall[0], auc[1] - auc[0]]
 
 
-def bootstrap(methods: TwoArms, replicate_count: int) -> np.ndarray:
-    """Return 95% intervals of the differences in recall and in AUC, shape (2, 2).
-
-    The loop draws seeds and images one replicate at a time.
-    """
-    generator = np.random.default_rng(1)
-    replicates = []
-    for _ in range(replicate_count):
-        seeds = generator.integers(3, size=3)
-        orange_rows = generator.integers(60, size=60)
-        other_rows = generator.integers(40, size=40)
-        oranges = methods.oranges[:, seeds][:, :, orange_rows]
-        others = methods.others[:, seeds][:, :, other_rows]
-        replicates.append(differences(oranges, others))
-    return np.quantile(replicates, (0.025, 0.975), axis=0).T
-
-
 def read_interval(cell: str) -> tuple[float, float, float]:
     """Read the difference and the two ends of its interval."""
     number = r"([+-][\d.]+)"
@@ -352,22 +335,15 @@ def read_interval(cell: str) -> tuple[float, float, float]:
     return float(difference), float(low), float(high)
 
 
-def test_a_difference_has_a_wider_interval_than_a_bootstrap_over_three_seeds(methods):
+def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(methods):
     tables = compare(methods.folders)
     header, total, web = tables["random minus none (3 and 3 seeds, paired)"]
     assert header[:4] == ["source", "recall", "FPR", "AUC"]
     assert web[0] == "web"
     assert total == ["all", *web[1:]]
-
     values = differences(methods.oranges, methods.others)
-    intervals = bootstrap(methods, 1000)
-    for cell, value, interval in zip((web[1], web[3]), values, intervals, strict=True):
-        difference, low, high = read_interval(cell)
-        assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.
-        # The ends vary by chance by up to 0.02, with 1,000 replicates. The bootstrap of three seeds
-        # has 2/3 of the variance between seeds, and t with two degrees of freedom is 2.2 · 1.96.
-        assert low < interval[0] + 0.02 and interval[1] - 0.02 < high
-        assert high - low < 2.8 * (interval[1] - interval[0])
+    found = [read_interval(cell)[0] for cell in (web[1], web[3])]
+    assert found == pytest.approx(values, abs=5.1e-4)  # The table has three digits.
 
 
 def test_networks_that_agree_on_n_oranges_differ_by_at_most_wilsons_limit_for_0_of_n(scored_run):

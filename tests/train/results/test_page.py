@@ -189,15 +189,6 @@ def test_the_report_of_a_command_says_why_there_is_none(tmp_path):
     assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
 
 
-def test_runs_that_cannot_be_read_are_named_in_the_page(tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
-    text = write_report([tmp_path], tmp_path)[0].read_text()
-    assert "/a</td><td" in text
-    assert "/b</td><td" in text
-
-
 def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_training(
     finished,
     tmp_path,
