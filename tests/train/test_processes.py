@@ -25,7 +25,6 @@ from train.cli import read_settings
 from train.processes import Interrupted, SignalHandler, process_group
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
-from train.training import loop
 
 ROOT = Path(__file__).parents[3]
 EPOCHS = 2
@@ -45,7 +44,6 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
         run_from_file(folder / "config.yaml", folder / "two")
         random_mode(folder / f"random_{index}.pt")
         folder_mode(folder / f"folder_{index}.pt")
-        run_until_a_signal(folder / "config.yaml", folder / "mixed")
 
 
 def run_from_file(config: Path, folder: Path) -> None:
@@ -94,81 +92,41 @@ def folder_mode(file: Path) -> None:
     torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
 
 
-def run_until_a_signal(config: Path, folder: Path) -> None:
-    """Send a signal to the second process in the second step of the second epoch.
-
-    Both processes stop after the third step.
-    """
-    training_batches = loop.training_batches
-
-    def signalled(images, **options):
-        epoch = options["this_round"].epoch
-        for count, batch in enumerate(training_batches(images, **options), 1):
-            if (epoch, count, distributed.rank()) == (1, 2, 1):
-                signal.raise_signal(signal.SIGTERM)
-            yield batch
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "training_batches", signalled)
-        with pytest.raises(Interrupted):
-            run_from_file(config, folder)
-
-
 @pytest.fixture(scope="module")
 def runs(tiny, tmp_path_factory) -> Path:
-    """Train by one process, by two, and by two until a signal and then by one.
+    """Train by one process and by two.
 
     The learning rate is so low that rounding errors do not grow.
     """
     folder = tmp_path_factory.mktemp("distributed")
-    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
-        settings = tiny("train.learning_rate=0.001", f"train.epochs={EPOCHS}", *overrides)
-        OmegaConf.save(OmegaConf.structured(settings), folder / f"{name}.yaml")
+    settings = tiny("train.learning_rate=0.001", f"train.epochs={EPOCHS}")
+    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
     once_for_both = [__name__, "torch._dynamo", "torch.utils.tensorboard", "torchvision.utils"]
     multiprocessing.set_forkserver_preload(once_for_both)
     multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
-    state = checkpoints.load(folder / "mixed" / run_folder.LAST)
-    assert (state["epoch"], state["under_way"]["step"]) == (1, 3)
     with pytest.MonkeyPatch.context() as patch:
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "one")
-        run_from_file(folder / "resume.yaml", folder / "mixed")
     return folder
 
 
-@pytest.mark.parametrize("name", ["two", "mixed"])
-def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
-    first, other = (checkpoints.load(runs / folder / run_folder.LAST) for folder in ("one", name))
+def test_a_run_does_not_depend_on_the_number_of_its_processes(runs):
+    first, other = (checkpoints.load(runs / name / run_folder.LAST) for name in ("one", "two"))
     torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32
     torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
     for epoch in range(1, EPOCHS + 1):
-        grids = [
-            np.asarray(
-                Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png"),
-            )
-            for folder in ("one", name)
-        ]
-        np.testing.assert_allclose(
-            *(grid.astype(int) for grid in grids),
-            atol=1,
-        )  # Rounding changes values by 1 of 255.
-    expected, lines = (read_metrics(runs / folder) for folder in ("one", name))
+        file = Path("renders", f"epoch_00{epoch}.png")
+        grids = [np.asarray(Image.open(runs / name / file)).astype(int) for name in ("one", "two")]
+        np.testing.assert_allclose(*grids, atol=1)  # Rounding changes values by 1 of 255.
+    expected, lines = (read_metrics(runs / name) for name in ("one", "two"))
     assert [line.get("epoch") for line in lines] == [*range(1, EPOCHS + 1), None]
     for one, line in zip(expected, lines, strict=True):
         for key in (key for key in one if not key.startswith("seconds/")):
             assert line[key] == pytest.approx(one[key], rel=1e-3), key
     assert all(line["augment/light_change"] > 0 for line in expected[:-1])
-    files = [
-        {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name}
-        for folder in (
-            "one",
-            name,
-        )
-    ]
-    assert files[0] == files[1]
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
 
 

@@ -9,8 +9,8 @@ import logging
 import shlex
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import cast
@@ -31,7 +31,7 @@ from train.run_folder import sole_writer
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
 from train.system import is_verbose, program
 from train.training.initial import with_label
-from train.training.run import load_runs
+from train.training.run import make_runs
 from train.user_errors import keyed, writable_folder
 
 # An override such as experiment=photographs chooses a file of settings. These keys
@@ -54,8 +54,20 @@ SHARED_IN_TRAIN = (
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
     """Train a network and its baselines, in this process or in each process of torchrun."""
     threading.excepthook = _report_thread_error
+    command = format_command(overrides)
     with process_group():
-        _train(config, overrides)
+        # The default name of the folder has the time, which differs between processes. All
+        # processes take the name of the first one.
+        folder = Path(broadcast(str(config.out))).absolute()
+        config.out = str(folder)
+        # A resumed run keeps its recorded settings, except for single values that the
+        # overrides change. An override that chooses a whole file prevents this.
+        if config.train.resume and not any(map(_is_choice, overrides)):
+            config, command = resume_config(config, overrides)
+        settings = with_label(read_settings(ExperimentSettings, config))
+        if settings.photographs_first:
+            settings = _train_on_photographs(settings, folder, command)
+        _train_in(folder, settings, command, program("train", as_called=True))
 
 
 def _report_thread_error(error: threading.ExceptHookArgs) -> None:
@@ -66,23 +78,6 @@ def _report_thread_error(error: threading.ExceptHookArgs) -> None:
     """
     if error.exc_type is not OSError:
         threading.__excepthook__(error)
-
-
-def _train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Read all settings, and train a network and its baselines."""
-    command = format_command(overrides)
-    # The default name of the folder has the time, which differs between processes. All
-    # processes take the name of the first one.
-    folder = Path(broadcast(str(config.out))).absolute()
-    config.out = str(folder)
-    # A resumed run keeps its recorded settings, except for single values that the
-    # overrides change. An override that chooses a whole file prevents this.
-    if config.train.resume and not any(map(_is_choice, overrides)):
-        config, command = resume_config(config, overrides)
-    settings = with_label(read_settings(ExperimentSettings, config))
-    if settings.photographs_first:
-        settings = _train_on_photographs(settings, folder, command)
-    _train_in(folder, settings, command, program("train", as_called=True))
 
 
 def _train_on_photographs(
@@ -139,12 +134,22 @@ def _train_in(
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, run_settings)
         require_new_run(path, "out", settings.overwrite, settings.train.resume)
-    is_first = distributed.rank() == 0
-    log = logged_to(writable_folder(str(folder), "out") / LOG) if is_first else nullcontext()
-    with log:
+    with ExitStack() as first_process:
+        if distributed.rank() == 0:
+            log = writable_folder(str(folder), "out") / LOG
+            first_process.enter_context(logged_to(log))
+            first_process.enter_context(sole_writer("out", *settings_of_runs))
         try:
-            with sole_writer("out", *settings_of_runs) if is_first else nullcontext():
-                _train_runs(settings_of_runs, folder, command)
+            for run in make_runs(settings_of_runs, command):
+                mode = run.settings.augment.mode
+                purpose = "" if run.folder == folder else ", for comparison"
+                console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
+                run.train()
+            if distributed.rank() == 0:
+                summaries = [summarize(path) for path in settings_of_runs]
+                console.debug("\n%s\n", format_table(summaries))
+                console.info("%s\n", format_short_comparison(summaries))
+                console.info("%s", report_of([folder], folder))
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
@@ -167,24 +172,6 @@ def _settings_of_runs(settings: ExperimentSettings, folder: Path) -> dict[Path, 
             settings_of_runs[folder / mode] = replace(settings, compare=[], augment=augment)
     settings_of_runs[folder] = settings
     return settings_of_runs
-
-
-def _train_runs(
-    settings_of_runs: Mapping[Path, ExperimentSettings],
-    folder: Path,
-    command: str,
-) -> None:
-    """Train and score several runs, print a table that compares them, and write a report."""
-    for run in load_runs(settings_of_runs, command):
-        mode = run.settings.augment.mode
-        purpose = "" if run.folder == folder else ", for comparison"
-        console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
-        run.train()
-    if distributed.rank() == 0:
-        summaries = [summarize(path) for path in settings_of_runs]
-        console.debug("\n%s\n", format_table(summaries))
-        console.info("%s\n", format_short_comparison(summaries))
-        console.info("%s", report_of([folder], folder))
 
 
 def _is_choice(override: str) -> bool:

@@ -34,7 +34,7 @@ from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system import is_verbose, shortened
 from train.training.initial import with_label
-from train.training.run import Run, load_inputs, load_runs
+from train.training.run import Run, load_inputs, make_runs
 from train.user_errors import user_message, writable_folder
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
@@ -187,7 +187,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
     settings = with_label(read_settings(ExperimentSettings, config))
     settings.train.resume = checkpoints.exists(folder)
     command = format_command([_unescaped(override) for override in overrides])
-    (run,) = load_runs({folder: settings}, command)
+    (run,) = make_runs({folder: settings}, command)
     run.train()
 
 

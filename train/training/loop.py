@@ -232,7 +232,12 @@ class Trainer:
             with self.phases("training"):
                 batches = self._batches(split, rows, now, first)
                 for batch in progress(batches, title, steps[index], first):
-                    state.sums += self._take_step(batch, state.step, sum(steps))
+                    done = state.step / sum(steps)
+                    # Each epoch of a soup runs through the whole schedule of the learning rate.
+                    if not settings.soup:
+                        done = (self.epoch + done) / settings.epochs
+                    number = self.epoch * sum(steps) + state.step
+                    state.sums += self.step.take(batch, done, number)
                     state.step += 1
                     if signals.requested():
                         return state.step == sum(steps)
@@ -268,14 +273,6 @@ class Trainer:
             flips=self.settings.flips,
             first=first,
         )
-
-    def _take_step(self, batch: Batch, number: int, count: int) -> Float[Tensor, " 2"]:
-        """Take a step, which has a number of `count` steps in its epoch."""
-        done = number / count
-        # Each epoch of a model soup runs through the whole schedule of the learning rate.
-        if not self.settings.soup:
-            done = (self.epoch + done) / self.settings.epochs
-        return self.step.take(batch, done, self.epoch * count + number)
 
     def _regenerate(self, now: Round) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""

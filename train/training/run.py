@@ -1,8 +1,4 @@
-"""One training run, from its settings to its scores.
-
-`load_runs` makes and loads runs. Then `fit`, `score` and `export` are called in
-this order.
-"""
+"""One training run, from its settings to its scores."""
 
 import json
 from collections.abc import Mapping
@@ -97,7 +93,6 @@ class Run:
         self.data = relabel(settings, data, initial)
         self.folder = folder
         self.command = command
-        self.initial = initial
         self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
@@ -112,12 +107,14 @@ class Run:
         # Settings of the run that is resumed. None for a new run.
         earlier = self._require_folder()
         self._is_resumed = earlier is not None
+        # The number of threads changes the last bits of the results, so a resumed run keeps it.
+        threads = settings.train.threads
+        if earlier is not None:
+            threads = threads or OmegaConf.select(earlier, "hardware.threads")
         validation = choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, validation.fraction, seed=0)
-        self.trainer = build_trainer(
-            settings, self.data, folder, initial, validation, self._choose_threads(earlier)
-        )
+        self.trainer = _build_trainer(settings, self.data, folder, initial, validation, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -138,7 +135,17 @@ class Run:
         is_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
         if is_left and not self._is_resumed:
             remove_run(self.folder, with_others=not self.settings.train.resume)
-        self._write_config()
+        write_config(
+            self.folder,
+            self.settings,
+            hardware={
+                "device": str(self.trainer.device),
+                "precision": self.trainer.model.precision,
+                "threads": self._threads,
+            },
+            command=self.command,
+            test_images=describe_test_images(self.settings, self.data),
+        )
 
     def train(self) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.
@@ -212,54 +219,27 @@ class Run:
             )
         return require_same_run(self.folder, self.settings)
 
-    def _choose_threads(self, earlier: DictConfig | None) -> int | None:
-        """Return the number of CPU threads that the settings or an earlier run give.
-
-        The number changes the last bits of the results, so a resumed run keeps
-        its number of threads.
-        """
-        given = self.settings.train.threads
-        if given or earlier is None:
-            return given
-        recorded = OmegaConf.select(earlier, "hardware.threads")
-        is_valid = isinstance(recorded, int) and recorded > 0
-        return recorded if is_valid else None
-
     def _warn_of_stretched_schedule(self, planned: int) -> None:
         """Warn if a resumed run has another number of epochs, and so another learning rate.
 
-        The schedule of the learning rate extends over all epochs.
+        The schedule of the learning rate extends over all epochs, but each epoch of a model soup
+        has the whole schedule.
         """
         # The trainer may have adapted the learning rate to the network.
         settings = self.trainer.settings
-        # Each epoch of a model soup has the whole schedule. Then the number of epochs does
-        # not change the learning rate.
         if settings.epochs == planned or settings.soup:
             return
-        rate = learning_rate(settings, self.trainer.epoch / settings.epochs)
-        rate_before = learning_rate(settings, self.trainer.epoch / planned)
-        change = f"train.epochs={settings.epochs}, not {planned}"
+        rates = [
+            learning_rate(settings, self.trainer.epoch / epochs)
+            for epochs in (settings.epochs, planned)
+        ]
         console.warning(
-            "%s, stretches train.schedule=%s: the learning rate goes on at %.3g, not %.3g",
-            change,
+            "train.epochs=%d, not %d, stretches train.schedule=%s: "
+            "the learning rate goes on at %.3g, not %.3g",
+            settings.epochs,
+            planned,
             settings.schedule,
-            rate,
-            rate_before,
-        )
-
-    def _write_config(self) -> None:
-        """Write config.yaml with the settings and the hardware of the run to its folder."""
-        hardware = {
-            "device": str(self.trainer.device),
-            "precision": self.trainer.model.precision,
-            "threads": self._threads,
-        }
-        write_config(
-            self.folder,
-            self.settings,
-            hardware=hardware,
-            command=self.command,
-            test_images=describe_test_images(self.settings, self.data),
+            *rates,
         )
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
@@ -421,7 +401,7 @@ class Run:
         return values
 
 
-def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
+def make_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
     """Make several runs before the first one is trained, so that mistakes are reported at once.
 
     All of them have the data set and the initial network of the first one.
@@ -434,7 +414,7 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     return runs
 
 
-def build_trainer(
+def _build_trainer(
     settings: ExperimentSettings,
     data: DataSet,
     folder: Path,

@@ -107,28 +107,19 @@ class TrainingStep:
             # The consistency term compares the images before and after the augmentation.
             tensors = [images, labels, rendered, augmented]
         self.optimizer.zero_grad(set_to_none=True)
-        sums = self._add_gradients(tensors)
+        sums = torch.zeros(2, device=self._device)
+        # The gradients of parts of the batch are added, which saves memory.
+        chunks = [tensor.chunk(settings.accumulation_steps) for tensor in tensors]
+        for part in zip(*chunks, strict=True):
+            loss, hits = self._loss(*part)
+            self.scaler.scale(loss / settings.accumulation_steps).backward()
+            sums += torch.stack([loss.detach() * len(part[0]), hits])
         if settings.clip_gradient:
             self.scaler.unscale_(self.optimizer)
             nn.utils.clip_grad_norm_(self._model.parameters(), settings.clip_gradient)
         self.scaler.step(self.optimizer)
         self.scaler.update()
         self._averages.end_step()
-        return sums
-
-    def _add_gradients(self, tensors: Sequence[Tensor]) -> Float[Tensor, " 2"]:
-        """Compute the gradient of the loss of a batch in parts, which saves memory.
-
-        Return the sum of the losses of the images, and the number of correct predictions.
-        """
-        count = self._settings.accumulation_steps
-        sums = torch.zeros(2, device=self._device)
-        # A list of chunks for each tensor. A part of the batch has one chunk of each tensor.
-        chunks = [tensor.chunk(count) for tensor in tensors]
-        for part in zip(*chunks, strict=True):
-            loss, hits = self._loss(*part)
-            self.scaler.scale(loss / count).backward()
-            sums += torch.stack([loss.detach() * len(part[0]), hits])
         return sums
 
     def state_dict(self) -> dict[str, Any]:

@@ -275,19 +275,6 @@ class TestARunThatReplacesAnother:
         monkeypatch.setattr("train.training.run.write_laboratory", write)
         return calls
 
-    def test_renders_anew_after_a_kill_during_its_renders(
-        self, tiny, tmp_path, monkeypatch, rendered
-    ):
-        completed_run(tiny(*self.RENDERED), tmp_path)
-        with monkeypatch.context() as patch:
-            killed = Mock(side_effect=KeyboardInterrupt)
-            patch.setattr("train.training.run.write_laboratory", killed)
-            with pytest.raises(KeyboardInterrupt):
-                completed_run(tiny(*self.RENDERED, "seed=8", "overwrite=true"), tmp_path)
-        assert not is_finished(tmp_path)
-        completed_run(tiny(*self.RENDERED, "seed=8", "train.resume=true"), tmp_path)
-        assert [settings.seed for settings in rendered] == [2001 + 7, 2001 + 8]
-
     def test_renders_once_if_it_is_resumed_and_anew_with_other_settings(
         self, tiny, tmp_path, rendered
     ):
