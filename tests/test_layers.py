@@ -103,6 +103,7 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
     command_layer = (
         "train.cli",
         "train.commands",
+        "train.fingerprints",
         "train.__main__",
         "train.results",
         "train.user_errors",

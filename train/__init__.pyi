@@ -13,9 +13,9 @@ from train.saved_networks import load_run as load_run
 from train.settings import DataSettings as DataSettings
 from train.settings import EvaluationSettings as EvaluationSettings
 from train.settings import ExperimentSettings as ExperimentSettings
-from train.settings import ModelSettings as ModelSettings
 from train.settings import TrainingSceneSettings as TrainingSceneSettings
-from train.settings import TrainSettings as TrainSettings
+from train.train_settings import ModelSettings as ModelSettings
+from train.train_settings import TrainSettings as TrainSettings
 
 console: logging.Logger
 __version__: str

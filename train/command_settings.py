@@ -467,14 +467,7 @@ class AuditSettings(ClassifierSettings):
             )
 
     def scale(self, count: int) -> int:
-        """Multiply a number of views, lightings or renders by the budget.
-
-        Args:
-            count: The number with a budget of 1.
-
-        Returns:
-            The rounded product, at least 1.
-        """
+        """Multiply a number of views, lightings or renders by the budget; at least 1 is left."""
         return max(1, round(count * self.budget))
 
 

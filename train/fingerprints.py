@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
@@ -14,7 +14,7 @@ from urllib.parse import unquote
 from train.data.photographs import visible_files
 from train.networks import PYTHON
 from train.saved_networks import selected_file
-from train.settings import INPUTS, dotted, published
+from train.settings import published
 
 # The files of a folder with more bytes are not read. Their sizes and times count instead.
 MAX_FOLDER_BYTES = 2**32
@@ -26,6 +26,33 @@ REFERENCE = re.compile(
     re.MULTILINE | re.IGNORECASE,
 )
 REFERRING = (".obj", ".mtl", ".ply", ".gltf")
+# Settings that can name input files. Their hashes are recorded with a run.
+INPUTS = (
+    *(
+        "data.path",
+        "weights",
+        "classes",
+        "augment.folder",
+        "augment.vary.environments",
+        "augment.vary.backgrounds",
+        "augment.vary.camera.slides",
+        "scene.projector.pattern",
+        "scene.lamps.start",
+        "scene.backgrounds",
+        "scene.light",
+    ),
+    *("network", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
+    "unlabeled",
+)
+
+
+def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each value in nested settings with its dotted key, such as "train.epochs"."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def fingerprints(settings: Any) -> dict[str, str]:

@@ -19,7 +19,7 @@ from augment.network import ChannelNormalization, Network, eval_mode
 from augment.plain_networks import as_facts
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
-from train.settings import WIDERESNET
+from train.train_settings import WIDERESNET
 
 # The name of a network begins with this text if it is an architecture of torchvision.
 TORCHVISION = "torchvision:"

@@ -15,9 +15,10 @@ from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, choose_operating_points
 from train.results.store import summarize, trained_labels
 from train.results.tables import Estimate
+from train.run_config import mapped
 from train.run_folder import PUBLISHED
 from train.saved_networks import load_run, load_selected, write_published
-from train.settings import mapped, published
+from train.settings import published
 from train.user_errors import keyed, writable_folder
 
 # Folder of the published networks, in the installation or in a clone.

@@ -42,9 +42,9 @@ from train.settings import (
     DataSettings,
     ExperimentSettings,
     TrainingSceneSettings,
-    TrainSettings,
     read_objects,
 )
+from train.train_settings import TrainSettings
 from train.training.initial import initial_of
 from train.training.inputs import load_data
 from train.training.run import Run

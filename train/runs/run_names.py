@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from train.settings import CIRCUMSTANCES
+from train.run_config import CIRCUMSTANCES
 
 # Largest number of characters of one setting in the name of a folder.
 MAX_PART = 48

@@ -32,7 +32,8 @@ from train.saved_networks import (
     load_selected,
     plain_weights,
 )
-from train.settings import WIDERESNET, ExperimentSettings, label_names
+from train.settings import ExperimentSettings, label_names
+from train.train_settings import WIDERESNET
 from train.user_errors import keyed
 
 # Entries in the description of a network. They must be equal in two networks if the

@@ -32,7 +32,7 @@ from train.data.sets import Split
 from train.device import MixedPrecision
 from train.processes import SignalHandler, all_reduce_sum
 from train.run_folder import PHASES, epoch_metrics, format_epoch
-from train.settings import TrainSettings
+from train.train_settings import TrainSettings
 from train.training.averages import Averages
 from train.training.recipe import set_training_mode
 from train.training.run_log import RunLog

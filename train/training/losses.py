@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from augment.losses import is_correct, kl_divergence, label_loss, ranking_loss
 from renderer.image import to_unit
-from train.settings import TrainSettings
+from train.train_settings import TrainSettings
 
 
 class TrainingLoss:

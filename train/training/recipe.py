@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from augment.classifier import nearest
 from augment.network import eval_mode
 from renderer.errors import InputError
-from train.settings import ALL_BUT_LAST, TrainSettings
+from train.train_settings import ALL_BUT_LAST, TrainSettings
 
 # The schedule "step" multiplies the learning rate by STEP_FACTOR after each of these
 # fractions of the training, like Zagoruyko and Komodakis (2016).

@@ -16,7 +16,7 @@ from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
-from train.settings import TrainSettings
+from train.train_settings import TrainSettings
 
 # The brightness of a projected slide is multiplied by smooth random factors, which are
 # interpolated from a grid with this number of cells per side.

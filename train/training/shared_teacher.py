@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from augment.network import eval_mode
 from train.device import PRECISIONS, MixedPrecision
-from train.settings import ALL_BUT_LAST, TrainSettings
+from train.train_settings import ALL_BUT_LAST, TrainSettings
 from train.training.recipe import last_layer
 
 

@@ -18,7 +18,7 @@ from train import console
 from train.data.batches import Batch
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import wrap_ddp
-from train.settings import RELIGHT, TrainSettings
+from train.train_settings import RELIGHT, TrainSettings
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.losses import TrainingLoss

@@ -21,7 +21,7 @@ from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.processes import Interrupted
 from train.run_folder import read_metrics
-from train.settings import TrainSettings
+from train.train_settings import TrainSettings
 from train.training import loop
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze

@@ -18,7 +18,8 @@ from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.saved_networks import load_run
-from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
+from train.settings import PHOTOGRAPHS_FIRST
+from train.train_settings import TrainSettings
 from train.training import run
 from train.training.averages import FACTORS, INTERPOLATION, mix
 from train.training.losses import TrainingLoss

@@ -14,7 +14,7 @@ from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
-from train.settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
+from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.baselines import PGD, Baseline
 from train.training.losses import TrainingLoss
 from train.training.recipe import (

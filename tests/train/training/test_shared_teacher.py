@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from train.device import MixedPrecision
-from train.settings import TrainSettings
+from train.train_settings import TrainSettings
 from train.training.shared_teacher import SharedTeacher, share_layers
 
 SIZE = 4

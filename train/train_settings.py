@@ -1,0 +1,225 @@
+"""Settings of the recipe of a training, and of the architecture. See `renderer.settings`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from renderer.errors import MAX_SCALE, InputError
+from renderer.settings import Settings, setting
+
+# Default of model.name.
+WIDERESNET = "wideresnet"
+# Training settings that need a network with whose weights the training begins.
+NEEDS_INITIAL_NETWORK = (
+    "distillation_weight",
+    "soup",
+    "eval_mode",
+    "consistency_weight",
+    "interpolate",
+)
+# Value of train.freeze with which only the last layer is trained, as by Kirichenko
+# et al. (2023).
+ALL_BUT_LAST = "all_but_last"
+# Choices of train.schedule.
+SCHEDULES = ("step", "cosine", "one_cycle")
+# Choices of train.flips.
+FLIPS = ("random", "alternating")
+# Choices of train.augmentation that are transforms of torchvision.
+TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
+# Augmentation by the light of a projector; see `train.training.relit_batches`.
+RELIGHT = "relight"
+# Choices of train.augmentation.
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
+# Choices of train.optimizer.
+OPTIMIZERS = ("sgd", "adamw")
+# Choices of train.compile.
+COMPILE = ("auto", "always", "never")
+
+
+@dataclass
+class ModelSettings(Settings):
+    """Settings of the architecture of the network to train."""
+
+    name: str = setting(
+        WIDERESNET,
+        "wideresnet, torchvision:NAME or python:package.module:function.",
+    )
+    depth: int = setting(16, "Depth of the WideResNet.")
+    width: int = setting(4, "Width of the WideResNet.")
+    dropout: float = setting(0.3, "Dropout of the WideResNet.")
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """Arguments of `build_network` that build the network. They are stored with its weights."""
+        if self.name == WIDERESNET:
+            return {"depth": self.depth, "width": self.width, "dropout": self.dropout}
+        return {"name": self.name}
+
+
+@dataclass
+class TrainSettings(Settings):
+    """Settings of the training of the network. The defaults are those of the paper."""
+
+    epochs: int = setting(
+        150,
+        "Number of passes over the training images.",
+        minimum=1,
+        maximum=10**6,
+    )
+    images_per_epoch: int | None = setting(
+        None,
+        "Number of training images, drawn anew for each epoch. null: all.",
+        minimum=1,
+        maximum=10**9,
+    )
+    batch_size: int = setting(128, "Images per training step.", minimum=1, maximum=10**6)
+    accumulation_steps: int = setting(
+        1,
+        "Number of parts into which each batch is divided to save memory.",
+        minimum=1,
+        maximum=10**6,
+    )
+    optimizer: str = setting(
+        "sgd",
+        "Optimizer. adamw decays no biases and norms.",
+        choices=OPTIMIZERS,
+    )
+    learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
+    feature_norm: float | None = setting(
+        None,
+        "Norm of the features for which learning_rate is meant. If only the last layer learns, "
+        "the rate is multiplied by it and divided by the norm of the features of the network. "
+        "null: the rate does not change.",
+        above=0,
+        maximum=MAX_SCALE,
+    )
+    momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
+    weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=MAX_SCALE)
+    clip_gradient: float | None = setting(
+        None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=MAX_SCALE
+    )
+    freeze: str | None = setting(
+        None,
+        "Name of the last module of the network that stays as it is. "
+        "all_but_last: only the last layer learns. null: all layers learn.",
+    )
+    schedule: str = setting(
+        "step",
+        "Schedule of the learning rate. step: times 0.2 at 30%, 60% and 80% of the training.",
+        choices=SCHEDULES,
+    )
+    flips: str = setting(
+        "random",
+        "Horizontal flips: half of the images at random, or each image in every other epoch "
+        "(alternating).",
+        choices=FLIPS,
+    )
+    augmentation: str = setting(
+        "none",
+        "Augmentation of every training image. relight: the light of a projector with random "
+        "slides.",
+        choices=AUGMENTATIONS,
+    )
+    relight_gain: float = setting(
+        3.0,
+        "Largest factor of a channel of a slide for augmentation=relight. Its inverse is the "
+        "smallest.",
+        minimum=1,
+        maximum=100,
+    )
+    relight_steps: int = setting(
+        0,
+        "Steps along the gradient that find these factors. 0: random factors.",
+        minimum=0,
+        maximum=1000,
+    )
+    label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
+    ranking_weight: float = setting(
+        0.0,
+        "Weight of the loss that ranks the images of `label` in a batch above the others.",
+        minimum=0,
+        maximum=MAX_SCALE,
+    )
+    distillation_weight: float = setting(
+        0.0,
+        "Weight of the divergence from the predictions of `network`. "
+        "On renders, this counts classes other than `label`.",
+        minimum=0,
+        maximum=MAX_SCALE,
+    )
+    consistency_weight: float = setting(
+        0.0,
+        "Weight of the divergence of the predictions for augmented images from those of "
+        "`network` for the same images without augmentation.",
+        minimum=0,
+        maximum=MAX_SCALE,
+    )
+    interpolate: bool = setting(
+        False,
+        "At the end, interpolate between the weights of `network` and the trained weights, "
+        "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
+    )
+    ema_decay: float = setting(
+        0.0,
+        "Decay of the moving average of the weights, which is validated and kept. 0: none.",
+        minimum=0,
+        below=1,
+    )
+    soup: bool = setting(
+        False,
+        "Start each epoch with `network` again, and keep the mean of the networks of all "
+        "epochs (a model soup).",
+    )
+    eval_mode: bool | None = setting(
+        None,
+        "Train in evaluation mode: with the running statistics of `network` and without "
+        "dropout. null: only a third-party classifier.",
+    )
+    precision: str = setting(
+        "auto",
+        "Precision of the training. auto: bfloat16 if the hardware computes in it, otherwise "
+        "float16 on a GPU and float32 on a CPU, where depthwise convolutions always take float32.",
+    )
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+    threads: int | None = setting(
+        None,
+        "CPU threads, on which the last bits depend. "
+        "null: all cores that the process may use, or one for small batches.",
+        minimum=1,
+        maximum=1024,
+    )
+    compile: str = setting(
+        "auto",
+        "Compile the training step. auto: CUDA graphs on one GPU.",
+        choices=COMPILE,
+    )
+    deterministic: bool = setting(
+        False,
+        "Compute the same bits every time on a GPU, which is slower. The results of a CPU always "
+        "repeat.",
+    )
+    checkpoint_every: int = setting(
+        1,
+        "Epochs between two checkpoints. A single process also writes one about every minute.",
+        minimum=1,
+        maximum=10**6,
+    )
+    resume: bool = setting(
+        False,
+        "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough.",
+    )
+    cache: str | None = setting(
+        "auto",
+        "Folder of rendered data sets. auto: ~/.cache/parametric-norm-balls. null: none.",
+    )
+
+    def __post_init__(self) -> None:
+        """Check all values, and that attacked images have a loss."""
+        super().__post_init__()
+        if self.relight_steps and not self.consistency_weight:
+            raise InputError(
+                f"relight_steps={self.relight_steps} attacks the images of the consistency loss, "
+                "whose weight is 0: set consistency_weight",
+                "relight_steps",
+            )
