@@ -19,9 +19,14 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from renderer.creases import CREASE, normal_groups
 from renderer.errors import InputError, describe, require_choice, require_range
-from renderer.normals import doubled_area_vectors, plain_face_normals, vertex_normals
+from renderer.normals import (
+    CREASE,
+    doubled_area_vectors,
+    normal_groups,
+    plain_face_normals,
+    vertex_normals,
+)
 from renderer.settings import MAX_VERTICES, NORMALS
 from renderer.validation import as_array, require_whole
 

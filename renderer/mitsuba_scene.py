@@ -45,8 +45,8 @@ from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.mesh import Mesh
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
+from renderer.surface.albedo import with_added_albedo
 from renderer.surface.lobes import coat_mean
-from renderer.surface.texture_bake import with_added_albedo
 
 # Name of the file in which a Mitsuba scene is written.
 SCENE = "scene.xml"

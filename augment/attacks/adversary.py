@@ -25,9 +25,8 @@ from renderer.errors import (
     single_line,
 )
 from renderer.image import to_bytes
-from renderer.io.arrays import read_numbers, write_numbers
 from renderer.io.export import export_mesh
-from renderer.io.files import atomic_write
+from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
@@ -37,8 +36,8 @@ from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.short_repr import ShortRepr
+from renderer.surface.albedo import with_added_albedo
 from renderer.surface.gloss import Gloss
-from renderer.surface.texture_bake import with_added_albedo
 from renderer.validation import as_folder
 from renderer.visibility.rasterizer import Rasterizer, choose
 

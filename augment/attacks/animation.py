@@ -9,7 +9,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from renderer.io.tiles import PAPER, Tile, draw_grid, tiles_of
+from renderer.io.images import PAPER, Tile, draw_grid, tiles_of
 
 # Pixels per side of the white ball that shows the light. Smaller images are enlarged by a whole
 # factor to at least this width.

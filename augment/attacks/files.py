@@ -19,8 +19,7 @@ from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import atomic_write
-from renderer.io.images import write_image
-from renderer.io.tiles import Tile, draw_grid, tiles_of
+from renderer.io.images import Tile, draw_grid, tiles_of, write_image
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from PIL import ExifTags, Image, ImageCms
 
-from renderer.image import decode, encode, to_bytes
-from renderer.io.primaries import REC_709, to_rec709
+from renderer.image import REC_709, decode, encode, to_bytes, to_rec709
 
 # Gamma and primaries of Adobe RGB (1998).
 ADOBE_GAMMA = 2 + 51 / 256

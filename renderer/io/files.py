@@ -1,16 +1,19 @@
-"""Write files so that a reader never sees a part of the new content.
+"""Write files, also of arrays (.npy), so that a reader never sees a part of the new content.
 
 A reader finds either the old content or the new content, also after a crash. The
 new content is written to a temporary file, which then replaces the old file.
 """
 
 import errno
+import io
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
+
+import numpy as np
 
 # Pattern for the names of temporary files. The new
 # content of a file is first written to a temporary file
@@ -120,3 +123,30 @@ def file_below(folder: Path, name: str) -> Path:
     if not path.is_file():
         raise ValueError(f"it refers to {name}, which does not exist in {folder}")
     return path
+
+
+def write_numbers(path: Path, numbers: np.ndarray) -> None:
+    """Write an array to an .npy file.
+
+    A reader never sees a part of the new file: see `atomic_write`.
+    """
+    content = io.BytesIO()
+    np.save(content, numbers)
+    atomic_write(path, content.getbuffer())
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """Read an array of real numbers from an .npy file.
+
+    The file is mapped into memory. A damaged header that claims a huge array
+    therefore raises an error instead of allocating memory. Numbers that are too large for float32
+    become infinite.
+    """
+    array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
+    if array.dtype.kind not in "fiu" or not array.size:
+        raise ValueError(
+            f"the array has the type {array.dtype} and the shape {array.shape}, but real numbers "
+            "are needed"
+        )
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32)

@@ -11,16 +11,15 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from renderer.creases import normal_groups
 from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_file, single_line
 from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits, identify
 from renderer.io.mesh_file import OPAQUE, MeshFile, Part, colored_mesh, require_bounded, unit_colors
 from renderer.io.obj import read_obj
-from renderer.io.off import read_off
+from renderer.io.off_and_stl import read_off, read_stl
 from renderer.io.ply import read_ply
-from renderer.io.stl import read_stl
 from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, transformed
+from renderer.normals import normal_groups
 from renderer.validation import as_path, require_flag
 
 # Suffixes of archive files, which are not read. trimesh could read them,

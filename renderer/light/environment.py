@@ -25,9 +25,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_file
-from renderer.io.arrays import read_numbers, write_numbers
-from renderer.io.files import replacing
-from renderer.io.primaries import REC_709, to_rec709
+from renderer.image import REC_709, to_rec709
+from renderer.io.files import read_numbers, replacing, write_numbers
 from renderer.light.harmonics import basis, equirectangular
 
 # Suffixes of the files that `write_map` writes.

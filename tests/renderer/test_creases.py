@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, mesh_of
 
 import norm_balls as nb
-from renderer.creases import normal_groups
 from renderer.mesh import concatenate, refine, select_faces, subdivide, transformed
+from renderer.normals import normal_groups
 
 CAN = mesh_of(trimesh.creation.cylinder(0.5, 1.2, sections=48), (0.8, 0.7, 0.6))
 

@@ -14,8 +14,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from renderer.io.files import atomic_write
-from renderer.io.images import open_image
-from renderer.io.tiles import PAPER, Tile, draw_grid
+from renderer.io.images import PAPER, Tile, draw_grid, open_image
 from train.results.intervals import RATES, auc_and_recalls, roc_curve
 from train.results.predictions import ROC_FIGURE, ROC_TABLE, Prediction, by_label
 from train.results.tables import Estimate

@@ -13,8 +13,7 @@ from torch.nn.functional import interpolate
 from augment.service import AttackExamples
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write, remove_unfinished
-from renderer.io.images import write_image
-from renderer.io.tiles import draw_grid, tiles_of
+from renderer.io.images import draw_grid, tiles_of, write_image
 from renderer.rendering import light_sphere
 from train.run_folder import METRICS, RENDERS
 

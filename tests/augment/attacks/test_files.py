@@ -15,8 +15,8 @@ from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.checks import warnings
 from augment.attacks.files import LINES, SIDE, _captions, figure
 from augment.attacks.result import AttackResult
+from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.io.meshes import load_mesh
-from renderer.io.tiles import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
 from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map

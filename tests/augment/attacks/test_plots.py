@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 import augment
 import renderer
 from augment.attacks.animation import SIDE
-from renderer.io.tiles import MARGIN
+from renderer.io.images import MARGIN
 from tests.helpers import bright_or_dark
 
 SIZE = 8

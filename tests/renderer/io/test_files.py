@@ -16,13 +16,13 @@ from PIL import Image
 
 import renderer
 from renderer.errors import InputError
-from renderer.io.arrays import write_numbers
 from renderer.io.files import (
     TEMPORARY,
     atomic_write,
     file_below,
     remove_unfinished,
     replacing,
+    write_numbers,
 )
 from renderer.io.images import write_image
 from renderer.light.environment import read_panorama, write_map

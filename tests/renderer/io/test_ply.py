@@ -72,7 +72,7 @@ def write_ply(
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
 
 
-@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.filterwarnings("ignore:.*flag, quality")
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     "types",
@@ -98,7 +98,7 @@ def test_all_encodings_of_a_ply_give_the_same_mesh(tmp_path, form, types, line_b
     assert found == {tuple(v): tuple(c) for v, c in zip(VERTICES, COLORS, strict=True)}
 
 
-@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.filterwarnings("ignore:.*flag, quality")
 @pytest.mark.parametrize("faces", [[[0, 1, 5], [1, 6, 5]], FACES])
 @pytest.mark.parametrize("form", FORMS)
 def test_a_truncated_ply_is_refused(tmp_path, form, faces):
@@ -124,7 +124,7 @@ def test_a_list_of_an_impossible_length_is_refused(tmp_path, length):
         load_mesh(tmp_path / "mesh.ply")
 
 
-@pytest.mark.filterwarnings("ignore:.*quality, flag")
+@pytest.mark.filterwarnings("ignore:.*flag, quality")
 @pytest.mark.parametrize("index", [-1, len(VERTICES)])
 @pytest.mark.parametrize("form", FORMS)
 def test_a_missing_vertex_is_refused(tmp_path, form, index):

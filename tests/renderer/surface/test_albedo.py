@@ -17,8 +17,8 @@ from renderer.surface.albedo import (
     face_albedo,
     paint_faces,
     surface_albedo,
+    with_added_albedo,
 )
-from renderer.surface.texture_bake import with_added_albedo
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import choose
 

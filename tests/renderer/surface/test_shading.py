@@ -17,7 +17,6 @@ from oracles import draw, patchwork, scipy_irradiance
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.creases import normal_groups
 from renderer.image import background_term, tonemap
 from renderer.light.harmonics import (
     DIFFUSE_DEGREE,
@@ -26,6 +25,7 @@ from renderer.light.harmonics import (
     nonzero_coefficients,
 )
 from renderer.mesh import Mesh
+from renderer.normals import normal_groups
 from renderer.settings import MAX_DEGREE, ImageSettings
 from renderer.surface import shading
 from renderer.surface.albedo import surface_albedo

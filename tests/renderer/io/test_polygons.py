@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from renderer.polygons import triangulate
+from renderer.io.mesh_file import triangulate
 
 
 def shoelace(points: np.ndarray) -> float:
