@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
@@ -14,7 +14,7 @@ from urllib.parse import unquote
 from train.data.photographs import visible_files
 from train.networks import PYTHON
 from train.saved_networks import selected_file
-from train.settings import published
+from train.settings import dotted, published
 
 # The files of a folder with more bytes are not read. Their sizes and times count instead.
 MAX_FOLDER_BYTES = 2**32
@@ -44,15 +44,6 @@ INPUTS = (
     *("network", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
     "unlabeled",
 )
-
-
-def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value in nested settings with its dotted key, such as "train.epochs"."""
-    for key, value in node.items():
-        if isinstance(value, dict):
-            yield from dotted(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def fingerprints(settings: Any) -> dict[str, str]:

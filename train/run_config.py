@@ -21,9 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.fingerprints import dotted
 from train.run_folder import opened_text
-from train.settings import ExperimentSettings
+from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted
 from train.system import program
 
 CONFIG = "config.yaml"
@@ -32,13 +31,6 @@ PACKAGES = ("torchvision", "numpy")
 # Arguments that are left out when the command line of a run is recorded. Whoever
 # resumes the run gives other values.
 NOT_RECORDED = ("out=", "train.resume=")
-# Settings and recorded facts that do not change the result of a training run, such as
-# its folder and its device. Two runs that differ only in these settings are equal.
-CIRCUMSTANCES = (
-    *("sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
-    *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
-    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
-)
 
 
 def read_config(path: Path) -> DictConfig:

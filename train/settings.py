@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,13 @@ MESHES = (
 # Default name of an output folder: the time at which the command starts. Hydra
 # replaces "${now:...}".
 TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
+# Settings and recorded facts that do not change the result of a training run, such as
+# its folder and its device. Two runs that differ only in these settings are equal.
+CIRCUMSTANCES = (
+    *("sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
+    *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
+    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+)
 
 
 @dataclass
@@ -549,3 +556,12 @@ def published(run: Path) -> Path:
         if path.exists():
             return path
     return run
+
+
+def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each value in nested settings with its dotted key, such as "train.epochs"."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

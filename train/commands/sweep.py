@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train import checkpoints, console
+from train.__main__ import run_name
 from train.cli import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
 from train.results.compare import format_short_comparison, format_table
@@ -30,7 +31,6 @@ from train.results.page import PAGE, report_of
 from train.results.store import is_finished, summarize
 from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state
-from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system import is_verbose, shortened
 from train.training.initial import with_label

@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 
 from renderer.settings import facts_of, field_types
 from train.cli import Command
-from train.fingerprints import dotted
 from train.run_config import format_command
+from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]
 NAMES = (

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 from tests.train.helpers import read_markdown
 from train import __main__ as command
+from train.__main__ import run_name
 from train.cli import USER_ERROR
 from train.commands import sweep
 from train.commands.sweep import format_sweep
 from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
-from train.runs.run_names import run_name
 from train.training import loop
 from train.training.run import Run
 
