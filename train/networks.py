@@ -4,11 +4,9 @@ A network is a WideResNet, an architecture of torchvision, or the result of a
 Python function.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -32,8 +30,6 @@ VERSION = 2
 # elsewhere can ask for any depth and width, and 1e9 parameters take 4 GB.
 MAX_DEPTH = 1000
 MAX_PARAMETER_COUNT = 1e9
-# Number of values of the random 16-bit integers that dropout draws on a CPU.
-DROPOUT_LEVELS = 2**16
 # Three numbers: red, green and blue.
 Color = Sequence[float]
 # Default mean and standard deviation of the pixels of the data, in red, green and blue.
@@ -161,66 +157,18 @@ def _initialize(module: nn.Module) -> None:
 
 
 class Dropout(nn.Dropout):
-    """Dropout that is fast on a CPU, and whose result is the same for any number of processes.
+    """Dropout whose result is the same for any number of processes.
 
-    On a CPU, the random numbers of `nn.Dropout` take a third of the time of a
-    training step. This class takes random 16-bit integers from NumPy, so the
-    probability is rounded to a multiple of 2⁻¹⁶. If several processes train a
-    network, each has a shard (an equal part) of the batch. Each process draws
-    the random numbers of the whole batch, and uses those of its shard.
+    Each process draws the random numbers of the whole batch, and uses those of its own part.
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Set random values to 0, and scale the others by 1 / (1 - p).
-
-        In evaluation mode, x is unchanged. Each process has a part of the batch.
-        """
+        """Set random values to 0, and scale the others by 1 / (1 - p)."""
         if not self.training or self.p == 0:
             return x
-        if x.device.type == "cpu":
-            return x * self._draw_factors(x)
-        if distributed.world_size() == 1:
-            return super().forward(x)
-        # Each process draws the numbers of the whole batch, and uses those of its own part.
         draws = torch.rand(distributed.world_size(), *x.shape, device=x.device)
         is_kept = draws[distributed.rank()] >= self.p
         return x * is_kept / (1 - self.p)
-
-    def _draw_factors(self, x: Tensor) -> Tensor:
-        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
-
-        The factors have the memory layout of x, which is on the CPU.
-        """
-        value_count = x.numel()
-        draws = _draw_int16(value_count * distributed.world_size())
-        shard_start = distributed.rank() * value_count
-        shard_draws = draws[shard_start : shard_start + value_count]
-        # Draws are integers from -DROPOUT_LEVELS / 2 to DROPOUT_LEVELS / 2 - 1. The smallest
-        # `dropped_levels` of these integers mean that a value is dropped.
-        dropped_levels = round(self.p * DROPOUT_LEVELS)
-        threshold = dropped_levels - DROPOUT_LEVELS // 2
-        # `ge_` replaces each draw by 1 if the value is kept, and by 0 if it is dropped.
-        # Numbers of type int16 convert to float five times faster than numbers of type bool.
-        is_kept = shard_draws.ge_(threshold)
-        factors = torch.empty_like(x)
-        # A view of the memory of `factors` as one row of numbers.
-        flat_factors = factors.as_strided((value_count,), (1,))
-        scale = DROPOUT_LEVELS / (DROPOUT_LEVELS - dropped_levels)
-        flat_factors.copy_(is_kept).mul_(scale)
-        return factors
-
-
-def _draw_int16(count: int) -> Tensor:
-    """Draw at least `count` random integers, int16, uniformly from all integers of this type.
-
-    The seed comes from torch, so that `torch.manual_seed` decides the draws.
-    """
-    seed = int(torch.randint(2**63 - 1, (1,)))
-    generator = np.random.Generator(np.random.SFC64(seed))
-    # NumPy draws words of 64 bits fastest. A word holds four integers of 16 bits.
-    word_count = math.ceil(count / 4)
-    words = generator.integers(0, 2**64 - 1, word_count, dtype=np.uint64, endpoint=True)
-    return torch.from_numpy(words.view(np.int16))
 
 
 def build_network(
