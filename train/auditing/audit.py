@@ -40,6 +40,7 @@ from train.auditing.lights import (
     success_by_light,
     transfer_success,
 )
+from train.auditing.network import LABORATORY, PHOTOGRAPHS, PLAIN, RECOGNIZED, TRANSFER
 from train.auditing.relit import (
     RELIT_FOLDER,
     measure_photographs,
@@ -89,7 +90,7 @@ NO_HARD_NEGATIVES = (
     "name meshes of what the classifier may confuse with the class."
 )
 # Settings of pnb-audit that name the folders of test images, by the name of the images.
-FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
+FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
 SETTABLE_LATER = ("hardened", "photos", "unlabeled")
 
@@ -118,11 +119,11 @@ def run_audit(
     _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
     has_renders = renders.exists() and not settings.overwrite
-    if page.LABORATORY not in plan.image_folders:
+    if LABORATORY not in plan.image_folders:
         try:
             # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
             with nullcontext() if has_renders else mitsuba():
-                plan.image_folders = {page.LABORATORY: renders} | plan.image_folders
+                plan.image_folders = {LABORATORY: renders} | plan.image_folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
     caveats += _gradient_caveats(networks.values(), plan.device)
@@ -131,7 +132,7 @@ def run_audit(
     with sole_writer("out", out):
         _prepare_folder(settings, out, renders)
         plan.find_views(out / CLASSIFIER)
-        if plan.image_folders.get(page.LABORATORY) == renders:
+        if plan.image_folders.get(LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
             _write_folder(
@@ -176,7 +177,7 @@ def _audit_photographs(
         folders = {name: out / key for key, name in names.items()}
         screen = photographs_screen(folders)
         path = write_photographs_page(screen, folders, out, caveats)
-        return page.Audited(path, screen, "", names, None)
+        return page.Audited(path, screen, "", {}, None)
 
 
 def _measure_photographs(network: Classifier, settings: AuditSettings, results: Path) -> None:
@@ -215,7 +216,7 @@ class _Plan:
         self.device = choose_device(settings.device)
         self.networks = {key: network.to(self.device) for key, network in networks.items()}
         meshes, hard_negatives = read_meshes(settings)
-        folders = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
+        folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
         self.image_folders = {
             name: published(Path(folder)) for name, folder in folders.items() if folder
         }
@@ -239,7 +240,7 @@ class _Plan:
         The views of all networks then have this light and this size.
         """
         results.mkdir(exist_ok=True)
-        path = results / page.PLAIN
+        path = results / PLAIN
         _write_json(path, _search, self.networks[CLASSIFIER], self.attacked_views)
         plain = PlainViews(**read_json(path))
         self.views = plain.apply_to(self.views)
@@ -250,7 +251,7 @@ class _Plan:
         network = self.networks[key]
         results.mkdir(exist_ok=True)
         lights = (self.environments, self.random_light_count)
-        path = results / page.RECOGNIZED
+        path = results / RECOGNIZED
         _write_json(path, recognize_in_environments, network, self.views, *lights)
         for kind in KINDS:
             path = results / f"{kind}.json"
@@ -258,7 +259,7 @@ class _Plan:
         self._score(network, results)
         others = [other for other in self.networks.values() if other is not network]
         if others:
-            path = results / page.TRANSFER
+            path = results / TRANSFER
             _write_json(path, transfer_success, network, *others, self.attacked_views, results)
 
     def score_in_normalized_light(self, out: Path) -> None:

@@ -9,12 +9,11 @@ from renderer.io.files import atomic_write
 from renderer.short_repr import ShortRepr
 from renderer.validation import as_path
 from train.auditing.lights import KINDS
-from train.auditing.page import RECOGNIZED, TRANSFER, Audited, write_answer
+from train.auditing.network import AuditedNetwork
+from train.auditing.page import Audited
 from train.auditing.remedies import CLASSIFIER, HARDENED
-from train.results.metrics import METRICS, Metrics
-from train.results.predictions import SUMMARY
+from train.results.metrics import METRICS
 from train.results.tables import Estimate
-from train.run_folder import read_json
 
 
 @dataclass(frozen=True)
@@ -114,55 +113,39 @@ class AuditReport(ShortRepr):
 
 
 def read_audit(audited: Audited) -> AuditReport:
-    """Read the results of an audit from its folder."""
-    folder = audited.path.parent
-    label = audited.label
-    networks = {}
-    for key, name in audited.names.items():
-        networks[key] = _read_network(label, name, folder / key)
-    text = audited.path.read_text(encoding="utf-8")
+    """Collect the numbers of an audit."""
+    networks = {key: _report_on(network) for key, network in audited.networks.items()}
     recommended = audited.recommendation
     return AuditReport(
-        label=label,
+        label=audited.label,
         network=networks[CLASSIFIER],
         hardened=networks.get(HARDENED),
         recommendation="" if recommended is None else recommended.sentence,
-        page=text,
+        page=audited.path.read_text(encoding="utf-8"),
     )
 
 
-def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
-    """Read the results of an audit for one network."""
-    summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
-    # The file has a list for the name of each light: whether each view is recognized.
-    recognized_views = read_json(folder / RECOGNIZED)
-    recognized_fraction = {}
-    for light, is_recognized in recognized_views.items():
-        recognized_fraction[light] = sum(is_recognized) / len(is_recognized)
+def _report_on(network: AuditedNetwork) -> NetworkReport:
+    """Collect the results of an audit for one network."""
+    scores = {}
+    for images, stored in network.run.photographs.items():
+        metrics = {name: stored.overall.find(name) for name in METRICS}
+        scores[images] = {name: item for name, item in metrics.items() if item is not None}
+    attacks = {}
+    for kind, counts in network.counts.items():
+        attacks[kind] = AttackCounts(
+            unit=KINDS[kind].unit,
+            radii=KINDS[kind].radii,
+            views=counts["n"],
+            correct=counts["correct"],
+            adversarial=tuple(counts["adversarial"]),
+            random=tuple(counts["random"]),
+        )
     return NetworkReport(
-        name=name,
-        answer=write_answer(label, name, folder, sorted(summaries)),
-        recognized=recognized_fraction,
-        attacks={kind: _read_attack(kind, folder / f"{kind}.json") for kind in KINDS},
-        scores={images: _read_scores(summary) for images, summary in summaries.items()},
-        transfers=read_json(folder / TRANSFER) if (folder / TRANSFER).exists() else {},
+        name=network.name,
+        answer=network.answer,
+        recognized={light: sum(is_) / len(is_) for light, is_ in network.recognized.items()},
+        attacks=attacks,
+        scores=scores,
+        transfers=network.transfers,
     )
-
-
-def _read_attack(kind: str, path: Path) -> AttackCounts:
-    """Read the numbers of misclassified views after the attack on one kind of lighting."""
-    counts = read_json(path)
-    return AttackCounts(
-        unit=KINDS[kind].unit,
-        radii=KINDS[kind].radii,
-        views=counts["n"],
-        correct=counts["correct"],
-        adversarial=tuple(counts["adversarial"]),
-        random=tuple(counts["random"]),
-    )
-
-
-def _read_scores(summary: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the metrics in the content of summary.json. Metrics that it lacks are left out."""
-    metrics = {name: Metrics.read(summary).find(name) for name in METRICS}
-    return {name: estimate for name, estimate in metrics.items() if estimate is not None}

@@ -17,7 +17,7 @@ from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
 from renderer.light.presets import load_light
-from train.auditing import audit, lights, page
+from train.auditing import audit, lights
 from train.auditing.audit import run_audit
 from train.auditing.lights import (
     KINDS,
@@ -28,8 +28,9 @@ from train.auditing.lights import (
     success_by_light,
     transfer_success,
 )
-from train.auditing.screen import withstood_sentence
+from train.auditing.network import LABORATORY, RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
+from train.results.tables import fraction
 
 CLASSES = ("orange", "other")
 
@@ -259,7 +260,7 @@ class TestAWholeAudit:
             with pytest.raises(KeyboardInterrupt):
                 run_audit(AuditSettings(**given))
         times = modification_times(folder)
-        assert folder / "classifier" / page.RECOGNIZED in times
+        assert folder / "classifier" / RECOGNIZED in times
 
         run_audit(AuditSettings(**given, hardened="guessing"))  # A hardened network may be added.
 
@@ -364,16 +365,17 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
     """
     is_recognized = [True] * hits + [False] * (n - hits)
     recognized = {"uniform": is_recognized, "random 1": is_recognized}
-    (folder / page.RECOGNIZED).write_text(json.dumps(recognized))
+    (folder / RECOGNIZED).write_text(json.dumps(recognized))
     for kind in KINDS:
         counts = {"correct": 4, "adversarial": adversarial}
         (folder / f"{kind}.json").write_text(json.dumps(counts))
     scores = {
-        "recall": asdict(page.fraction(hits, n)),
-        "false_positive_rate": asdict(page.fraction(0, n)),
+        "label": "orange",
+        "recall": asdict(fraction(hits, n)),
+        "false_positive_rate": asdict(fraction(0, n)),
     }
-    (folder / page.LABORATORY).mkdir()
-    (folder / page.LABORATORY / "summary.json").write_text(json.dumps(scores))
+    (folder / LABORATORY).mkdir()
+    (folder / LABORATORY / "summary.json").write_text(json.dumps(scores))
 
 
 @pytest.mark.parametrize(
@@ -392,30 +394,32 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
 )
 def test_the_answer_of_an_audit(tmp_path, hits, n, adversarial, answer):
     write_parts(tmp_path, hits, n, adversarial)
-    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
+    text = AuditedNetwork("orange", "dark", tmp_path).answer
     assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
 
 
 def test_no_interval_of_an_audit_has_zero_width(tmp_path):
     for is_recognized in (True, False):
-        rates = page._rates({"uniform": [is_recognized] * 5, "random 1": [is_recognized] * 5})
-        for rate in rates.values():
+        recognized = {name: [is_recognized] * 5 for name in ("uniform", "random 1")}
+        (tmp_path / RECOGNIZED).write_text(json.dumps(recognized))
+        for rate in AuditedNetwork("orange", "dark", tmp_path).rates.values():
             assert rate.low < rate.high
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):
     write_parts(tmp_path, 400, 400, adversarial=[0, 1, 2, 4])
-    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
+    text = AuditedNetwork("orange", "dark", tmp_path).answer
     for light in KINDS.values():
         assert f"{light.title} of radius {light.radii[2]:g} loses 2 of 4 views" in text
 
 
-def test_the_kinds_of_lighting_are_named_that_no_attack_succeeds_with():
-    counts = {kind: {"correct": 4, "adversarial": [0, 0, 0, 1]} for kind in KINDS}
-    assert withstood_sentence("dark", counts) == ""
-    counts["skylight"] = {"correct": 4, "adversarial": [0, 0, 0, 0]}
+@pytest.mark.parametrize("withstood", [[], ["skylight"]])
+def test_the_kinds_of_lighting_are_named_that_no_attack_succeeds_with(tmp_path, withstood):
+    write_parts(tmp_path, 4, 4, adversarial=[0, 0, 0, 1])
     # Without a recognized view there is nothing to attack.
-    counts["lamps"] = {"correct": 0, "adversarial": [0, 0, 0, 0]}
-    text = withstood_sentence("dark", counts)
-    named = [kind for kind, light in KINDS.items() if light.title in text]
-    assert named == ["skylight"]
+    counts = {"lamps": {"correct": 0, "adversarial": [0, 0, 0, 0]}}
+    counts |= {kind: {"correct": 4, "adversarial": [0, 0, 0, 0]} for kind in withstood}
+    for kind, content in counts.items():
+        (tmp_path / f"{kind}.json").write_text(json.dumps(content))
+    text = AuditedNetwork("orange", "dark", tmp_path).withstood
+    assert [kind for kind, light in KINDS.items() if light.title in text] == withstood

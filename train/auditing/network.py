@@ -1,0 +1,217 @@
+"""What an audit measured about one network, read from its files once, and whether it is safe."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from train.auditing.lights import KINDS, RANDOM
+from train.results.intervals import Units, leave_out, weighted_means
+from train.results.predictions import Prediction
+from train.results.store import RunSummary, ScoredRun, read_summaries
+from train.results.tables import Estimate, join_words
+from train.run_folder import read_json
+
+# Names of the two folders of test images, and of the subfolders with their scores.
+LABORATORY = "laboratory"
+PHOTOGRAPHS = "photographs"
+# The images in these folders, in words.
+IN_WORDS = {LABORATORY: "path-traced test images", PHOTOGRAPHS: "photographs"}
+# Result file: in which environment lights a network recognizes each view.
+RECOGNIZED = "recognized.json"
+# Result file: the ordinary light in which the audited network recognizes most views.
+PLAIN = "plain_light.json"
+# Result file: how often attacks on a network also fool the other network.
+TRANSFER = "transfer.json"
+# With fewer views that an attack could lose, attacks and renders alone decide nothing.
+MIN_VIEWS = 6
+# A network is called safe only if it classifies at least this fraction of the images
+# correctly, both of the tested class and of other objects.
+PASS_THRESHOLD = 0.9
+
+
+class _Finding(NamedTuple):
+    """Fraction of images that a network classifies correctly, in words and as numbers.
+
+    Attributes:
+        text: Clause for the report, such as "it recognizes 60% of orange".
+        right: Fraction of images that the network classifies correctly.
+        least: Low end of the 95% interval of this fraction.
+    """
+
+    text: str
+    right: float
+    least: float
+
+
+def _recognized(subject: str, recall: Estimate) -> Iterator[_Finding]:
+    """Describe what fraction of the images of an object a network recognizes, if it is known."""
+    if recall.value is not None and recall.low is not None:
+        yield _Finding(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)
+
+
+def _not_mistaken(subject: str, error: Estimate) -> Iterator[_Finding]:
+    """Describe what fraction of the images of other objects a network mistakes for a class.
+
+    `error` is the fraction that is mistaken, the finding has the fraction that is not.
+    """
+    if error.value is not None and error.high is not None:
+        yield _Finding(f"it takes {error.value:.0%} of {subject}", 1 - error.value, 1 - error.high)
+
+
+@dataclass(frozen=True)
+class AuditedNetwork:
+    """Results of an audit for one network.
+
+    Attributes:
+        label: Class whose objects were tested.
+        name: Name of the network.
+        folder: Folder of the results.
+    """
+
+    label: str
+    name: str
+    folder: Path
+
+    @cached_property
+    def run(self) -> RunSummary:
+        """The scores on test images as those of a run, for tables and comparisons."""
+        scores = read_summaries(self.folder)
+        return RunSummary(self.folder, self.name, {"network": self.name}, scores, None)
+
+    @cached_property
+    def recognized(self) -> dict[str, list[bool]]:
+        """Whether the network recognizes each view, by the name of an environment light."""
+        return read_json(self.folder / RECOGNIZED)
+
+    @cached_property
+    def counts(self) -> dict[str, dict[str, Any]]:
+        """Result of `success_by_light` for each kind of lighting."""
+        return {kind: read_json(self.folder / f"{kind}.json") for kind in KINDS}
+
+    @cached_property
+    def transfers(self) -> dict[str, Any]:
+        """Result of `transfer_success`. Empty with one network."""
+        path = self.folder / TRANSFER
+        return read_json(path) if path.exists() else {}
+
+    def predictions(self, images: str) -> Sequence[Prediction]:
+        """Predictions for a folder of test images, in the order of the images."""
+        return ScoredRun(self.run, images).pooled().predictions
+
+    @cached_property
+    def rates(self) -> dict[str, Estimate]:
+        """Fraction of renders in environment lights and in random lights that is recognized.
+
+        The intervals are over views.
+        """
+        random_names = {name for name in self.recognized if name.startswith(RANDOM)}
+        names_of_title = {
+            "renders in environments": self.recognized.keys() - random_names,
+            "renders in random light": random_names,
+        }
+        rates: dict[str, Estimate] = {}
+        for title, names in names_of_title.items():
+            # `hits` has one row for each view and one column for each light.
+            hits = np.array([self.recognized[name] for name in sorted(names)], float).T
+            # Index of the view in each entry of `hits.ravel()`.
+            view_of_render = np.arange(len(hits)).repeat(hits.shape[1])
+            units = Units([view_of_render], "views")
+            (rate,) = leave_out(partial(weighted_means, hits.reshape(1, -1)), units)
+            rates[title] = rate.estimate
+        return rates
+
+    @cached_property
+    def verdict(self) -> tuple[str, str]:
+        """Whether the network is safe, in words such as "No", and a sentence that says why."""
+        if not any(any(views) for views in self.recognized.values()):
+            return "Unknown", f"Unknown: it does not recognize {self.label} in plain light, either."
+        of_renders = [
+            finding
+            for subject, rate in self.rates.items()
+            for finding in _recognized(subject, rate)
+        ]
+        of_images = [*self._judge_images()]
+        findings = [*of_renders, *of_images]
+        faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
+        faults += self._attack_faults()
+        view_count = max(counts["correct"] for counts in self.counts.values())
+        rests_on_images = any(finding.right < PASS_THRESHOLD for finding in of_images)
+        if faults and not rests_on_images and view_count < MIN_VIEWS:
+            reasons = "; ".join(faults)
+            return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} views were attacked."
+        if faults:
+            return "No", f"No: {'; '.join(faults)}."
+        if self.run.photographs and all(item.least >= PASS_THRESHOLD for item in findings):
+            answer = "Yes, as far as this audit looks."
+        else:
+            answer = "No fault is shown, but so few images leave room for one."
+        return answer, answer
+
+    @property
+    def answer(self) -> str:
+        """Whether the network is safe in unusual lighting, and why it is not."""
+        return f"Is {self.name} safe under unusual lighting? {self.verdict[1]}"
+
+    def _judge_images(self) -> Iterator[_Finding]:
+        """Yield what fractions of the test images the network classifies correctly."""
+        for images, scores in self.run.photographs.items():
+            place = f"{self.label} in the {IN_WORDS[images]}"
+            yield from _recognized(place, scores.overall.recall)
+            yield from _not_mistaken(
+                f"other objects for {place}", scores.overall.false_positive_rate
+            )
+
+    def _attack_faults(self) -> Iterator[str]:
+        """Yield the attacks after which the network misclassifies half of the views.
+
+        Each clause has the smallest radius at which that is so, among the views that were correct
+        before.
+        """
+        for kind, counts in self.counts.items():
+            light = KINDS[kind]
+            for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
+                if 0 < counts["correct"] <= 2 * fooled_count:
+                    attack = f"an attack with {light.title} of radius {radius:g}"
+                    yield f"{attack} loses {fooled_count} of {counts['correct']} views"
+                    break
+
+    @property
+    def withstood(self) -> str:
+        """Sentence that names the kinds of lighting by which no attack succeeds.
+
+        Empty if attacks with each kind succeed, or if no view is recognized before them.
+        """
+        titles = [
+            KINDS[kind].title
+            for kind, counts in self.counts.items()
+            if counts["correct"] and not counts["adversarial"][-1]
+        ]
+        if not titles:
+            return ""
+        return f"No attack on {self.name} succeeded with {join_words(titles, 'or')}."
+
+    @property
+    def strongest_kind(self) -> str | None:
+        """Kind of lighting by which the most views become misclassified.
+
+        None if no view is recognized before the attacks.
+        """
+        lost = {
+            kind: counts["adversarial"][-1] / counts["correct"]
+            for kind, counts in self.counts.items()
+            if counts["correct"]
+        }
+        return max(lost, key=lambda kind: lost[kind]) if lost else None
+
+    def remaining(self, kind: str, method: str) -> Iterator[tuple[int, int]]:
+        """Yield the numbers of views that stay correct, and of views correct before, by radius.
+
+        The first is for the radius 0. `method` is "adversarial" or "random".
+        """
+        correct = self.counts[kind]["correct"]
+        for count in (0, *self.counts[kind][method]):
+            yield correct - count, correct
