@@ -14,6 +14,12 @@ from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
 from augment.attacks.files import save as save
 from augment.attacks.result import AttackResult as AttackResult
+from augment.augmentation_settings import AugmentationSettings as AugmentationSettings
+from augment.augmentation_settings import CameraEffectSettings as CameraEffectSettings
+from augment.augmentation_settings import RandomLightSettings as RandomLightSettings
+from augment.augmentation_settings import SpecularLayerSettings as SpecularLayerSettings
+from augment.augmentation_settings import TrainingAttackSettings as TrainingAttackSettings
+from augment.augmentation_settings import VariationSettings as VariationSettings
 from augment.classifier import Classifier as Classifier
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
@@ -24,20 +30,14 @@ from augment.scene.objects import Example as Example
 from augment.scene.objects import SceneObject as SceneObject
 from augment.scene.scene import Scene as Scene
 from augment.service import AugmentationService as AugmentationService
-from augment.settings import AugmentationSettings as AugmentationSettings
-from augment.settings import CameraEffectSettings as CameraEffectSettings
 from augment.settings import LampsSettings as LampsSettings
 from augment.settings import MeshSettings as MeshSettings
 from augment.settings import NormalizedLightSettings as NormalizedLightSettings
 from augment.settings import ObjectSettings as ObjectSettings
 from augment.settings import ProjectorSettings as ProjectorSettings
 from augment.settings import PropSettings as PropSettings
-from augment.settings import RandomLightSettings as RandomLightSettings
 from augment.settings import RendererSettings as RendererSettings
 from augment.settings import SceneSettings as SceneSettings
-from augment.settings import SpecularLayerSettings as SpecularLayerSettings
-from augment.settings import TrainingAttackSettings as TrainingAttackSettings
-from augment.settings import VariationSettings as VariationSettings
 from augment.sources import load_classifier as load_classifier
 
 __version__: str

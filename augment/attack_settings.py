@@ -139,11 +139,7 @@ class PoseSettings(StepSettings):
     )
 
     def __post_init__(self) -> None:
-        """Check that the attack can change something.
-
-        Raises:
-            InputError: If all settings are 0.
-        """
+        """Check that the attack can change something."""
         super().__post_init__()
         if not any(getattr(self, name) for name in POSE_PARTS):
             raise InputError(
@@ -393,11 +389,7 @@ class AttackSettings(ParameterSettings):
     )
 
     def __post_init__(self) -> None:
-        """Check that the settings do not contradict each other.
-
-        Raises:
-            InputError: If two parameters set the same light, or if restarts lack a norm-ball.
-        """
+        """Check that the settings do not contradict each other."""
         super().__post_init__()
         if self.lighting and self.skylight:
             raise InputError("lighting and skylight both set the light: choose one of them")

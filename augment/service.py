@@ -22,6 +22,7 @@ from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
+from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import LogitNetwork
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known
 from augment.network import compute_outputs, frozen_eval_mode
@@ -31,7 +32,6 @@ from augment.scene.build import MeshSource, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import AugmentationSettings
 from renderer.errors import InputError, describe
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis

@@ -34,7 +34,7 @@ import torch
 
 import renderer
 from augment import AugmentationService, AugmentationSettings, StepSettings
-from augment.settings import TrainingAttackSettings
+from augment.augmentation_settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility.rasterizer import choose

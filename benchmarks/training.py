@@ -41,11 +41,11 @@ from torch.utils.data import DataLoader
 from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
+from augment.augmentation_settings import TrainingAttackSettings
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, record, with_median
 from train import checkpoints, run_folder
 from train.__main__ import main as train_command

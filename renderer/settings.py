@@ -84,6 +84,7 @@ class Facts:
         above: Number that the value must exceed.
         below: Number that the value must not reach.
         choices: Names that the value may have.
+        length: Number of items of a list.
         is_pair: True for a list of two numbers [minimum, maximum].
         is_text: True for a name or a path whose annotation is Any.
         may_be_empty: True if an empty text is permitted.
@@ -97,6 +98,7 @@ class Facts:
     above: float | None = None
     below: float | None = None
     choices: Collection[str] = ()
+    length: int | None = None
     is_pair: bool = False
     is_text: bool = False
     may_be_empty: bool = False
@@ -131,42 +133,15 @@ class Limit:
     end: float | None
 
 
-def setting(
-    default: Any,
-    about: str,
-    unit: str = "",
-    *,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-    choices: Collection[str] = (),
-    is_pair: bool = False,
-    is_text: bool = False,
-    may_be_empty: bool = False,
-    checks_type: bool = True,
-) -> Any:
-    """Create a field of a settings class.
+def setting(default: Any, about: str, unit: str = "", **facts: Any) -> Any:
+    """Create a field of a settings class. `facts` are further attributes of `Facts`.
 
     If the value is a list, its items are checked against the range and the choices. None is
     permitted if the annotation of the field permits None. A function as default is called
     for each instance, and REQUIRED means that there is none. `above` and `below` exclude
     the limit. `is_text` makes the command line read 1.10 as text.
     """
-    facts = Facts(
-        about,
-        unit,
-        minimum,
-        maximum,
-        above,
-        below,
-        choices,
-        is_pair,
-        is_text,
-        may_be_empty,
-        checks_type,
-    )
-    return _field(default, facts)
+    return _field(default, Facts(about, unit, **facts))
 
 
 def setting_like(kind: type, name: str, default: Any) -> Any:
@@ -222,11 +197,16 @@ def field_types(kind: type) -> dict[str, Any]:
     return {item.name: hints[item.name] for item in fields(cast(Any, kind))}
 
 
-def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) -> Kind:
-    """Create an instance of a settings class from a mapping.
+def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
+    """Create an instance of a settings class from a mapping. An instance is returned as it is.
 
     `argument` is the name of the mapping, with which errors begin.
     """
+    if isinstance(values, kind):
+        return values
+    if not isinstance(values, Mapping):
+        expected = f"give a mapping or {kind.__name__}(...)"
+        raise InputError(f"{argument} is {describe(values)}: {expected}", argument)
     known_fields = fields(cast(Any, kind))
     names = [known.name for known in known_fields]
     for name in values:
@@ -257,9 +237,9 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     if facts.is_pair:
         _check_pair(name, value, facts)
         return
-    if not facts.choices and not facts.limits:
-        return
-    items = value if isinstance(value, list | tuple) else [value]
+    items = list(value) if _is_list(value) else [value]
+    if facts.length not in (None, len(items)):
+        raise InputError(f"{name}={items}: give {facts.length} numbers", name)
     for item in items:
         if facts.choices:
             require_choice(name, item, facts.choices)
@@ -322,13 +302,17 @@ def _fits(value: object, hint: Any) -> bool:
         return any(_fits(value, option) for option in get_args(hint))
     if origin is list:
         (item_hint,) = get_args(hint)
-        # An array or a tensor with at least one axis counts as a list.
-        is_array = getattr(value, "ndim", 0) > 0
-        if isinstance(value, str) or not (is_array or isinstance(value, Sequence)):
+        if not _is_list(value):
             return False
         items = cast(Iterable[Any], value)
         return item_hint is Any or all(_fits(item, item_hint) for item in items)
     return isinstance(value, origin or hint)
+
+
+def _is_list(value: object) -> bool:
+    """Tell whether a value is a list. An array or a tensor with at least one axis counts as one."""
+    is_array = getattr(value, "ndim", 0) > 0
+    return not isinstance(value, str) and (is_array or isinstance(value, Sequence))
 
 
 # Words with which errors ask for a value of each type.

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attacks.result import AttackResult
+from augment.augmentation_settings import RandomLightSettings
 from augment.progress import Phases
 from augment.scene.objects import Conditions
-from augment.settings import RandomLightSettings
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps

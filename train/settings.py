@@ -8,15 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.settings import (
-    MAX_EXAMPLES,
-    AugmentationSettings,
-    ObjectSettings,
-    RendererSettings,
-    SceneSettings,
-    count_views,
-    read_normalized_light,
-)
+from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, count_views
+from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
 from renderer.errors import InputError, composed, describe, is_whole, require_range
 from renderer.settings import (
     MAX_SIZE,

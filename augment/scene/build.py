@@ -41,7 +41,7 @@ from renderer.visibility.rasterizer import choose
 
 if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings
-    from augment.settings import SpecularLayerSettings, VariationSettings
+    from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from augment.augmentation_settings import CameraEffectSettings
 from augment.progress import progress
 from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
-from augment.settings import CameraEffectSettings
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
+from augment.settings import MeshSettings, ObjectSettings, PropSettings
 from renderer.camera import Camera
 from renderer.errors import InputError
 from renderer.mesh import (
@@ -185,7 +185,6 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """
     if color is None:
         return item
-    require_color("ground", color)
     used_vertices = np.unique(item.mesh.faces)
     # Horizontal coordinates x and y of the vertices that a face uses.
     horizontal = item.mesh.vertices[used_vertices, :2]

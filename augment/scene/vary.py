@@ -12,6 +12,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from augment.augmentation_settings import (
+    CameraEffectSettings,
+    SpecularLayerSettings,
+    VariationSettings,
+)
 from augment.progress import progress
 from augment.scene.camera_effects import draw_camera_effects, draw_image_files
 from augment.scene.objects import (
@@ -24,7 +29,6 @@ from augment.scene.objects import (
 from augment.scene.patterns import pixel_centers, random_colors
 from augment.scene.scene import Scene
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
-from augment.settings import CameraEffectSettings, SpecularLayerSettings, VariationSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode

@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from augment import AugmentationService, AugmentationSettings
+from augment.augmentation_settings import CameraEffectSettings, TrainingAttackSettings
 from augment.scene import scene
 from augment.scene.build import build_scene
-from augment.settings import CameraEffectSettings, TrainingAttackSettings
 from renderer import memory
 from renderer.errors import InputError
 from renderer.image import to_bytes

@@ -11,18 +11,18 @@ from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.attack_settings import StepSettings
+from augment.augmentation_settings import (
+    AugmentationSettings,
+    RandomLightSettings,
+    TrainingAttackSettings,
+    VariationSettings,
+)
 from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.service import AugmentationService, Renders
-from augment.settings import (
-    AugmentationSettings,
-    RandomLightSettings,
-    TrainingAttackSettings,
-    VariationSettings,
-)
 from renderer.errors import InputError
 from renderer.light.presets import probe
 from renderer.solids import solid

@@ -7,7 +7,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from augment.settings import AugmentationSettings
+from augment.augmentation_settings import AugmentationSettings
 from renderer.errors import InputError
 from scripts.attack import main as attack_command
 from scripts.evaluate import main as evaluate_command

@@ -31,6 +31,7 @@ from augment.attacks.find_scene import EXPOSURES
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions
+from augment.augmentation_settings import VariationSettings
 from augment.classifier import Classifier
 from augment.network import compute_outputs
 from augment.progress import progress
@@ -39,7 +40,7 @@ from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
+from augment.settings import LampsSettings, ProjectorSettings
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes

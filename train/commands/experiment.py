@@ -18,7 +18,7 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from augment import distributed
-from augment.settings import MODES
+from augment.augmentation_settings import MODES
 from train import checkpoints, console
 from train.cli import compose, read_settings
 from train.processes import Interrupted, broadcast, process_group

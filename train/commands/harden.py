@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import Classifier
 from augment.network import unwrapped
 from augment.plain_networks import (
@@ -20,7 +21,7 @@ from augment.plain_networks import (
     device_of,
     require_evaluation_mode,
 )
-from augment.settings import AugmentationSettings, NormalizeLight, RendererSettings
+from augment.settings import NormalizeLight, RendererSettings
 from renderer.errors import InputError, describe
 from renderer.settings import Settings
 from renderer.validation import as_path, require_kind

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
-from augment.settings import MODES
+from augment.augmentation_settings import MODES
 from renderer.errors import InputError
 from train.results.intervals import Jackknife, change
 from train.results.metrics import METRICS, TOP_RANKS, Pool, Pooled, metric_title

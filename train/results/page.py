@@ -14,8 +14,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from augment.augmentation_settings import MODES
 from augment.progress import progress_message
-from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.laboratory.kept_aside import can_be_generated

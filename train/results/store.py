@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, cast
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attack_settings import LINES
-from augment.settings import MODES
+from augment.augmentation_settings import MODES
 from renderer.errors import InputError, single_line
 from train import console, run_config, run_folder
 from train.results.metrics import (

@@ -13,9 +13,9 @@ from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.result import AttackResult
+from augment.augmentation_settings import TrainingAttackSettings
 from augment.losses import NO_CLASS
 from augment.service import Renders
-from augment.settings import TrainingAttackSettings
 from renderer.errors import InputError
 
 SIZE = 8

@@ -12,10 +12,11 @@ from torch import Tensor
 import augment
 from augment.attack_settings import MaterialSettings
 from augment.attacks.parameters import make_parameter
+from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.scene.build import Smoothest, build_scene, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import ObjectSettings, PropSettings, SpecularLayerSettings, VariationSettings
+from augment.settings import ObjectSettings, PropSettings
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import quadrature

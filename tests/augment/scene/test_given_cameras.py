@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import augment
 import renderer
+from augment.augmentation_settings import VariationSettings
 from augment.scene.vary import vary
-from augment.settings import VariationSettings
 from renderer.errors import InputError
 
 SIZE = 24

@@ -16,12 +16,13 @@ from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
+from augment.augmentation_settings import count_views
 from augment.scene import render
 from augment.scene.build import build_scene, load_backgrounds
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
-from augment.settings import ObjectSettings, count_views
+from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.io.images import gray_or_image

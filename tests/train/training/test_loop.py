@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from augment.augmentation_settings import AugmentationSettings
 from augment.progress import Phases
 from augment.service import AugmentationService
-from augment.settings import AugmentationSettings
 from renderer import memory
 from renderer.errors import InputError
 from train import checkpoints, run_folder
