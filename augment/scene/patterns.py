@@ -176,7 +176,7 @@ def draw_photograph_patterns(
     rotated = turned(points * scale, angle.cos(), angle.sin())
     # `grid_sample` needs the coordinates on the last axis, shape (N, size, size, 2).
     grid = rotated.permute(1, 2, 3, 0)
-    shown = F.grid_interpolate(photographs, grid, padding_mode="reflection", align_corners=False)
+    shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
     # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
     factor = MAX_SATURATION * relative_saturation[:, None]
