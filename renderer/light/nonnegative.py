@@ -10,12 +10,12 @@ direction in which its radiance has a local minimum and is negative.
 `project_nonnegative` keeps the mean of the given light v, so x₀ = v₀. It
 minimizes the error of the irradiance, Σ A_l² (x − v)², with the factors A_l of
 `lambertian_factors`. Coefficients with A_l = 0 get a small weight instead (see
-`window.irradiance_weights`), so of all lights with the same irradiance, the
-nearest one is chosen. The program is solved for the directions of a grid and of
-the negative minima that are found. If negative minima are left after a few
-solutions, the light times `nonnegative_window` is mixed in to remove them. This
-windowed light is non-negative if the given light is a physical light that was
-cut off at a degree. Without a fixed mean, the nearest coefficients would
+`irradiance_weights`), so of all lights with the same irradiance, the
+nearest one is chosen. The program is solved for the directions of a grid and of the negative minima
+that are found. If negative minima are left after a few solutions, the light times
+`nonnegative_window` is mixed in to remove them. This windowed light is
+non-negative if the given light is a physical light that was cut off at a degree.
+Without a fixed mean, the nearest coefficients would
 brighten the whole sky to remove the negative minima beside a bright source.
 
 `nearest_nonnegative` is used after each step of an attack. For coefficients v,
@@ -59,9 +59,13 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.ball import Ball
-from renderer.light.harmonics import bands, cache_tensors, gradient_matrices, monomial_coefficients
-from renderer.light.program import shortest
-from renderer.light.window import irradiance_weights, nonnegative_window
+from renderer.light.harmonics import (
+    bands,
+    cache_tensors,
+    gradient_matrices,
+    monomial_coefficients,
+)
+from renderer.light.ringing import irradiance_weights, nonnegative_window, shortest
 from renderer.vectors import tangent_axes
 
 Array = NDArray[Any]
@@ -106,28 +110,13 @@ _MAX_ANGLE = 0.1
 _NEWTON_STEPS = 2
 
 
-@dataclass(frozen=True)
-class _StartLimits:
-    """Limits that tell from which grid directions the search for a negative minimum starts.
-
-    Both limits are fractions of the largest radiance of the light.
-
-    Attributes:
-        above_zero: The radiance in a start direction is below this limit.
-        above_neighbors: The radiance in a start direction exceeds the radiance in
-            each neighboring grid direction by at most this limit.
-    """
-
-    above_zero: float
-    above_neighbors: float
-
-
-# `nearest_nonnegative` uses these limits, with which few negative minima are missed.
-_MANY_STARTS = _StartLimits(above_zero=0.04, above_neighbors=1e-3)
-# `project_nonnegative` uses these limits, with which a search only starts from grid
-# directions that are at most as bright as all their neighbors. The search is faster, and
-# the next round of the exchange method finds the minima that it misses.
-_LOWEST_STARTS = _StartLimits(above_zero=0.04, above_neighbors=0.0)
+# The search for a negative minimum starts from grid directions whose radiance is below this
+# fraction of the largest radiance of the light,
+_ABOVE_ZERO = 0.04
+# and exceeds the radiance of no neighbor by more than this fraction. Few minima are missed
+# with the first value. The search is faster with the second one.
+_MANY_STARTS = 1e-3
+_LOWEST_STARTS = 0.0
 
 
 def project_nonnegative(coefficients: Tensor) -> Tensor:
@@ -158,12 +147,7 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
 
 @lru_cache(maxsize=_MAX_CACHED_CHANNELS)
 def _project_channel(channel: bytes) -> Float[Tensor, " K"]:
-    """Call `_project_with_mean` for one color channel, and cache the result.
-
-    Several attacks often start in the same light. At degree 39, a projection takes
-    half a minute. The bytes of the channel (float64) are used because a cache needs something
-    that can be hashed.
-    """
+    """Project one color channel, in bytes that can be hashed, and cache the result."""
     return torch.from_numpy(_project_with_mean(np.frombuffer(channel).copy()))
 
 
@@ -176,7 +160,7 @@ def _project_with_mean(light: Array) -> Array:
         return uniform
     degree = math.isqrt(len(light)) - 1
     weights = irradiance_weights(degree).numpy()
-    smoothed = nonnegative_window(degree).numpy() * light
+    windowed = nonnegative_window(degree).numpy() * light
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
@@ -192,19 +176,18 @@ def _project_with_mean(light: Array) -> Array:
             weighted_change = shortest(constraints[:, 1:] / weights[1:], -constraints @ light)
             nearest = np.concatenate([[mean], light[1:] + weighted_change / weights[1:]])
         else:
-            # Mix uniform light into the smoothed light until its radiance is not negative in
+            # Mix uniform light into the windowed light until its radiance is not negative in
             # any direction that was found. Then mix the result into the nearest light.
-            filler = _mix_to_nonnegative(smoothed, uniform, constraints)
+            filler = _mix_to_nonnegative(windowed, uniform, constraints)
             filler = _mix_to_nonnegative(filler, uniform, new_constraints)
             nearest = _mix_to_nonnegative(nearest, filler, new_constraints)
     return nearest
 
 
 def _mix_to_nonnegative(light: Array, filler: Array, harmonics: Array) -> Array:
-    """Mix a second light into a light until its radiance is non-negative in D directions.
+    """Mix a light with as little of a filler as makes it non-negative in D directions.
 
-    The result is light + s (filler - light) with the smallest possible s ≥ 0. The filler must be
-    brighter than the light wherever the light is negative.
+    The filler must be brighter than the light wherever the light is negative.
     """
     radiance = harmonics @ light
     difference = harmonics @ (filler - light)
@@ -290,16 +273,8 @@ class _QuadraticProgram:
     radius. The solution is the projection of the point c + t (v - c), without the
     ball. The number t from 0 to 1 is chosen so that the solution lies in the ball.
 
-    Attributes:
-        original: SH coefficients v of the given light, shape (C, K).
-        nearest: SH coefficients of the solution, shape (C, K).
-
-    Args:
-        original: SH coefficients v of the given light, shape (C, K).
-        low: Lower bounds of the coefficients, shape (C, K) or a number.
-        high: Upper bounds of the coefficients, shape (C, K) or a number.
-        center: Center c of the ball, shape (C, K) or a number.
-        radius: Radius r of the ball. Infinity for no ball.
+    The arrays `original` (v), `nearest` (the solution), `low`, `high` and `center` have the
+    shape (C, K), or the last three are numbers.
     """
 
     def __init__(
@@ -323,9 +298,8 @@ class _QuadraticProgram:
         self._min_t = min(radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
         self.nearest = self._unconstrained_point().clip(low, high)
-        # This list has one array for each channel, shape (M, K). The array has the harmonics
-        # in the M directions in which the constraint of the radiance is active (its
-        # multiplier is positive). At first, there are no directions.
+        # Harmonics in the M directions whose constraint is active (its multiplier is positive),
+        # one array (M, K) for each channel. At first, there are no directions.
         self._active_constraints = [original[:0]] * len(original)
 
     def _unconstrained_point(self) -> Array:
@@ -386,13 +360,10 @@ class _QuadraticProgram:
     def _step_to_sphere(
         self, velocity: Array, displacement: Array, missing_squared: float
     ) -> float:
-        """Find the change of t that brings the solution x onto the sphere |x - c| = r.
+        """Find the change s of t with |displacement + s velocity| = r, which keeps t in its range.
 
-        The solution is the projection of the point c + t (v - c), which lies between
-        the center c of the ball (t = 0) and the given light v (t = 1). The change s
-        of t solves the quadratic equation |displacement + s velocity| = r. It is
-        clipped so that t stays between its minimum and 1. `velocity` is the derivative of x with
-        respect to t, `displacement` is x - c, and `missing_squared` is r² - |x - c|².
+        `velocity` is the derivative of x with respect to t, `displacement` is x - c, and
+        `missing_squared` is r² - |x - c|².
         """
         squared_speed = float((velocity * velocity).sum())
         slope = float((velocity * displacement).sum())
@@ -486,7 +457,7 @@ def _least_distance(
 
 
 def _find_negative_minima(
-    lights: Array, rounding_radiance: Array, limits: _StartLimits
+    lights: Array, rounding_radiance: Array, above_neighbors: float
 ) -> tuple[Array, Array]:
     """Find the directions in which the radiance of R lights has a negative local minimum.
 
@@ -499,7 +470,15 @@ def _find_negative_minima(
     # Radiance of each light (rows) in each direction of the grid (columns).
     radiance = lights @ grid.harmonics
     largest = np.abs(radiance).max(1)
-    light_index, grid_index = _choose_starts(radiance, largest, rounding_radiance, grid, limits)
+    upper_limit = np.where(largest > rounding_radiance, _ABOVE_ZERO * largest, -np.inf)
+    light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
+    # Each of the six rows of `grid.neighbors` has one neighbor of every grid direction.
+    for neighbors in grid.neighbors:
+        neighbor_radiance = radiance[light_index, neighbors[grid_index]]
+        margin = above_neighbors * largest[light_index]
+        is_low = radiance[light_index, grid_index] <= neighbor_radiance + margin
+        light_index = light_index[is_low]
+        grid_index = grid_index[is_low]
     # SH coefficients of the 3 first and the 9 second derivatives of the light of each start
     # direction. Axes: start, derivative, coefficient.
     derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
@@ -510,30 +489,6 @@ def _find_negative_minima(
     lowest_radiance = (harmonics * lights[light_index]).sum(1)
     is_negative = lowest_radiance < -_MIN_DEPTH * largest[light_index]
     return light_index[is_negative], harmonics[is_negative]
-
-
-def _choose_starts(
-    radiance: Array,
-    largest: Array,
-    rounding_radiance: Array,
-    grid: "_Grid",
-    limits: _StartLimits,
-) -> tuple[Array, Array]:
-    """Choose the grid directions from which the search for a negative minimum starts.
-
-    `radiance` has a row for each light, and `largest` is its largest magnitude. The result is the
-    index of the light and of the grid direction of each start.
-    """
-    upper_limit = np.where(largest > rounding_radiance, limits.above_zero * largest, -np.inf)
-    light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
-    margin = limits.above_neighbors * largest
-    # Each of the six rows of `grid.neighbors` has one neighbor of every grid direction.
-    for neighbors in grid.neighbors:
-        neighbor_radiance = radiance[light_index, neighbors[grid_index]]
-        is_low = radiance[light_index, grid_index] <= neighbor_radiance + margin[light_index]
-        light_index = light_index[is_low]
-        grid_index = grid_index[is_low]
-    return light_index, grid_index
 
 
 def _step_down(directions: Array, derivatives: Array) -> Array:

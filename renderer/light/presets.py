@@ -27,7 +27,7 @@ from renderer.light.harmonics import (
     require_degree,
     rotate,
 )
-from renderer.light.highlights import window_without_ringing
+from renderer.light.ringing import window_without_ringing
 from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.validation import as_path
 

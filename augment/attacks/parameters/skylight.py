@@ -15,9 +15,9 @@ from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.basis import HARMONICS
 from renderer.light.presets import mean_luminance
+from renderer.light.ringing import nonnegative_window
 from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
-from renderer.light.window import nonnegative_window
 from renderer.settings import TURBIDITY
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)

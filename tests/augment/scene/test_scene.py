@@ -28,8 +28,8 @@ from renderer.errors import InputError
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
-from renderer.light.highlights import required_degree
 from renderer.light.presets import ambient, probe
+from renderer.light.ringing import required_degree
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings

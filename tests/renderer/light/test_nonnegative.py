@@ -25,7 +25,7 @@ from renderer.light.nonnegative import (
     project_nonnegative,
 )
 from renderer.light.presets import ambient, load_light
-from renderer.light.window import nonnegative_window
+from renderer.light.ringing import nonnegative_window
 
 HDRI = Path(__file__).parents[4] / "shared/data/hdri"
 GRACE = load_light("grace").double()

@@ -31,10 +31,10 @@ from renderer.light.basis import (
     SplitLight,
 )
 from renderer.light.harmonics import bands, basis, lambertian_factors
-from renderer.light.highlights import AMPLITUDE, highlight_window, required_degree
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
+from renderer.light.ringing import AMPLITUDE, highlight_window, required_degree
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape

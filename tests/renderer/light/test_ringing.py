@@ -10,8 +10,12 @@ from oracles import draw_uniform, random_directions
 from scipy import optimize
 
 from renderer.light.harmonics import basis, quadrature
-from renderer.light.highlights import NARROWER, highlight_window, window_without_ringing
-from renderer.light.window import nonnegative_window
+from renderer.light.ringing import (
+    NARROWER,
+    highlight_window,
+    nonnegative_window,
+    window_without_ringing,
+)
 
 # Error of the irradiance of a point source, relative to its root mean square,
 # by degree. It follows from the closed form of the clamped cosine.

@@ -1,0 +1,344 @@
+"""Ringing of lights that are cut off at a degree, and windows that prevent it.
+
+A light that is cut off at a degree rings: its radiance oscillates around bright
+places and becomes negative. A window multiplies the coefficients of band l (the
+harmonics of degree l) by a factor w_l. This convolves the light with a kernel
+
+    k(cos θ) = Σ_l (2l + 1) / 4π w_l P_l(cos θ),
+
+with the Legendre polynomials P_l and the angle θ between two directions. If the
+kernel is non-negative, a non-negative light stays non-negative. With w_0 = 1,
+the light keeps its mean.
+
+`nonnegative_window` computes the non-negative kernel that gives a point source
+the smallest error of irradiance, Σ_l (2l + 1) A_l² (1 - w_l)². The factors A_l
+of `harmonics.lambertian_factors` are zero for odd l from 3 on. The program uses
+half of the smallest positive factor instead of zero, which raises the error by
+less than 10⁻⁵ of the error.
+
+This is a convex quadratic program with one constraint for each angle θ. The
+exchange method (Hettich and Kortanek 1993, "Semi-infinite programming", section
+7) solves the program for some angles, adds the angles at which the kernel is
+negative, and repeats.
+
+A highlight is the light that a rough surface reflects specularly toward the
+camera (see `renderer.microfacets`). In light with few spherical harmonics, it is
+blurred or rings, too. The amplitude of degree l is the factor by which a specular
+lobe multiplies the coefficients of degree l of a light (as the kernel of a
+convolution), divided by the factor of degree 0.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.polynomial import legendre
+from torch import Tensor
+
+from renderer.light.environment import FEWEST_ROWS, to_map
+from renderer.light.harmonics import bands, cache_tensors, lambertian_factors
+from renderer.microfacets import SCHLICK, reflectance
+from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
+
+# Largest number of rounds of `best_window`. Each round finds the angles at which the
+# lobe is negative, and constrains the lobe there. Eight rounds are usual.
+_MAX_ROUNDS = 100
+# `best_window` stops if the lobe that it makes non-negative is nowhere below minus this
+# fraction of its largest value.
+_MAX_DEPTH = 1e-9
+# `shortest` stops if two errors are at most this number. The first is the violation of the
+# inequalities, relative to their right sides. The second is the duality gap (the sum of
+# the products of slacks and multipliers), relative to the squared length of y.
+_TOLERANCE = 1e-9
+# At the optimum, the shortest vector y is matrixᵀ multipliers. `shortest` only stops if the
+# length of the difference is at most this number times the length of y.
+_STATIONARITY_TOLERANCE = 1e-6
+# Largest number of steps of `shortest`. 15 to 40 are usual.
+_MAX_STEPS = 80
+# A step goes this fraction of the way to the point at which a slack or a multiplier
+# becomes 0.
+_FRACTION_TO_BOUNDARY = 0.99
+# Smallest slack at the start of `shortest`. The multipliers start with this number,
+# divided by the mean squared length of a row of the matrix.
+_START = 0.1
+# `required_degree` leaves out the degrees of a light whose amplitude in a highlight
+# is at most this fraction of the amplitude of degree 0, by default.
+AMPLITUDE = 0.1
+# Highlights at grazing angles are narrower than highlights along the normal.
+# `window_without_ringing` therefore also tests a highlight whose width α = roughness² is
+# multiplied by this factor.
+NARROWER = 0.7
+# When `highlight_window` minimizes errors, an error of the irradiance has this many times
+# the weight of an error of a highlight.
+IRRADIANCE_WEIGHT = 10.0
+# Smallest amplitude that `_amplitudes` returns. Other functions divide by amplitudes, so
+# these must not be 0.
+MIN_AMPLITUDE = 1e-4
+
+
+@cache_tensors
+def nonnegative_window(degree: int) -> Tensor:
+    """Compute factors for SH coefficients that keep lights non-negative.
+
+    A physical light becomes negative in some directions if its SH coefficients
+    are cut off at a degree. Multiplied by these factors (a window), the cut light
+    is non-negative. Of all such windows, this one changes the irradiance of a
+    point source least. The root mean square error is 0.17, 0.073 and 0.039 of the
+    root mean square irradiance at degrees 6, 12 and 19. The degree is at most 20. The factors in
+    [0, 1] are equal within a band, and the first is 1.
+    """
+    # The first harmonic of band l has the index l².
+    first_of_band = np.arange(degree + 1) ** 2
+    irradiance_by_band = irradiance_weights(degree)[first_of_band].numpy()
+    # The squared coefficients of a point source in band l add up to (2l + 1) / 4π. The
+    # weights therefore contain √(2l + 1). The constant factor 4π does not matter.
+    weights = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_by_band
+    return best_window(np.ones(degree + 1), weights)
+
+
+def best_window(
+    spectrum: Float[np.ndarray, " degrees"], weight: Float[np.ndarray, " degrees"]
+) -> Tensor:
+    """Compute the factors that make a lobe non-negative and change the lobe least.
+
+    A lobe is a function of the angle θ from an axis, Σ_l (2l + 1) s_l P_l(cos θ),
+    with the Legendre polynomials P_l. A window multiplies s_l by a factor w_l.
+    The best window minimizes Σ_l weight_l² (w_l - 1)² under the condition that the
+    windowed lobe Σ_l (2l + 1) s_l w_l P_l(cos θ) is negative at no angle. All s_l must be
+    positive. They are 1 for a point source. The result has one factor for each coefficient of a
+    light, and the first is 1.
+    """
+    degree = len(weight) - 1
+    if degree == 0:
+        return torch.ones(1, dtype=torch.float64)
+    # Cosines of the angles at which the windowed lobe must not be negative.
+    cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
+    for _ in range(_MAX_ROUNDS):
+        factors = _best_factors(cosines, weight, spectrum)
+        # Legendre coefficients of the windowed lobe.
+        series = (2 * np.arange(degree + 1) + 1) * spectrum * factors
+        # The minima of the lobe are at roots of its derivative, or at an end.
+        stationary = legendre.legroots(legendre.legder(series))
+        candidates = np.concatenate([stationary.real.clip(-1, 1), [-1.0, 1.0]])
+        lobe_values = legendre.legval(candidates, series)
+        negative_cosines = candidates[lobe_values < -_MAX_DEPTH * lobe_values.max()]
+        if not len(negative_cosines):
+            break
+        cosines = np.concatenate([cosines, negative_cosines])
+    # The lobe may still be slightly negative. Reducing all factors but the first one moves
+    # the lobe toward a constant, which lifts its minimum to 0.
+    factors[1:] /= max(1 - lobe_values.min(), 1)
+    return torch.from_numpy(factors)[bands(degree)]
+
+
+def _best_factors(
+    cosines: Float[np.ndarray, " N"],
+    weight: Float[np.ndarray, " degrees"],
+    spectrum: Float[np.ndarray, " degrees"],
+) -> Float[np.ndarray, " degrees"]:
+    """Compute the factors that make a lobe non-negative at N angles and change it least.
+
+    The lobe is Σ_l (2l + 1) s_l w_l P_l(cos θ) with the factors w_l. Its error is
+    Σ_l weight_l² (w_l - 1)². It is the squared length of the vector with the
+    entries weight_l (w_l - 1), so the shortest vector is searched. The first factor is 1.
+    """
+    degree = len(weight) - 1
+
+    # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.
+    terms = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
+    # The sum over a row is the value of the lobe at this angle if all factors are 1. The
+    # change of the factors must add at least the negative of this value.
+    weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
+    return np.concatenate([[1.0], 1 + weighted_change / weight[1:]])
+
+
+def shortest(
+    matrix: Float[np.ndarray, "M n"], lower_bounds: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, " n"]:
+    """Find the shortest vector y with `matrix` y ≥ `lower_bounds`, a least distance program.
+
+    This is a convex quadratic program. With slacks s = matrix y - lower_bounds
+    and multipliers μ, the vector y is optimal if y = matrixᵀ μ, s ≥ 0, μ ≥ 0, and
+    s_i μ_i = 0 for each inequality i. The predictor-corrector method solves
+    these conditions (Mehrotra 1992, "On the implementation of a primal-dual
+    interior point method"). The computing time does not depend on how many
+    inequalities hold with equality. Some y must satisfy all inequalities strictly, and
+    y = 0 must violate one of them. They hold up to 10⁻⁹ of the largest bound.
+    """
+    # Only imported when it is needed, because scipy.linalg takes 0.1 s.
+    from scipy.linalg import cho_factor, cho_solve
+
+    scale = np.abs(lower_bounds).max()
+    bounds = lower_bounds / scale
+    y = np.zeros(matrix.shape[1])
+    slacks = np.maximum(-bounds, _START)
+    multipliers = np.full(len(matrix), _START / np.square(matrix).sum(1).mean())
+    for _ in range(_MAX_STEPS):
+        # At the optimum, both residuals and the gap are 0.
+        dual_residual = y - matrix.T @ multipliers
+        primal_residual = matrix @ y - slacks - bounds
+        gap = slacks @ multipliers
+        is_gap_closed = gap < _TOLERANCE * (y @ y)
+        is_stationary = np.linalg.norm(dual_residual) < _STATIONARITY_TOLERANCE * np.linalg.norm(y)
+        if is_gap_closed and is_stationary and np.abs(primal_residual).max() < _TOLERANCE:
+            break
+        weighted_rows = matrix * np.sqrt(multipliers / slacks)[:, None]
+        system = weighted_rows.T @ weighted_rows + np.eye(len(y))
+        try:
+            factor = cho_factor(system, overwrite_a=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            # Near the optimum, multipliers divided by slacks may differ so much in
+            # magnitude that rounding errors prevent another step.
+            break
+        # The predictor is a Newton step toward products s_i μ_i of 0, which is not taken. Its
+        # length, up to which no slack or multiplier is negative, decides how small the
+        # products shall become: the longer, the smaller. The corrector is a Newton step
+        # toward these equal products. It also removes the second-order error of the predictor.
+        products = slacks * multipliers
+        reductions = products
+        for is_predictor in (True, False):
+            # Eliminating the slacks and the multipliers leaves a linear system for y.
+            eliminated = (multipliers * primal_residual + reductions) / slacks
+            right_side = -dual_residual - matrix.T @ eliminated
+            y_change = cho_solve(factor, right_side, check_finite=False)
+            slack_change = matrix @ y_change + primal_residual
+            multiplier_change = -(reductions + multipliers * slack_change) / slacks
+            # Largest fractions of their values that a slack and a multiplier lose.
+            decreases = (-slack_change / slacks).max(), (-multiplier_change / multipliers).max()
+            longest = 1 / max(*decreases, _FRACTION_TO_BOUNDARY)
+            if is_predictor:
+                predicted_slacks = slacks + longest * slack_change
+                predicted_gap = predicted_slacks @ (multipliers + longest * multiplier_change)
+                target_product = (predicted_gap / gap) ** 3 * gap / len(matrix)
+                reductions = products + slack_change * multiplier_change - target_product
+        length = min(_FRACTION_TO_BOUNDARY * longest, 1)
+        y = y + length * y_change
+        slacks = slacks + length * slack_change
+        multipliers = multipliers + length * multiplier_change
+    return y * scale
+
+
+@cache_tensors
+def irradiance_weights(degree: int) -> Tensor:
+    """Compute how strongly each SH coefficient changes the irradiance of a diffuse surface.
+
+    The weight of a coefficient of degree l is |A_l| / A_0. A_l is the factor of
+    the coefficient in the irradiance (`lambertian_factors`). If A_l is zero, the
+    weight is half of the smallest positive weight up to degree + 1, so that all
+    weights are positive.
+    """
+    # Also compute the factor of degree + 1, because it may be the smallest positive factor.
+    factors = lambertian_factors(degree + 1).abs()
+    smallest = factors[factors > 0].min()
+    weights = factors.clamp(min=smallest / 2) / factors[0]
+    return weights[: (degree + 1) ** 2]
+
+
+@cache
+def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
+    """Find the degree of environment light that the highlights of a material need.
+
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal. It multiplies the coefficients of degree l of the light by
+    an amplitude. All degrees with a larger amplitude than `amplitude` are needed.
+    `amplitude` is a fraction of the amplitude of degree 0, and the result is at most
+    MAX_DEGREE.
+    """
+    amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
+    # The amplitudes fall with the degree. If n degrees from 1 on exceed the limit, these
+    # are the degrees 1 to n.
+    return int(np.count_nonzero(amplitudes[1:] > amplitude))
+
+
+def window_without_ringing(
+    coefficients: Float[Tensor, "K C"], roughness: float
+) -> Float[Tensor, " K"]:
+    """Find factors for the SH coefficients of a map that keep dark rings out of highlights.
+
+    The radiance of few spherical harmonics oscillates around bright places of the
+    map. Highlights then get dark rings with negative radiance. A window is a
+    factor for each coefficient that prevents this. The function tries no window,
+    then the window for a highlight of the surface, and then the window for a
+    highlight that is narrower by the factor NARROWER. It returns the first of
+    these with which the narrower highlight is negative nowhere. The first factor is 1.
+    """
+    degree = math.isqrt(len(coefficients)) - 1
+    # The square root, because the width of a highlight is α = roughness².
+    narrow_roughness = max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER)
+    narrow_amplitudes = torch.from_numpy(_amplitudes(narrow_roughness, degree))
+    narrow_lobe = narrow_amplitudes[bands(degree)]
+    window = torch.ones(len(coefficients), dtype=torch.float64)
+    rows = max(FEWEST_ROWS, 2 * degree)
+    for width in (1.0, NARROWER):
+        # Radiance of the narrower highlight for cameras in all directions.
+        highlights = to_map(coefficients * (window * narrow_lobe)[:, None], rows)
+        if (highlights >= 0).all():
+            break
+        window = highlight_window(degree, roughness, width)
+    return window
+
+
+@cache
+def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
+    """Find factors for SH coefficients of light that keep a highlight non-negative.
+
+    The factors (a window) change the highlight and the irradiance of a point
+    light as little as possible. An error of the irradiance has IRRADIANCE_WEIGHT
+    times the weight of an error of the highlight. `width` is a factor for the width
+    α = roughness² of the highlight. The first factor is 1.
+    """
+    highlight = _amplitudes(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
+    # The first harmonic of degree l has the index l².
+    first_of_degree = torch.arange(degree + 1) ** 2
+    irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
+    weight = np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance)
+    harmonics_per_degree = 2 * np.arange(degree + 1) + 1
+    return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
+
+
+@cache
+def highlight_error(degree: int, roughness: float) -> float:
+    """Compute the error of a highlight if a point light is approximated by harmonics.
+
+    The SH coefficients of the point light are cut off at a degree and multiplied
+    by `highlight_window` for a highlight that is narrower by the factor NARROWER.
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal. The error is the root mean square over all directions, as a fraction
+    of that of the highlight.
+    """
+    amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
+    window = highlight_window(degree, roughness, NARROWER)
+    # The first harmonic of degree l has the index l².
+    first_of_degree = np.arange(degree + 1) ** 2
+    # Factor of each degree in the approximation. Degrees that are cut off have 0.
+    factors = np.zeros_like(amplitudes)
+    factors[: degree + 1] = window[first_of_degree].numpy()
+    power = (2 * np.arange(len(amplitudes)) + 1) * amplitudes**2
+    relative_squared_error = float(power @ (1 - factors) ** 2 / power.sum())
+    return math.sqrt(relative_squared_error)
+
+
+def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
+    """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
+
+    The highlight is the specular lobe of a metal for a camera that looks along
+    the surface normal. The lobe is symmetric about the normal, so the factor of
+    degree l is the integral of the lobe times the Legendre polynomial P_l. Factors are
+    divided by that of degree 0, and at least MIN_AMPLITUDE.
+    """
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    node_count = 2**9 + 4 * degree
+    # Gauss-Legendre nodes in [-1, 1]. They are mapped to the cosines of angles to the
+    # normal in [0, 1], because the lobe is 0 below the surface.
+    nodes, weights = legendre.leggauss(node_count)
+    cosine = torch.from_numpy((nodes + 1) / 2)
+    sine = (1 - cosine**2).sqrt()
+    light = torch.stack([sine, 0 * cosine, cosine], 1)
+    roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
+    lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
+    # Legendre polynomials P_0 to P_degree (columns) at each node (rows).
+    polynomials = legendre.legvander(cosine.numpy(), degree)
+    amplitudes = (weights * lobe.numpy()) @ polynomials
+    return np.maximum(amplitudes / amplitudes[0], MIN_AMPLITUDE)
