@@ -177,7 +177,7 @@ class LampsSettings(Settings):
     )
 
 
-# Settings of each kind of local light, see `renderer.light.local_lights`.
+# Settings of each kind of local light, see `renderer.light.lamps`.
 LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
     "projector": ProjectorSettings,
     "lamps": LampsSettings,

@@ -31,7 +31,7 @@ from renderer.io.images import gray_or_image, write_image
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.files import read_light, save_light
-from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings

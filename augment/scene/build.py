@@ -29,9 +29,9 @@ from renderer.errors import InputError, as_device, describe, require_bounded
 from renderer.io.images import gray_or_image
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
 from renderer.light.harmonics import degree_of, irradiance_error
-from renderer.light.highlights import highlight_error, required_degree
-from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.presets import load_light
+from renderer.light.ringing import highlight_error, required_degree
 from renderer.memory import has_memory
 from renderer.mesh import Mesh, require_mesh, select_faces, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings

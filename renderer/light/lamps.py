@@ -18,6 +18,7 @@ from renderer.errors import MAX_SCALE, InputError, require_range
 from renderer.io.mitsuba_entries import pose_of
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
+from renderer.light.projector import Projector
 from renderer.settings import require_field_types
 from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes
@@ -261,3 +262,10 @@ class Lamps(LocalBasis):
         radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}
         emitter = {"type": "area", "radiance": radiance}
         return {"type": "disk", "to_world": pose_of(camera, self.radius), "emitter": emitter}
+
+
+# All kinds of local light by name. In this order, their coefficients follow those of the
+# environment light in a scene. The name is also the name of two settings: a field of
+# `augment.settings.SceneSettings` for the light, and a field of
+# `augment.parameter_settings.ParameterSettings` for attacks on the light.
+LOCAL_LIGHTS: dict[str, type[LocalBasis]] = {kind.name: kind for kind in (Projector, Lamps)}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.parameters.local_light import LocalLight
 from renderer.errors import require_choice
-from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,7 +19,7 @@ from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
-from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.operators import lamp_paths
 from renderer.operators.build import build_operators
 from renderer.visibility.rasterizer import choose

@@ -26,7 +26,7 @@ from renderer.errors import InputError
 from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import irradiance_error, nonzero_coefficients, project
-from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import ZENITH, coefficients
