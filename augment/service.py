@@ -37,10 +37,7 @@ from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
 from renderer.validation import (
-    as_array,
     as_integers,
-    as_list,
-    as_tensor,
     require_kind,
     require_seed,
     require_whole,
@@ -59,14 +56,8 @@ class AttackExamples:
     """S renders for which an attack during training succeeded, to be shown in figures.
 
     The first axis of images, lights and predictions is the time: index 0 is before the attack,
-    and index 1 is after it.
-
-    Attributes:
-        images: Images in [0, 1], shape (2, S, 3, H, W).
-        lights: RGB coefficients of the light, shape (2, S, basis.size, 3).
-        predictions: Probabilities of the C classes, shape (2, S, C).
-        labels: Labels, shape (S,), int64.
-        basis: Basis of the light.
+    and index 1 is after it. Images are in [0, 1]. Lights are RGB coefficients in the basis.
+    Predictions are probabilities of the C classes.
     """
 
     images: Float[Tensor, "2 S 3 H W"]
@@ -76,7 +67,6 @@ class AttackExamples:
     basis: Basis = HARMONICS
 
     def __len__(self) -> int:
-        """Return the number of examples."""
         return len(self.labels)
 
 
@@ -150,12 +140,7 @@ class AugmentationService:
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Check the arguments, and raise the degree of the lighting if the settings need it.
-
-        Raises:
-            InputError: If an argument has the wrong type or shape, or if the
-                settings need a scene or images that are not given.
-        """
+        """Check the arguments, and raise the degree of the lighting if the settings need it."""
         expected = "nb.AugmentationSettings(...)"
         require_kind("settings", self.settings, AugmentationSettings, expected)
         require_seed("seed", self.seed)
@@ -171,7 +156,7 @@ class AugmentationService:
                 f"give one label for each of the {len(self.scene)} examples",
             )
         if self.images is not None:
-            self.images = self._checked_images(self.images)
+            self._check_images(self.images)
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(
@@ -184,15 +169,13 @@ class AugmentationService:
             if not attack.allow_negative:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 
-    def _checked_images(self, images: UInt8[Tensor, "E 3 H W"]) -> Tensor:
-        """Convert images to a tensor, and check its dtype and shape."""
-        if not isinstance(images, Tensor):
-            images = torch.from_numpy(as_array("images", images))
+    def _check_images(self, images: UInt8[Tensor, "E 3 H W"]) -> None:
+        """Check the type, the dtype and the shape of the images of a folder."""
+        require_kind("images", images, Tensor, "a tensor of bytes, or None")
         if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
             raise InputError(
                 f"images is {describe(images)}: give bytes (E, 3, H, W), one for each label",
             )
-        return images
 
     @classmethod
     def from_meshes(
@@ -237,18 +220,6 @@ class AugmentationService:
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_seed("seed", seed)
-        expected = (
-            "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
-        )
-        members = as_list("meshes", meshes, tuple | list, expected)
-        for index, member in enumerate(members):
-            if len(member) != 2:
-                raise InputError(
-                    f"meshes[{index}] is {describe(member)}: give a pair of a mesh and the index "
-                    "of its class, such as ('solid:orange', 53)"
-                )
-            require_whole(f"meshes[{index}]: its label", member[1])
-        named = [(mesh, str(label)) for mesh, label in members]
         paper: dict[str, Any] = {
             "views": 10,
             "samples": 8,
@@ -257,8 +228,10 @@ class AugmentationService:
         }
         settings = settings or AugmentationSettings()
         options = paper | of_scene
-        scene = build_scene(named, size, attack=settings.attack, vary=settings.vary, **options)
-        labels = torch.tensor([int(label) for label in scene.labels], device=scene.lights.device)
+        scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
+        for item in scene.objects:
+            require_whole(f"meshes: the label of {item.name}", item.label)
+        labels = torch.tensor(scene.labels, device=scene.lights.device)
         settings = replace(settings, examples=len(scene))
         return cls(settings, scene, labels, seed, Phases(labels.device))
 
@@ -337,18 +310,11 @@ class AugmentationService:
                 f"state has the keys {found}, which are not those of a service: "
                 "give the result of state_dict of a service with the same scene"
             )
-        values = state.get("values")
-        if values is not None:
-            values = as_tensor("state", values)
-            if values.ndim != 2 or len(values) != len(self.labels):
-                raise InputError(
-                    f"state has values of {len(values)} examples, not of {len(self.labels)}: "
-                    "resume with the settings of the run",
-                )
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
             raise InputError(
                 "state is of another scene: resume with the same meshes, labels, views and light",
             )
+        values = state.get("values")
         self._last_values = None if values is None else values.to(self.labels.device)
 
     @cached_property

@@ -25,7 +25,7 @@ from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_mat
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer.camera import Camera, orbit_cameras
-from renderer.errors import InputError, as_device, describe, require_bounded
+from renderer.errors import InputError, as_device, describe, is_whole, require_bounded
 from renderer.io.images import gray_or_image
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
 from renderer.light.harmonics import degree_of, irradiance_error
@@ -208,7 +208,8 @@ def _as_meshes(meshes: object) -> list[Any]:
         mesh, label = member
         if not isinstance(mesh, str | Path):
             require_mesh(f"meshes[{index}]", mesh)
-        require_kind(f"meshes[{index}]: its label", label, str | int, LABEL)
+        if not is_whole(label):
+            require_kind(f"meshes[{index}]: its label", label, str, LABEL)
     return members
 
 
@@ -219,6 +220,8 @@ def _load_member(
     if isinstance(member, ObjectSettings):
         return load_object(member, vertices)
     mesh, label = member
+    if not isinstance(label, str):
+        label = int(label)
     if isinstance(mesh, Mesh):
         return SceneObject.from_mesh(label, subdivide(mesh, vertices))
     loaded = load_object(ObjectSettings(str(mesh), str(label)), vertices)
