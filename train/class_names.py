@@ -134,36 +134,22 @@ def require_others(
             )
 
 
-def with_classes_of_meshes(
-    settings: ExperimentSettings, classes: Sequence[str]
-) -> ExperimentSettings:
-    """Fill in the missing label of the settings of a run from the classes of its meshes.
-
-    The label lists each class once, and each mesh in the copy has its class.
-    """
-    items = settings.meshes
-    names = classes_of_meshes(items, classes, "meshes")
-    meshes = []
-    for item, name in zip(items, names, strict=True):
-        values = item if isinstance(item, dict) else {"mesh": item}
-        meshes.append({**values, "label": name})
-    negatives = [
-        with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
-    ]
-    # A dictionary has each name once, in the order of the meshes.
-    labels = list(dict.fromkeys(names))
-    return replace(
-        settings,
-        label=labels[0] if len(labels) == 1 else labels,
-        meshes=meshes,
-        hard_negatives=negatives,
-    )
-
-
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
-    """Replace the indices of classes in the settings of a run by the names of the classes."""
-    names = [class_name(classes, name, "label") for name in label_names(settings.label)]
-    meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
+    """Name the classes in the settings of a run, some of which may be given by index.
+
+    A missing label becomes the list of the classes of the meshes, and each mesh gets its class.
+    """
+    if settings.label is None:
+        found = classes_of_meshes(settings.meshes, classes, "meshes")
+        meshes = [
+            {**(item if isinstance(item, dict) else {"mesh": item}), "label": name}
+            for item, name in zip(settings.meshes, found, strict=True)
+        ]
+        # A dictionary has each name once, in the order of the meshes.
+        names = [*dict.fromkeys(found)]
+    else:
+        names = [class_name(classes, name, "label") for name in label_names(settings.label)]
+        meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
     negatives = [
         with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
     ]

@@ -6,11 +6,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from filelock import FileLock, Timeout
-from tqdm import tqdm
 
 from renderer.errors import InputError, single_line
 from renderer.io.files import remove_unfinished
@@ -38,11 +36,6 @@ BEFORE = "before"
 # Phases of an epoch. The log has the seconds of each phase. Together, the phases take
 # the whole time of the epoch.
 PHASES = ("attack", "training", "evaluation", "input_output")
-
-# Measurements of the attack on the training renders. A round is a part of the training
-# with the same renders. If an epoch has several rounds, the log has these measurements
-# of each round.
-SHOWN = ("attack_success_before", "attack_success", "steps")
 
 
 @contextmanager
@@ -157,60 +150,6 @@ def state(folder: Path) -> str:
         reason = failure.read_text(encoding="utf-8", errors="replace").strip()
         return f"failed: {reason}"
     return "interrupted"
-
-
-def epoch_metrics(
-    trained: Mapping[str, float],
-    validated: Mapping[str, float],
-    diagnostics: list[Mapping[str, float]],
-    seconds: Mapping[str, float],
-) -> dict[str, float]:
-    """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
-
-    "augment/" has means of the diagnostics over all rounds, and "round_1/" those of one of several
-    rounds.
-    """
-    means = {}
-    for name in diagnostics[0]:
-        means[name] = fmean(of_round[name] for of_round in diagnostics)
-    groups = {
-        "train": trained,
-        "validation": validated,
-        "augment": means,
-        "seconds": seconds,
-    }
-    if len(diagnostics) > 1:
-        for number, of_round in enumerate(diagnostics, 1):
-            shown = {name: of_round[name] for name in SHOWN if name in of_round}
-            groups[f"round_{number}"] = shown
-    metrics: dict[str, float] = {}
-    for group, values in groups.items():
-        metrics |= {f"{group}/{name}": value for name, value in values.items()}
-    return metrics
-
-
-def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
-    """Write the line that the console shows after an epoch.
-
-    The success of the attack counts only renders that are classified correctly before it.
-    """
-    total = sum(metrics[f"seconds/{name}"] for name in PHASES)
-    parts = [
-        f"epoch {epoch}/{epochs}",
-        f"train loss {metrics['train/loss']:.3f} accuracy {metrics['train/accuracy']:.3f}",
-        f"validation accuracy {metrics['validation/accuracy']:.3f}",
-    ]
-    success = attack_success(metrics, "augment/")
-    if success is not None:
-        # "attack_success_before" is the fraction of renders that are misclassified
-        # before the attack.
-        correct = 1 - metrics["augment/attack_success_before"]
-        parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
-    duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"
-    left = total * (epochs - epoch)
-    if left:
-        duration += f"; about {tqdm.format_interval(left)} left"
-    return "  ".join([*parts, duration])
 
 
 def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:

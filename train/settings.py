@@ -311,7 +311,7 @@ class ExperimentSettings(NetworkSettings):
             self._check_silhouettes()
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
-            # are known. `with_classes_of_meshes` then creates these settings again.
+            # are known. `with_class_names` then creates these settings again.
             return
         self._remove_generated_positives()
         if renders_meshes:

@@ -26,7 +26,7 @@ def test_label_lists_the_classes_of_labels_files_and_solids_once():
         {"mesh": "other_scan.glb", "label": 0},
         "solid:lemon:3",
     ]
-    named = class_names.with_classes_of_meshes(settings(meshes), CLASSES)
+    named = class_names.with_class_names(settings(meshes), CLASSES)
     assert named.label == ["banana", "coffee mug", "lemon"]
     labels = [item.label for item in named.objects.values()]
     assert labels == ["banana", "coffee mug", "banana", "lemon"]
@@ -34,13 +34,13 @@ def test_label_lists_the_classes_of_labels_files_and_solids_once():
 
 
 def test_label_of_one_class_is_its_name():
-    named = class_names.with_classes_of_meshes(settings(["orange.glb", "solid:orange"]), CLASSES)
+    named = class_names.with_class_names(settings(["orange.glb", "solid:orange"]), CLASSES)
     assert named.label == "orange"
 
 
 def test_generated_hard_negatives_of_these_classes_are_left_out():
     negatives = ["solid:fruit", "solid:lemon", {"mesh": "solid:orange", "label": 3}]
-    named = class_names.with_classes_of_meshes(settings(["lemon.glb"], negatives), CLASSES)
+    named = class_names.with_class_names(settings(["lemon.glb"], negatives), CLASSES)
     assert named.hard_negatives == [
         "solid:fruit",
         {"mesh": "solid:orange", "label": "orange"},
@@ -62,11 +62,11 @@ def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message, monkeypatc
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bananas.glb").touch()
     with pytest.raises(InputError, match=re.escape(message)):
-        class_names.with_classes_of_meshes(settings([mesh]), CLASSES)
+        class_names.with_class_names(settings([mesh]), CLASSES)
 
 
 def test_a_mesh_tells_no_class_if_the_classes_have_no_names(tmp_path):
     mesh = tmp_path / "orange.glb"
     mesh.touch()
     with pytest.raises(InputError, match="give label=INDEX, from 0 to 2"):
-        class_names.with_classes_of_meshes(settings([str(mesh)]), ["0", "1", "2"])
+        class_names.with_class_names(settings([str(mesh)]), ["0", "1", "2"])

@@ -27,7 +27,7 @@ from renderer.settings import Settings
 from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
-from train.class_names import require_others, with_classes_of_meshes
+from train.class_names import require_others, with_class_names
 from train.cli import read_settings
 from train.commands.arguments import (
     MeshItem,
@@ -177,7 +177,7 @@ def harden(
         }
         settings = _read_settings(changes, sections)
         if settings.label is None:
-            settings = with_classes_of_meshes(settings, classifier.classes)
+            settings = with_class_names(settings, classifier.classes)
         with sole_writer("out", folder), _restores_torch():
             trained = _train(settings, classifier, has_report=out is not None)
     return _copy_with_weights(network, classifier, trained)

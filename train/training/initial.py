@@ -19,7 +19,6 @@ from train.class_names import (
     class_of_name,
     name_of_mesh,
     with_class_names,
-    with_classes_of_meshes,
 )
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, PYTHON, describe
@@ -180,8 +179,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     if initial is None:
         # `Run.load` checks the label when it knows the classes of the data.
         return settings
-    change = with_class_names if names else with_classes_of_meshes
-    return change(settings, initial.classes)
+    return with_class_names(settings, initial.classes)
 
 
 def _print_assumed_class(meshes: Sequence[Any], label: str) -> None:

@@ -31,11 +31,11 @@ from train.data.batches import Batch, Round, TrainingImages, rounds_of_epoch, tr
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.processes import SignalHandler, all_reduce_sum
-from train.run_folder import PHASES, epoch_metrics, format_epoch
+from train.run_folder import PHASES
 from train.train_settings import TrainSettings
 from train.training.averages import Averages
 from train.training.recipe import set_training_mode
-from train.training.run_log import RunLog
+from train.training.run_log import RunLog, epoch_metrics, format_epoch
 from train.training.step import TrainingStep, fitting_batch_size, require_equal_shares
 
 # Number of images in a pass of the validation.
