@@ -28,24 +28,23 @@ from renderer.normals import (
     vertex_normals,
 )
 from renderer.settings import MAX_VERTICES, NORMALS
-from renderer.validation import as_array, require_whole
+from renderer.validation import as_array, as_list, require_whole
 
-# Affine matrix, shape (4, 4), that rotates the y-axis
-# to the z-axis. It converts meshes from files in
-# which y points up to our axes, in which z points up.
+# Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes from files
+# in which y points up to our axes, in which z points up.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
-# Allowed types of each array of a mesh, as values of `dtype.kind`: f is
-# floating-point, i is a signed integer, and u is an unsigned integer.
-_KINDS = {
-    "vertices": "fiu",
-    "faces": "iu",
-    "corner_colors": "fiu",
-    "corner_uvs": "fiu",
-    "texture_ids": "iu",
-    "gloss": "fiu",
-    "normal_ids": "iu",
+# Each array of a mesh: its allowed types, as values of `dtype.kind` (f is floating-point, i is a
+# signed and u an unsigned integer), and the shape of a row.
+_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "vertices": ("fiu", (3,)),
+    "faces": ("iu", (3,)),
+    "corner_colors": ("fiu", (3, 3)),
+    "corner_uvs": ("fiu", (3, 2)),
+    "texture_ids": ("iu", ()),
+    "gloss": ("fiu", (3,)),
+    "normal_ids": ("iu", (3,)),
 }
 # Arrays of a mesh that may be None when it is created.
 _OPTIONAL = ("gloss", "normal_ids")
@@ -55,9 +54,8 @@ PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "nor
 MAX_NORMAL_ID = 2**31 - 1
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
-# Corners of the four triangles into which a triangle is
-# divided. Points 0, 1 and 2 are its corners. Points 3, 4
-# and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
+# Corners of the four triangles into which a triangle is divided. Points 0, 1 and 2 are its corners.
+# Points 3, 4 and 5 are the midpoints of its edges 0-1, 1-2 and 2-0.
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
 # Roughness, metallic and specular factor of a face without specular reflection.
 _MATTE = np.array([[1, 0, 0]], dtype=np.float32)
@@ -128,21 +126,26 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Convert lists to arrays, check all fields, and find sharp edges."""
-        # A frozen dataclass forbids assignments,
-        # so fields are set by object.__setattr__.
-        for name, kinds in _KINDS.items():
-            value = getattr(self, name)
-            is_missing = name in _OPTIONAL and value is None
-            if not isinstance(value, np.ndarray) and not is_missing:
-                object.__setattr__(self, name, as_array(name, value, kinds))
-        self._require_shapes()
+        for name, (kinds, row) in _ARRAYS.items():
+            if getattr(self, name) is None and name in _OPTIONAL:
+                continue
+            array = as_array(name, getattr(self, name), kinds)
+            # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
+            object.__setattr__(self, name, array)
+            shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
+            if array.shape != shape:
+                raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
         self._require_indices()
         if self.normal_ids is None:
             object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
-        textures = _as_textures("textures", self.textures, 3)
-        object.__setattr__(self, "textures", textures)
-        gloss_textures = _as_textures("gloss_textures", self.gloss_textures, 2)
-        object.__setattr__(self, "gloss_textures", gloss_textures)
+        for name, channels in (("textures", 3), ("gloss_textures", 2)):
+            expected = f"a list of arrays (height, width, {channels}) of uint8"
+            given = as_list(name, getattr(self, name), object, expected)
+            textures = [as_array(name, texture) for texture in given]
+            for texture in textures:
+                if texture.shape[2:] != (channels,) or texture.dtype != np.uint8:
+                    raise InputError(f"{name} has {describe(texture)}: give {expected}")
+            object.__setattr__(self, name, tuple(textures))
         if self.texture_ids.max() >= len(self.textures):
             raise InputError(
                 f"texture_ids has the index {self.texture_ids.max()}, but the mesh has "
@@ -150,35 +153,11 @@ class Mesh:
                 f"or {NO_TEXTURE} for faces without a texture"
             )
 
-    def _require_shapes(self) -> None:
-        """Raise `InputError` if an array of the mesh has a wrong shape or type."""
-        vertex_count = len(self.vertices) if self.vertices.ndim else 0
-        face_count = len(self.faces) if self.faces.ndim else 0
-        shapes = {
-            "vertices": (vertex_count, 3),
-            "faces": (face_count, 3),
-            "corner_colors": (face_count, 3, 3),
-            "corner_uvs": (face_count, 3, 2),
-            "texture_ids": (face_count,),
-        }
-        if self.gloss is not None:
-            shapes["gloss"] = (face_count, 3)
-        if self.normal_ids is not None:
-            shapes["normal_ids"] = (face_count, 3)
-        for name, shape in shapes.items():
-            values = getattr(self, name)
-            if values.shape != shape or values.dtype.kind not in _KINDS[name]:
-                raise InputError(
-                    f"{name} has the type {values.dtype} and the shape {values.shape}: "
-                    f"give numbers in the shape {shape}"
-                )
-
     def _require_indices(self) -> None:
         """Raise `InputError` if there are no faces, or if a vertex index is out of range."""
         require_range("the number of faces", len(self.faces), 1, np.inf)
         vertex_count = len(self.vertices)
-        lowest = self.faces.min()
-        highest = self.faces.max()
+        lowest, highest = self.faces.min(), self.faces.max()
         if not 0 <= lowest <= highest < vertex_count:
             raise InputError(
                 f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
@@ -214,9 +193,8 @@ class Mesh:
         """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
         given_faces = as_array("faces", faces)
-        # astype turns NaN into an arbitrary integer, with
-        # a warning. The warning is suppressed, because
-        # the comparison below finds the difference.
+        # astype turns NaN into an arbitrary integer, with a warning. The warning is suppressed,
+        # because the comparison below finds the difference.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
@@ -307,8 +285,7 @@ class Mesh:
             Copy of the mesh, which shares the packed textures with this mesh.
         """
         moved_mesh = replace(self, vertices=vertices)
-        # Packing the textures again would take long. A
-        # cached property stores its value in `__dict__`.
+        # Packing takes long. A cached property stores its value in `__dict__`.
         moved_mesh.__dict__["packed_textures"] = self.packed_textures
         return moved_mesh
 
@@ -316,9 +293,8 @@ class Mesh:
     def packed_textures(self) -> tuple[np.ndarray, ...]:
         """Textures with one integer per texel, int32, shape (H, W) each.
 
-        Bits 0 to 7 of the integer are red, bits 8 to 15 are green, and bits 16 to
-        23 are blue. Looking up one integer per texel is faster than looking up
-        three bytes.
+        Red is in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23. Looking up one
+        integer per texel is faster than looking up three bytes.
         """
         return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
 
@@ -334,12 +310,10 @@ class Mesh:
         part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
         if part_of_face is None:
             return False
-        centered_vertices = self.vertices - self.vertices.mean(axis=0)
-        first_corners = centered_vertices[self.faces[:, 0]]
+        first_corners = self.vertices[self.faces[:, 0]] - self.vertices.mean(axis=0)
         doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
-        # Six times the volume of the tetrahedron of each
-        # face and the mesh center, shape (F,). It is
-        # negative if the face is turned toward the center.
+        # Six times the volume of the tetrahedron of each face and the mesh center, shape (F,). It
+        # is negative if the face is turned toward the center.
         sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
         volume_of_part = np.bincount(part_of_face, sixfold_volumes)
         return bool((volume_of_part > 0).all())
@@ -362,32 +336,18 @@ def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
     keys = edge_ends @ [vertex_count, 1]
     # Key of the same edge in the opposite direction: b · V + a.
     reversed_keys = edge_ends @ [1, vertex_count]
-    key_order = np.argsort(keys)
-    reversed_key_order = np.argsort(reversed_keys)
-    sorted_keys = keys[key_order]
-    is_repeated = (np.diff(sorted_keys) == 0).any()
+    order = np.argsort(keys)
+    reversed_order = np.argsort(reversed_keys)
+    is_repeated = (np.diff(keys[order]) == 0).any()
     # Each edge of a closed surface occurs once in each direction,
     # so the set of keys equals the set of reversed keys.
-    if is_repeated or not np.array_equal(sorted_keys, reversed_keys[reversed_key_order]):
+    if is_repeated or not np.array_equal(keys[order], reversed_keys[reversed_order]):
         return None
     # Both orders list the edges by the same keys, so entry i of the
     # first order and entry i of the second one are the same edge in
     # two neighboring faces. The edge in row r belongs to face r // 3.
-    neighboring_faces = np.stack([key_order, reversed_key_order], axis=1) // 3
+    neighboring_faces = np.stack([order, reversed_order], axis=1) // 3
     return connected_component_labels(neighboring_faces, node_count=len(faces))
-
-
-def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
-    """Check textures, and convert them to a tuple. A tuple of arrays is returned as it is."""
-    expected = f"a list of arrays (height, width, {channels}) of uint8"
-    if not isinstance(textures, list | tuple):
-        raise InputError(f"{name} is {describe(textures)}: give {expected}")
-    arrays = [as_array(name, texture) for texture in textures]
-    for array in arrays:
-        if array.ndim != 3 or array.shape[2] != channels or array.dtype != np.uint8:
-            raise InputError(f"{name} has a texture that is {describe(array)}: give {expected}")
-    is_unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
-    return textures if isinstance(textures, tuple) and is_unchanged else tuple(arrays)
 
 
 def require_mesh(name: str, value: object) -> None:
@@ -409,14 +369,10 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
     Vertices are not merged.
     """
-    faces = []
-    texture_ids = []
-    normal_ids = []
+    faces, texture_ids, normal_ids = [], [], []
     # Numbers of vertices, textures and normals of the meshes before the
     # mesh of the loop. The indices of this mesh grow by these numbers.
-    vertex_count = 0
-    texture_count = 0
-    normal_count = 0
+    vertex_count = texture_count = normal_count = 0
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
         normal_ids.append(mesh.normal_ids + normal_count)
@@ -442,27 +398,18 @@ def _concatenate_gloss(meshes: Sequence[Mesh]) -> Float[np.ndarray, "F 3"] | Non
     """Concatenate roughness, metallic and specular factor. None if all meshes are matte."""
     if all(mesh.gloss is None for mesh in meshes):
         return None
-    gloss_by_mesh = []
-    for mesh in meshes:
-        matte_gloss = _MATTE.repeat(len(mesh.faces), 0)
-        gloss_by_mesh.append(matte_gloss if mesh.gloss is None else mesh.gloss)
-    return np.concatenate(gloss_by_mesh)
+    matte = [_MATTE.repeat(len(mesh.faces), 0) for mesh in meshes]
+    pairs = zip(meshes, matte, strict=True)
+    return np.concatenate([rows if mesh.gloss is None else mesh.gloss for mesh, rows in pairs])
 
 
 def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
-    """Concatenate the gloss textures of several meshes.
-
-    A gloss texture has factors for roughness and metallic. If a mesh has any, it
-    has one for each of its color textures. Meshes without gloss textures get the factor 1, unless
-    no mesh has any.
-    """
+    """Concatenate gloss textures. Meshes without them get the factor 1, unless no mesh has any."""
     if not any(mesh.gloss_textures for mesh in meshes):
         return ()
-    gloss_textures: list[np.ndarray] = []
-    for mesh in meshes:
-        neutral_textures = (_NEUTRAL_GLOSS,) * len(mesh.textures)
-        gloss_textures += mesh.gloss_textures or neutral_textures
-    return tuple(gloss_textures)
+    neutral = (_NEUTRAL_GLOSS,)
+    lists = [mesh.gloss_textures or neutral * len(mesh.textures) for mesh in meshes]
+    return tuple(texture for textures in lists for texture in textures)
 
 
 def normalize(mesh: Mesh) -> Mesh:
@@ -496,9 +443,8 @@ def normalize(mesh: Mesh) -> Mesh:
     """
     require_mesh("mesh", mesh)
     center, extent = center_and_extent(mesh)
-    centered = mesh.vertices - center
-    normalized = (centered / extent).astype(np.float32).astype(np.float64)
-    return replace(mesh, vertices=normalized)
+    normalized = ((mesh.vertices - center) / extent).astype(np.float32)
+    return replace(mesh, vertices=normalized.astype(np.float64))
 
 
 def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
@@ -588,13 +534,12 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
-    arrays: dict[str, Any] = {}
-    for name in PER_FACE:
-        rows_of_small_faces = getattr(small_faces, name)
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(small_faces, name), getattr(divided, name)])
+        for name in PER_FACE
         # The array `gloss` of a matte mesh is None.
-        if rows_of_small_faces is not None:
-            rows_of_divided_faces = getattr(divided, name)
-            arrays[name] = np.concatenate([rows_of_small_faces, rows_of_divided_faces])
+        if getattr(mesh, name) is not None
+    }
     # The divided mesh has all old vertices, so the vertex
     # indices of the small faces are valid in it, too.
     return replace(divided, **arrays)
@@ -602,27 +547,18 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
     """Return a copy of a mesh with some faces (indices, mask or slice) and all of its vertices."""
-    selected_rows = {}
-    for name in PER_FACE:
-        rows = getattr(mesh, name)
-        # The array `gloss` of a matte mesh is None.
-        if rows is not None:
-            selected_rows[name] = rows[faces]
-    return replace(mesh, **selected_rows)
+    # The array `gloss` of a matte mesh is None.
+    rows = {name: getattr(mesh, name) for name in PER_FACE if getattr(mesh, name) is not None}
+    return replace(mesh, **{name: values[faces] for name, values in rows.items()})
 
 
 def _quartered(mesh: Mesh) -> Mesh:
-    """Return a copy of a mesh in which each face is divided into four triangles.
-
-    New vertices are the midpoints of edges. Two faces that share an edge also
-    share its midpoint. The first vertices are the old ones.
-    """
+    """Return a copy of a mesh in which each face is divided into four triangles (`subdivide`)."""
     edge_ends, edge_of_side = _shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
     # The midpoints follow the old vertices, so their indices begin at V.
     midpoint_vertices = len(mesh.vertices) + edge_of_side
-    # Vertices of the three corners and of the
-    # three midpoints of each face, shape (F, 6).
+    # Vertices of the three corners and of the three midpoints of each face, shape (F, 6).
     points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
     # Two faces share the normal in the middle of an edge if they share the normals at both ends.
     _, normal_of_side = _shared_edges(mesh.normal_ids)
@@ -645,8 +581,7 @@ def _shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray
     vertex_count = faces.max() + 1
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
-    # A side from vertex a to vertex b gets the key a · V + b, for V
-    # vertices. np.unique sorts these numbers faster than pairs of vertices.
+    # A side from vertex a to b gets the key a · V + b. np.unique sorts numbers faster than pairs.
     side_keys = side_ends @ [vertex_count, 1]
     edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
     # Dividing the key a · V + b by V gives the quotient a and the remainder b.
@@ -657,16 +592,9 @@ def _shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray
 def _interpolate_quarters(
     corner_values: Float[np.ndarray, "F 3 D"],
 ) -> Float[np.ndarray, "4*F 3 D"]:
-    """Interpolate values at the corners of faces to the corners of the four parts of each face.
-
-    The four parts are the triangles between the corners of a face and the
-    midpoints of its edges. They have the order of `_QUARTERS`.
-    """
-    # Values at both ends of each edge of each
-    # face, shape (F, 3 edges, 2 ends, D).
-    edge_values = corner_values[:, EDGES]
-    midpoint_values = edge_values.mean(axis=2)
-    # Values at the three corners and the three
-    # midpoints of each face, shape (F, 6, D).
+    """Interpolate corner values to the parts of each face, in the order of `_QUARTERS`."""
+    # Axes: face, edge, end of the edge, value.
+    midpoint_values = corner_values[:, EDGES].mean(axis=2)
+    # Values at the three corners and the three midpoints of each face, shape (F, 6, D).
     point_values = np.concatenate([corner_values, midpoint_values], axis=1)
     return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])

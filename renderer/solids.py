@@ -30,9 +30,8 @@ from renderer.validation import require_whole
 # Colors of stalks and leaves, sRGB-encoded red, green and blue.
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
-# Smallest and largest hue of the solid `fruit`, as
-# fractions of the color circle. 1.02 is the same hue as
-# 0.02. The hues of oranges are outside of this range.
+# Smallest and largest hue of the solid `fruit`, as fractions of the color circle. 1.02 is the same
+# hue as 0.02. The hues of oranges are outside of this range.
 LOWEST_HUE = 0.14
 HIGHEST_HUE = 1.02
 # Number of vertices around the axis of a surface of revolution.
@@ -216,8 +215,7 @@ def cup(rng: np.random.Generator) -> Mesh:
     coffee = (0.28, 0.16, 0.08)
     vertices, faces, section = revolve(outside, inside, drink)
     body = paint(vertices, faces, section, glaze, white, coffee)
-    # The handle ends in the middle of the wall of
-    # thickness 0.07, at the heights -0.4 and 0.4.
+    # The handle ends in the middle of the wall of thickness 0.07, at the heights -0.4 and 0.4.
     outer_radii = np.interp([-0.4, 0.4], [-0.7, 0.7], [foot_radius, rim_radius])
     handle_vertices, handle_faces, _ = loft(_handle(outer_radii - 0.035))
     return concatenate([body, Mesh.plain(handle_vertices, handle_faces, glaze)])
@@ -232,17 +230,15 @@ def _handle(end_radii: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "19 12 3"]:
     points_per_ring = 12
     tube_radius = 0.07
     bend_radius = 0.4
-    # Angle of each ring about the y-axis, from -90° to 90°.
-    # The first and the last angle occur twice, because a
-    # ring of radius 0 closes each end of the tube.
+    # Angle of each ring about the y-axis, from -90° to 90°. The first and the last angle occur
+    # twice, because a ring of radius 0 closes each end of the tube.
     bend = np.linspace(-np.pi / 2, np.pi / 2, open_ring_count)
     bend = np.pad(bend, 1, mode="edge")[:, None, None]
     # Radius of each ring: 0 at both ends.
     radius = np.pad(np.full(open_ring_count, tube_radius), 1)[:, None, None]
     around = np.linspace(0, 2 * np.pi, points_per_ring, endpoint=False)[None, :, None]
     outward = np.cos(bend) * x_axis + np.sin(bend) * z_axis
-    # Points on the straight line between both
-    # ends, about which the tube is bent.
+    # Points on the straight line between both ends, about which the tube is bent.
     bend_center = np.interp(np.sin(bend), [-1, 1], end_radii) * x_axis
     ring_center = bend_center + outward * bend_radius
     return ring_center + radius * (np.cos(around) * outward + np.sin(around) * y_axis)
@@ -289,8 +285,7 @@ def lamp(rng: np.random.Generator) -> Mesh:
 
 def table(rng: np.random.Generator) -> Mesh:
     """Create a wooden table with four square legs, as one closed polyhedron."""
-    # The table consists of cubic cells. True
-    # marks the filled cells along x, y and z.
+    # The table consists of cubic cells. True marks the filled cells along x, y and z.
     is_filled = np.zeros((14, 10, 10), dtype=bool)
     # The board is the top layer of cells.
     is_filled[:, :, -1] = True
@@ -309,8 +304,7 @@ def table(rng: np.random.Generator) -> Mesh:
 def lemon(rng: np.random.Generator) -> Mesh:
     """Create a yellow ellipsoid with pores and a tip at both ends, often greener toward one end."""
     directions, faces = sphere()
-    # Angle from the nearer one of both ends
-    # of the lemon, which are on the z-axis.
+    # Angle from the nearer one of both ends of the lemon, which are on the z-axis.
     angle_from_end = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
     pores = ripples(rng, directions, wavelength=0.2)
     radius = 1 + 0.004 * pores + 0.015 * ripples(rng, directions, wavelength=2.0)
@@ -371,8 +365,7 @@ def fruit(rng: np.random.Generator) -> Mesh:
     Its shape lies between a ball, a lemon and an apple.
     """
     directions, faces = sphere()
-    # Angle from the nearer one of both ends
-    # of the fruit, which are on the z-axis.
+    # Angle from the nearer one of both ends of the fruit, which are on the z-axis.
     angle_from_end = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
     length = rng.uniform(0.75, 1.35)
     pores = ripples(rng, directions, wavelength=0.2)
@@ -416,9 +409,8 @@ SOLIDS: dict[str, Maker] = {
     "lamp": lamp,
     "table": table,
 }
-# Solids that resemble an orange. The training run
-# `experiment=best` shows the network the solid `fruit` in
-# training, and the other three solids in its evaluation.
+# Solids that resemble an orange. The training run `experiment=best` shows the network the solid
+# `fruit` in training, and the other three solids in its evaluation.
 HARD_NEGATIVES: dict[str, Maker] = {
     "lemon": lemon,
     "peach": peach,
@@ -472,8 +464,7 @@ def _divided_profile(
     # prevents an additional piece because of a rounding error of the length.
     piece_counts = np.ceil(lengths / MAX_EDGE_LENGTH - 1e-9).astype(int)
     edge_of_piece = np.repeat(np.arange(len(edges)), piece_counts)
-    # Position of the start of each piece on
-    # its edge, as a fraction of the edge.
+    # Position of the start of each piece on its edge, as a fraction of the edge.
     fraction = np.concatenate([np.arange(count) / count for count in piece_counts if count])
     starts = corners[edge_of_piece] + fraction[:, None] * edges[edge_of_piece]
     profile = np.concatenate([starts, corners[-1:]])
@@ -492,10 +483,9 @@ def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.
     first_point = rings[0, :1]
     last_point = rings[-1, :1]
     vertices = np.concatenate([first_point, rings[1:-1].reshape(-1, 3), last_point])
-    # Vertex of each point of each ring, shape (R, P). The
-    # points of the second ring have the vertices 1 to P, and so
-    # on. The clipping gives all points of the first ring the
-    # vertex 0, and all points of the last ring the last vertex.
+    # Vertex of each point of each ring, shape (R, P). The points of the second ring have the
+    # vertices 1 to P, and so on. The clipping gives all points of the first ring the vertex 0, and
+    # all points of the last ring the last vertex.
     consecutive = np.arange(1 - point_count, (ring_count - 1) * point_count + 1)
     last_vertex = (ring_count - 2) * point_count + 1
     vertex = np.clip(consecutive.reshape(ring_count, point_count), 0, last_vertex)
@@ -508,8 +498,7 @@ def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.
     # Each quadrilateral becomes the triangles a, b, c and a, c, d.
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     ring_of_face = np.repeat(np.arange(ring_count - 1), 2 * point_count)
-    # Two corners are equal in half of the
-    # triangles at the first and at the last ring.
+    # Two corners are equal in half of the triangles at the first and at the last ring.
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])
     return vertices, faces[has_area], ring_of_face[has_area]
 
@@ -550,8 +539,7 @@ def paint(
     """Create a mesh whose faces have the color of their section, one color or one per vertex."""
     # Color that each vertex has in each section, shape (sections, V, 3).
     vertex_colors = np.stack([np.broadcast_to(color, vertices.shape) for color in colors])
-    # The color of a corner depends on the
-    # section of the face and on the vertex.
+    # The color of a corner depends on the section of the face and on the vertex.
     corner_colors = vertex_colors.astype(np.float32)[section[:, None], faces]
     return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
 
@@ -587,8 +575,7 @@ def ripples(
     phases = rng.uniform(0, 2 * np.pi, WAVES)
     # torch computes cosines much faster than NumPy.
     waves = torch.from_numpy(points @ wave_vectors + phases).cos().numpy()
-    # A cosine has the variance 1/2. The sum of 32
-    # cosines therefore has the standard deviation 4.
+    # A cosine has the variance 1/2. The sum of 32 cosines therefore has the standard deviation 4.
     return waves.sum(axis=1) / 4
 
 

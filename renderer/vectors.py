@@ -1,11 +1,16 @@
 """Vectors in space: unit vectors, tangents, and rotations."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+# Type for the x, y and z components of S vectors, shape (S,) each.
+Components = tuple[Tensor, Tensor, Tensor]
 
 
 def unit_vectors(vectors: Float[Tensor, "3 ..."]) -> tuple[Tensor, Tensor]:
@@ -76,3 +81,48 @@ def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3
     # The transposed matrix times a vector p is the cross product of the
     # rotation vector and p. The exponential of this matrix is the rotation.
     return torch.matrix_exp(cross_products.mT)
+
+
+class Angle(NamedTuple):
+    """Rotation angle, given by its sine and cosine of shape (), or (S,) for each sample."""
+
+    sine: Tensor
+    cosine: Tensor
+
+    def reversed(self) -> Angle:
+        """Return the negative angle, for the inverse rotation."""
+        return Angle(sine=-self.sine, cosine=self.cosine)
+
+    def for_columns(self, coefficients: Tensor) -> Angle:
+        """Convert an angle of shape () to shape (1,), and to another dtype and device."""
+        return Angle(
+            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
+        )
+
+
+def rotate_about_x(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the x-axis, from y toward z."""
+    x, y, z = vectors
+    rotated_y, rotated_z = _rotate_in_plane(y, z, angle)
+    return x, rotated_y, rotated_z
+
+
+def rotate_about_y(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the y-axis, from z toward x."""
+    x, y, z = vectors
+    rotated_z, rotated_x = _rotate_in_plane(z, x, angle)
+    return rotated_x, y, rotated_z
+
+
+def rotate_about_z(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the z-axis, from x toward y."""
+    x, y, z = vectors
+    rotated_x, rotated_y = _rotate_in_plane(x, y, angle)
+    return rotated_x, rotated_y, z
+
+
+def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tensor, Tensor]:
+    """Rotate vectors in the plane of two axes, from the first axis toward the second."""
+    rotated_first = first * angle.cosine - second * angle.sine
+    rotated_second = first * angle.sine + second * angle.cosine
+    return rotated_first, rotated_second

@@ -42,7 +42,7 @@ from renderer.microfacets import (
     masking_denominator,
 )
 from renderer.settings import MIN_ROUGHNESS
-from renderer.vectors import unit
+from renderer.vectors import Angle, Components, rotate_about_x, rotate_about_y, rotate_about_z, unit
 
 # `lobe_functions` uses one common table of this degree for all lights up to this degree.
 COMMON_DEGREE = 6
@@ -59,9 +59,6 @@ AZIMUTH_NODE_COUNT = 64
 AZIMUTH_SCALE = 0.4
 # Smaller sines of the angle between normal and camera count as this one.
 SMALLEST_SINE = 1e-15
-
-# Type for the x, y and z components of S vectors, shape (S,) each.
-Components = tuple[Tensor, Tensor, Tensor]
 
 
 class ViewFrame(NamedTuple):
@@ -208,8 +205,8 @@ class ViewAxis(NamedTuple):
     def to_view(self, vectors: Tensor) -> Components:
         """Rotate vectors, shape (S, 3), from world axes to view axes."""
         x, y, z = vectors.T
-        without_azimuth = _rotate_about_z((x, y, z), self.azimuth.reversed())
-        return _rotate_about_y(without_azimuth, self.polar.reversed())
+        without_azimuth = rotate_about_z((x, y, z), self.azimuth.reversed())
+        return rotate_about_y(without_azimuth, self.polar.reversed())
 
 
 class Tilt(NamedTuple):
@@ -251,53 +248,8 @@ class Tilt(NamedTuple):
         """Rotate one vector per sample from view axes to sample axes."""
         # From sample axes to view axes, vectors rotate about y and then about x. The inverse
         # rotates back about x first.
-        rotated_about_x = _rotate_about_x(vectors, self.about_x.reversed())
-        return _rotate_about_y(rotated_about_x, self.about_y.reversed())
-
-
-class Angle(NamedTuple):
-    """Rotation angle, given by its sine and cosine of shape (), or (S,) for each sample."""
-
-    sine: Tensor
-    cosine: Tensor
-
-    def reversed(self) -> Angle:
-        """Return the negative angle, for the inverse rotation."""
-        return Angle(sine=-self.sine, cosine=self.cosine)
-
-    def for_columns(self, coefficients: Tensor) -> Angle:
-        """Convert an angle of shape () to shape (1,), and to another dtype and device."""
-        return Angle(
-            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
-        )
-
-
-def _rotate_about_x(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the x-axis, from y toward z."""
-    x, y, z = vectors
-    rotated_y, rotated_z = _rotate_in_plane(y, z, angle)
-    return x, rotated_y, rotated_z
-
-
-def _rotate_about_y(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the y-axis, from z toward x."""
-    x, y, z = vectors
-    rotated_z, rotated_x = _rotate_in_plane(z, x, angle)
-    return rotated_x, y, rotated_z
-
-
-def _rotate_about_z(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the z-axis, from x toward y."""
-    x, y, z = vectors
-    rotated_x, rotated_y = _rotate_in_plane(x, y, angle)
-    return rotated_x, rotated_y, z
-
-
-def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tensor, Tensor]:
-    """Rotate vectors in the plane of two axes, from the first axis toward the second."""
-    rotated_first = first * angle.cosine - second * angle.sine
-    rotated_second = first * angle.sine + second * angle.cosine
-    return rotated_first, rotated_second
+        rotated_about_x = rotate_about_x(vectors, self.about_x.reversed())
+        return rotate_about_y(rotated_about_x, self.about_y.reversed())
 
 
 def _degree_of_lobes(lobes: Tensor) -> int:
