@@ -7,7 +7,7 @@ because the prediction for the unchanged photograph counts as right.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -181,18 +181,18 @@ def attack_folder(
         seed=seed,
     )
     out.mkdir(parents=True, exist_ok=True)
-    content = {
-        "folder": str(folder),
-        "slides": settings.slides,
-        "gain": settings.gain,
-        "passes": settings.passes,
-        "found": len(found),
-        "unreadable": unreadable,
-        "photographs": _describe(result, readable),
-        "pictures": _write_pictures(result, out),
-    }
-    atomic_write(out / RELIT, json.dumps(content, indent=1) + "\n", durable=True)
-    return read_relit(out)
+    scores = RelitScores(
+        folder=str(folder),
+        slides=settings.slides,
+        gain=settings.gain,
+        passes=settings.passes,
+        photographs=[_describe(result, *item) for item in enumerate(readable)],
+        pictures=_write_pictures(result, out),
+        found=len(found),
+        unreadable=unreadable,
+    )
+    atomic_write(out / RELIT, json.dumps(asdict(scores), indent=1) + "\n", durable=True)
+    return scores
 
 
 def read_relit(folder: Path) -> RelitScores:
@@ -204,26 +204,17 @@ def read_relit(folder: Path) -> RelitScores:
 
 
 def _describe(
-    result: PhotographAttackResult, photographs: Sequence[Photograph]
-) -> list[dict[str, Any]]:
-    """Convert the result of an attack to entries of relit.json."""
+    result: PhotographAttackResult, index: int, photograph: Photograph
+) -> RelitPhotograph:
+    """Collect the predictions for the photograph with an index in an attack."""
     classes = result.classifier.classes
-    described = []
-    for index, photograph in enumerate(photographs):
-        kept = {}
-        becomes = {}
-        for light, changed in result.changed.items():
-            kept[light] = int((~changed[index]).sum())
-            becomes[light] = [classes[label] for label in result.predicted[light][index].tolist()]
-        described.append(
-            {
-                "path": str(photograph.path),
-                "predicted": classes[int(result.source[index])],
-                "kept": kept,
-                "becomes": becomes,
-            }
-        )
-    return described
+    predicted = {light: labels[index].tolist() for light, labels in result.predicted.items()}
+    return RelitPhotograph(
+        path=str(photograph.path),
+        predicted=classes[int(result.source[index])],
+        kept={light: int((~changed[index]).sum()) for light, changed in result.changed.items()},
+        becomes={light: [classes[label] for label in predicted[light]] for light in result.changed},
+    )
 
 
 def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:

@@ -77,6 +77,8 @@ Model = Callable[[torch.Tensor], torch.Tensor]
 # Number of wrong predictions that are listed for the images of each class: the 5 most
 # common ones.
 WRONG_CLASSES = 5
+# Metrics that depend on a ranking of images or classes.
+RANKING_METRICS = (*ROC_METRICS, *TOP_RANKS)
 # Metrics that `format_overall` leaves out, because they matter less.
 DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
 
@@ -521,8 +523,8 @@ def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
     paragraphs = [
         _count_images(scores),
-        str(_fraction_table(scores)),
-        str(_ranking_table(scores)),
+        str(_metric_table(scores, _fraction_metrics(scores))),
+        str(_metric_table(scores, RANKING_METRICS)),
         str(_class_table(scores)),
         *_notes(scores),
     ]
@@ -542,19 +544,25 @@ def format_overall(scores: Scores) -> str:
 
     The table has a row for each metric. The metrics in `DETAILS` are left out.
     """
-    details = {metric_title(name) for name in DETAILS}
-    rows = []
-    for table in (_fraction_table(scores), _ranking_table(scores)):
-        # The first row is about all images. Its first cell is the title of the row.
-        metric_titles = table.header[1:]
-        cells = table.rows[0][1:]
-        for metric, cell in zip(metric_titles, cells, strict=True):
-            if metric not in details:
-                rows.append((metric, cell))
     overall = scores.overall
+    rows = []
+    for name in (*_fraction_metrics(scores), *RANKING_METRICS):
+        if name not in DETAILS:
+            rows.append((metric_title(name), _format_metric(overall.find(name))))
     intervals = describe_intervals([overall.recall, overall.false_positive_rate, overall.auc])
     overall_table = Table(f"{_count_images(scores)}; {intervals}", ["metric", scores.label], rows)
     return "\n".join([str(overall_table), *_notes(scores)])
+
+
+def _fraction_metrics(scores: Scores) -> list[str]:
+    """Return the known metrics that are fractions of images, such as recall."""
+    return [name for name in FRACTION_METRICS if scores.overall.find(name) is not None]
+
+
+def _format_metric(metric: Estimate | None) -> str:
+    """Write a fraction of images with its counts, and any other metric with its interval."""
+    is_fraction = isinstance(metric, Proportion)
+    return format_fraction(metric) if is_fraction else format_interval(metric)
 
 
 def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:
@@ -569,27 +577,14 @@ def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:
     yield from groups.items()
 
 
-def _fraction_table(scores: Scores) -> Table:
-    """Make the table of the metrics that are fractions of images, such as recall."""
-    names = [name for name in FRACTION_METRICS if scores.overall.find(name) is not None]
-    rows = []
-    shown: list[Proportion] = []
-    for title, metrics in _metrics_of_rows(scores):
-        proportions: list[Proportion] = [getattr(metrics, name) for name in names]
-        shown += proportions
-        rows.append([title, *map(format_fraction, proportions)])
-    return Table(describe_intervals(shown), ["", *map(metric_title, names)], rows)
-
-
-def _ranking_table(scores: Scores) -> Table:
-    """Make the table of the metrics that depend on a ranking of images or classes."""
-    names = (*ROC_METRICS, *TOP_RANKS)
+def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
+    """Make a table of some metrics for each row."""
     rows = []
     shown: list[Estimate | None] = []
     for title, metrics in _metrics_of_rows(scores):
         estimates = [metrics.find(name) for name in names]
         shown += estimates
-        rows.append([title, *map(format_interval, estimates)])
+        rows.append([title, *map(_format_metric, estimates)])
     return Table(describe_intervals(shown), ["", *map(metric_title, names)], rows)
 
 

@@ -69,7 +69,7 @@ def page(tmp_path_factory) -> Path:
         for name, color in {"black": "black", "gray": "#808080"}.items():
             Image.new("RGB", (8, 8), color).save(folder / "lab" / label / f"{name}.png")
     settings = AuditSettings(
-        classifier="original",
+        network="original",
         meshes=["solid:orange:0"],
         laboratory=str(folder / "lab"),
         environments=[],
