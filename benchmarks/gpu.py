@@ -38,7 +38,7 @@ from augment.augmentation_settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility.rasterizer import choose
-from train.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
+from train.device import GraphedNetwork, MixedPrecision, choose_precision, set_deterministic
 from train.saved_networks import load_run
 
 NETWORK = "pretrained/none"
@@ -220,7 +220,7 @@ def attack(device: str) -> Iterator[Row]:
         "eager, channels first": channels_first(regenerate_channels_first),
     }
     if device != "cpu":
-        calls["CUDA graphs"] = partial(service.regenerate, GraphedModel(network), 0)
+        calls["CUDA graphs"] = partial(service.regenerate, GraphedNetwork(network), 0)
     yield from compare_calls(f"attack of {STEPS} steps", calls, device)
 
 

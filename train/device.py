@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
+from augment.network import Network
 from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
@@ -27,7 +28,7 @@ THREADS = torch.get_num_threads()
 SMALL_WORK = 1e10
 # Number type in which a network computes, by the name of the precision.
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
-# Batch sizes for which `GraphedModel` records CUDA graphs. Validation has the largest batches.
+# Batch sizes for which `GraphedNetwork` records CUDA graphs. Validation has the largest batches.
 # The batches of an attack become smaller when examples leave after their success.
 SIZES = (16, 32, 64, 128, 512)
 # Number of times that torch may compile a function. Its default of 8 is too small, since each
@@ -133,16 +134,15 @@ def _computes_in_bfloat16() -> bool:
     return torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
-class MixedPrecision(nn.Module):
-    """Wrapper of a network that computes in a chosen precision.
+class MixedPrecision(Network):
+    """Network that computes in a chosen precision.
 
-    Images and logits are float32. Between them, torch.autocast uses the chosen precision.
+    Images and logits are float32. Between them, torch.autocast uses the chosen precision. The
+    weights of the network are changed to channels-last.
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        """Wrap a network. Its weights are changed to channels-last."""
-        super().__init__()
-        self.network = network.to(memory_format=torch.channels_last)
+        super().__init__(network.to(memory_format=torch.channels_last))
         self.precision = precision
 
     def forward(self, images: Tensor) -> Tensor:
@@ -178,27 +178,23 @@ def compiles(choice: str, device: torch.device) -> bool:
     return True
 
 
-class GraphedModel(nn.Module):
-    """Wrapper of a model that replays recorded CUDA graphs in evaluation mode.
+class GraphedNetwork(Network):
+    """Network that replays recorded CUDA graphs in evaluation mode.
 
     There is a graph for each batch size in SIZES. A batch of another size is padded with images of
     zeros, which do not change the logits of the other images in evaluation mode. In training mode,
-    and for batches larger than all SIZES, the model is called without a graph.
-
-    Args:
-        model: The model, from images to logits.
-        compiler: Backend of torch.compile.
+    and for batches larger than all SIZES, there is no graph. `compiler` is a backend of
+    torch.compile.
     """
 
-    def __init__(self, model: nn.Module, compiler: Any = "cudagraphs"):
-        super().__init__()
-        self.model = model
-        self._graphs = torch.compile(model.forward, backend=compiler, dynamic=False)
+    def __init__(self, network: nn.Module, compiler: Any = "cudagraphs"):
+        super().__init__(network)
+        self._graphs = torch.compile(network.forward, backend=compiler, dynamic=False)
         torch._dynamo.config.recompile_limit = RECOMPILE_LIMIT
 
     def forward(self, images: Tensor) -> Tensor:
         if self.training or len(images) > SIZES[-1]:
-            return self.model(images)
+            return self.network(images)
         # The smallest recorded batch size that is large enough.
         size = next(size for size in SIZES if len(images) <= size)
         padding = images.new_zeros(size - len(images), *images.shape[1:])

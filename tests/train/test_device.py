@@ -7,7 +7,7 @@ from renderer.errors import InputError
 from train import device
 from train.device import (
     SIZES,
-    GraphedModel,
+    GraphedNetwork,
     MixedPrecision,
     choose_device,
     choose_precision,
@@ -160,7 +160,7 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
 
     linear = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3))
     linear = linear.double().requires_grad_(False)
-    graphed = GraphedModel(linear, compiler).eval()
+    graphed = GraphedNetwork(linear, compiler).eval()
     for count in (1, 7, 16, 17, 30, 32, 33):
         images = torch.rand(count, 3, 8, 8, dtype=torch.float64, requires_grad=True)
         logits = graphed(images)

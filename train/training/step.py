@@ -16,7 +16,7 @@ from renderer.errors import InputError
 from renderer.memory import require_memory
 from train import console
 from train.data.batches import Batch
-from train.device import GraphedModel, MixedPrecision, compiles
+from train.device import GraphedNetwork, MixedPrecision, compiles
 from train.processes import wrap_ddp
 from train.train_settings import RELIGHT, TrainSettings
 from train.training.averages import Averages
@@ -87,8 +87,8 @@ class TrainingStep:
             # earlier run are removed.
             torch.compiler.reset()
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-            self.attacked = GraphedModel(model)
-            self.validated = GraphedModel(averages.selected)
+            self.attacked = GraphedNetwork(model)
+            self.validated = GraphedNetwork(averages.selected)
 
     def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
         """Change the weights by the gradient of the loss of a batch.

@@ -131,6 +131,7 @@ def test_an_attack_finds_the_class_by_its_name_or_index(call, here):
         assert json.loads(line)["label"] == ["Orange"]
 
 
+@pytest.mark.slow
 def test_an_audit_of_one_mesh_finds_its_class_and_has_hard_negatives(
     call, here, monkeypatch, caplog
 ):
