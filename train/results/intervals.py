@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
-from train.results.tables import Estimate, fraction
+from train.results.tables import Estimate, fraction, wilson
 
 # False-positive rates at which the recall is reported. Decimal strings are exact,
 # while a float such as 0.1 is not.
@@ -88,8 +88,8 @@ class Jackknife:
         spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
         half_width = spread.quantile * spread.variance**0.5
         ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
-        wilson = _wilson(value, self.unit_count, spread.quantile)
-        return np.where(spread.variance > 0, ends, wilson)
+        without_variance = wilson(value, self.unit_count, spread.quantile)
+        return np.where(spread.variance > 0, ends, without_variance)
 
     @property
     def is_open(self) -> np.ndarray:
@@ -262,14 +262,6 @@ def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
 def _logit(values: np.ndarray) -> np.ndarray:
     """Log-odds of values in (0, 1)."""
     return np.log(values) - np.log1p(np.negative(values))
-
-
-def _wilson(value: np.ndarray, n: int, quantile: np.ndarray) -> np.ndarray:
-    """Ends of Wilson's interval of a fraction of n units, with a quantile of Student's t."""
-    shift = quantile**2 / n
-    center = (value + shift / 2) / (1 + shift)
-    half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
-    return np.clip([center - half_width, center + half_width], 0, 1)
 
 
 def weighted_means(values: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -19,27 +19,20 @@ from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, FAILURE, METRICS, PUBLISHED, RENDERS, WEIGHTS
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
-# Files that each command writes to its output folder, as patterns of `Path.glob`.
-# A command refuses a folder with one of these files.
+# Files of an audit, as patterns of `Path.glob`.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
-# `remove_run` removes them in this order.
+# Files of a training run. `remove_run` removes them in this order.
 OF_RUN = (METRICS, run_folder.LAST, run_folder.PREVIOUS, run_folder.BEST, WEIGHTS)
-OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE)
-OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
-OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
-OF_FIT = ("light.json", "background.png", "comparison.png")
-# Files that most commands write: the configuration and the report.
-SHARED = (CONFIG, PAGE)
-# All of these files.
+# Files that commands write to their output folders. A command refuses a folder with one of them.
 RESULTS = (
     *OF_RUN,
-    *OF_ATTACK,
+    *(RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE),
     *OF_AUDIT,
-    *OF_SCORES,
-    *OF_LABORATORY,
+    *(SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE),
+    *(photographs.DESCRIPTION, photographs.TABLE),
     PUBLISHED,
-    *OF_FIT,
-    *SHARED,
+    *("light.json", "background.png", "comparison.png"),
+    *(CONFIG, PAGE),
 )
 
 

@@ -4,11 +4,16 @@ import shutil
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 # What a 95% interval is over. Images of few objects say nothing about other objects.
 OBJECTS = "objects"
 IMAGES = "images"
 THESE_OBJECTS = "images, for these objects"
+NORMAL_QUANTILE = NormalDist().inv_cdf(0.975)
 
 
 @dataclass(frozen=True)
@@ -145,18 +150,25 @@ def fraction(hits: int, n: int) -> Proportion:
     """Compute hits / n with its 95% Wilson score interval (Wilson 1927)."""
     if n == 0:
         return Proportion()
-    # This import is here because it takes a second.
-    from scipy.stats import binomtest
-
-    ends = binomtest(hits, n).proportion_ci(method="wilson")
+    low, high = map(float, wilson(hits / n, n, NORMAL_QUANTILE))
+    # Rounding must not move an end that is exactly 0 or 1.
     return Proportion(
         value=hits / n,
-        low=float(ends.low),
-        high=float(ends.high),
+        low=low if hits else 0.0,
+        high=high if hits < n else 1.0,
         over=IMAGES,
         hits=hits,
         n=n,
     )
+
+
+def wilson(value: ArrayLike, n: int, quantile: ArrayLike) -> np.ndarray:
+    """Compute the ends of Wilson's interval of a fraction of n units, with a quantile."""
+    value, quantile = np.asarray(value), np.asarray(quantile)
+    shift = quantile**2 / n
+    center = (value + shift / 2) / (1 + shift)
+    half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
+    return np.clip([center - half_width, center + half_width], 0, 1)
 
 
 def format_fraction(proportion: Proportion) -> str:
