@@ -15,7 +15,7 @@ import torch
 import yaml
 
 from renderer.errors import InputError
-from train import console, system
+from train import console
 from train import user_errors as errors
 from train.cli import USER_ERROR, Command, HelpText
 from train.commands.compare import CompareSettings
@@ -51,10 +51,6 @@ def two_methods(tiny_npz) -> list[str]:
 def no_report(monkeypatch) -> None:
     """Write no page of a training, whose plots take longer than the training."""
     monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
-
-
-def modification_times(folder: Path) -> dict[Path, int]:
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 class TestTrainingOfTwoArms:
@@ -147,12 +143,6 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_met
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
-def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
-    assert call("train", "--multirun", "seed=0,1") == USER_ERROR
-    assert "start a sweep with pnb-train --multirun" in capsys.readouterr().err
-
-
 class TestAStoppedRun:
     @pytest.fixture
     def stopped(self, call, capsys, no_report, tmp_path, two_methods, photos) -> Path:
@@ -174,7 +164,12 @@ class TestAStoppedRun:
         return folder.rename(tmp_path / "moved")
 
     def test_is_resumed_by_its_folder_alone(self, call, tmp_path, stopped):
-        """Resume both methods, with an additional setting, to the weights of a whole run."""
+        """Resume both methods, with an additional setting, to the weights of a whole run.
+
+        Settings that affect the result cannot change.
+        """
+        for other in ("seed=4", "augment=random"):
+            assert call("train", f"out={stopped}", "train.resume=true", other) == USER_ERROR
         before = yaml.safe_load((stopped / "config.yaml").read_text())
         additional = "train.checkpoint_every=2"
         assert call("train", f"out={stopped}", "train.resume=true", additional) == 0
@@ -191,27 +186,6 @@ class TestAStoppedRun:
             assert resumed_state["epoch"] == 2
             assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
             assert (stopped / method / "photographs" / "summary.json").is_file()
-
-    def test_is_resumed_method_by_method(self, call, stopped):
-        assert call("train", f"out={stopped / 'none'}", "train.resume=true") == 0
-        assert not (stopped / "none" / "none").exists()
-
-    @pytest.mark.parametrize(
-        ("override", "message"),
-        [("seed=4", "seed=3, not 4"), ("augment=random", "was made with ")],
-    )
-    def test_is_resumed_with_no_other_settings_that_affect_its_result(
-        self,
-        call,
-        capsys,
-        stopped,
-        override,
-        message,
-    ):
-        before = modification_times(stopped)
-        assert call("train", f"out={stopped}", "train.resume=true", override) == USER_ERROR
-        assert message in capsys.readouterr().err
-        assert modification_times(stopped) == before
 
 
 @pytest.mark.parametrize(
@@ -345,23 +319,16 @@ def test_an_interrupt_while_torch_is_imported_is_one_line(module):
     assert ended.stderr == "ended by SIGINT\n"
 
 
-def test_slow_imports_are_announced(monkeypatch, tmp_path, capsys):
-    (tmp_path / "slow.py").write_text("import time\ntime.sleep(0.2)\ndef work(): pass\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(system, "IMPORT_DELAY", 0.01)
-    system.import_function("slow:work")()
-    assert capsys.readouterr().err.endswith(" ...\n")
-
-
-def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch, tmp_path):
+def test_a_closed_output_pipe_ends_a_command_silently(capsys, monkeypatch):
     read, write = os.pipe()
     os.close(read)
     with monkeypatch.context() as patch, open(write, "w") as output:
         patch.setattr(sys, "stdout", output)
-        assert call("light", "light=grace", "height=4", "out=a.hdr") == 128 + signal.SIGPIPE
+        with pytest.raises(SystemExit) as stop, COMPARE.handle_errors():
+            print("a table")
+        assert stop.value.code == 128 + signal.SIGPIPE
         print("text that Python writes at its end", flush=True)
     assert capsys.readouterr().err == ""
-    assert (tmp_path / "a.hdr").is_file()
 
 
 FULL_DISK = OSError(28, "No space left on device")

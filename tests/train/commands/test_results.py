@@ -122,18 +122,6 @@ def test_older_scores_are_replaced_by_overwrite_alone(call, here):
     assert json.loads((here / "scores" / "summary.json").read_text())["label"] == "fig"
 
 
-def test_a_map_that_exists_is_replaced_by_overwrite_alone(call, here, capsys):
-    command = ["light", "light=grace", "height=8", "out=sky.exr"]
-    (here / "sky.exr").write_bytes(b"mine")
-    assert call(*command) == USER_ERROR
-    error = capsys.readouterr().err
-    assert "out=sky.exr" in error
-    assert "overwrite=true" in error
-    assert (here / "sky.exr").read_bytes() == b"mine"
-    assert call(*command, "overwrite=true") == 0
-    assert renderer.load_light(here / "sky.exr").isfinite().all()
-
-
 def test_an_attack_over_an_earlier_one_leaves_none_of_its_adversaries(call, here):
     fast = ["attack.max_steps=1", "attack.checks=false", "attack.verify=null"]
     command = ["attack", *COMMANDS["attack"], *fast, "out=out"]
