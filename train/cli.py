@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -405,6 +406,10 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     if key.startswith("+") and not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
         argument = f"{key}{equals}{value}"
+    choices = key.partition("@")[0]
+    if (CONF / choices).is_dir() and re.fullmatch(r"null|true|false|[-+.\d]+", value):
+        # Hydra raises an error of the program for a choice that is no text.
+        raise InputError(_explain_choice(f"{choices}/{value}"))
     group = key.rpartition(".")[0]
     # A setting of type Any can hold a mapping, such as scene.projector. Hydra sets a
     # key of a mapping, which may be absent, only if the override begins with "++".
@@ -435,11 +440,10 @@ def _as_text(key: str, value: str) -> str:
         return f"{key}={','.join(item.partition('=')[2] for item in values)}"
     parsed = parsed_override.value()
     if isinstance(parsed, list) and not set("[]{}" + QUOTES) & set(value[1:-1]):
-        # Classes can be named true, null or 1.5. Hydra would read them as values.
+        # Classes can be named true, null or 007. Hydra would read them as values.
         members = zip(value[1:-1].split(","), parsed, strict=False)
         texts = [
-            quoted(text.strip()) if member is None or isinstance(member, bool | float) else text
-            for text, member in members
+            text if isinstance(member, str) else quoted(text.strip()) for text, member in members
         ]
         return f"{key}=[{','.join(texts)}]"
     is_changed = isinstance(parsed, str | int | float) and parsed != value
