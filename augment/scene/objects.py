@@ -6,11 +6,13 @@ seen by cameras. Conditions are the light, the shape and the colors with which i
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 MIN_TABLE_REACH = 1.2
 # Smallest distance by which a table extends beyond the object and its props, in world units.
 TABLE_MARGIN = 0.2
+# Meshes that callers of Python functions gave, by the names of `name_mesh`.
+MESHES_IN_MEMORY: WeakValueDictionary[str, Mesh] = WeakValueDictionary()
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,23 @@ class SceneObject:
             return self
         mesh = concatenate([self.mesh, *others])
         return replace(self, mesh=mesh, own=int(self.own_faces.sum()))
+
+
+def name_mesh(mesh: Mesh) -> str:
+    """Name a mesh in memory by its content, so that settings, which hold texts, can name it.
+
+    `load_object` finds the mesh by this name as long as the caller keeps the mesh.
+    """
+    digest = hashlib.sha256()
+    for field in fields(mesh):
+        value = getattr(mesh, field.name)
+        arrays = value if isinstance(value, tuple) else () if value is None else (value,)
+        for array in arrays:
+            digest.update(f"{field.name}{array.dtype}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+    name = f"mesh_{digest.hexdigest()[:8]}"
+    MESHES_IN_MEMORY[name] = mesh
+    return name
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
@@ -275,7 +296,9 @@ def _load(item: MeshSettings) -> Mesh:
 def _load_with_color(item: MeshSettings) -> Mesh:
     """Load a mesh file or generate a solid, and give it the color of its settings, if any."""
     kind, _, name = item.mesh.partition(":")
-    if kind == "solid":
+    if item.mesh in MESHES_IN_MEMORY:
+        mesh = MESHES_IN_MEMORY[item.mesh]
+    elif kind == "solid":
         mesh = _build_solid(item.mesh, name)
     else:
         # Importing trimesh takes half a second.

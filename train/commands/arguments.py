@@ -1,6 +1,5 @@
 """Arguments of functions that run a command: meshes, and the folder of the results."""
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -9,10 +8,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from augment.classifier import Classifier
+from augment.scene.objects import name_mesh
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
-from renderer.io.export import export_mesh
-from renderer.io.files import atomic_write
 from renderer.mesh import Mesh
 from renderer.validation import as_folder, as_list
 from train.class_names import classes_of_meshes
@@ -28,23 +26,23 @@ EXPECTED = (
 
 
 def as_mappings(
-    name: str, meshes: Sequence[MeshItem], classifier: Classifier, folder: Path
+    name: str, meshes: Sequence[MeshItem], classifier: Classifier
 ) -> list[dict[str, Any]]:
     """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
 
-    Meshes in memory are written to `folder`, because settings can only name files. A mapping has a
-    "label" if the class is given.
+    A mapping has a "label" if the class is given.
     """
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
+        mapping: dict[str, Any]
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
         elif isinstance(item, MeshSource):
-            mapping = _mesh_fields(item, folder)
+            mapping = {"mesh": _name(item)}
         elif len(item) == 2 and isinstance(item[0], MeshSource):
             source, label = item
-            mapping = _mesh_fields(source, folder) | {"label": label}
+            mapping = {"mesh": _name(source), "label": label}
         else:
             raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
         if mapping.get("label", "") != "":
@@ -53,23 +51,9 @@ def as_mappings(
     return mappings
 
 
-def _mesh_fields(source: MeshSource, folder: Path) -> dict[str, Any]:
-    """Return the fields of `ObjectSettings` that describe a mesh.
-
-    For a mesh in memory, "gloss" says whether the written file has a glossy material.
-    """
-    if not isinstance(source, Mesh):
-        return {"mesh": str(source)}
-    with TemporaryDirectory() as temporary:
-        written = Path(temporary) / "mesh.glb"
-        export_mesh(source, written)
-        content = written.read_bytes()
-    # The hash of the mesh in the name of the file differs from that of any other mesh
-    # that an earlier call wrote to the folder.
-    path = folder / f"mesh_{hashlib.sha256(content).hexdigest()[:8]}.glb"
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, content)
-    return {"mesh": str(path), "gloss": None if source.gloss is None else "file"}
+def _name(source: MeshSource) -> str:
+    """Return the text that names a mesh in settings: its file, its solid, or a name in memory."""
+    return name_mesh(source) if isinstance(source, Mesh) else str(source)
 
 
 def find_positive_classes(

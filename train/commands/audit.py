@@ -130,14 +130,14 @@ def audit(
         classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
             require_replaceable(folder, "out", overwrite)
-            items = as_mappings("meshes", meshes, classifier, folder)
+            items = as_mappings("meshes", meshes, classifier)
             positive_classes = find_positive_classes(label, meshes, items, classifier)
             if len(positive_classes) > 1:
                 raise InputError(
                     f"meshes are of several classes ({', '.join(positive_classes)}): "
                     "give meshes of one class"
                 )
-            negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             settings = AuditSettings(
                 network=classifier.name,
                 label=positive_classes[0],

@@ -148,7 +148,7 @@ def harden(
         )
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
-        items = as_mappings("meshes", meshes, classifier, folder)
+        items = as_mappings("meshes", meshes, classifier)
         labels = find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
             "out": str(folder.absolute()),
@@ -162,7 +162,7 @@ def harden(
             "train": {"device": str(device)},
         }
         if hard_negatives is not None:
-            negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             named = read_objects(negatives, OTHER, "hard_negatives")
             require_others(named, labels, classifier.classes)
             changes["hard_negatives"] = negatives

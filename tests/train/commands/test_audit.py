@@ -99,8 +99,8 @@ def counts_of(report: nb.AuditReport) -> tuple:
 def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, tmp_path, suffix):
     """The numbers are those of the mesh's file and of the network itself, by name."""
     network = Brightness().eval()
-    mesh = nb.solid("orange", 0)
-    nb.export_mesh(mesh, tmp_path / "orange.glb")
+    nb.export_mesh(nb.solid("orange", 0), tmp_path / "orange.glb")
+    mesh = nb.load_mesh(tmp_path / "orange.glb")
     expected = nb.audit(network, [tmp_path / "orange.glb"], **options)
 
     path = tmp_path / f"network.{suffix}"
