@@ -33,7 +33,6 @@ CLASSES = {"plate": 0, "table": 2}
 EXAMPLE_COUNT = 100
 SHORT = TrainingAttackSettings(max_steps=5)
 LONG = TrainingAttackSettings(max_steps=30, step_size=0.5)
-FRACTIONS = {"attack_success_before", "attack_success", "used_all_steps", "zero_gradient"}
 
 
 def built(views: int, *backgrounds: float) -> Scene:
@@ -123,30 +122,6 @@ def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(
     assert len(renders.images) == 0
     assert len(renders.labels) == 0
     assert renders.diagnostics == {}
-
-
-@pytest.mark.parametrize("mode", ["random", "adversarial"])
-def test_renders_are_images_with_the_labels_of_the_scene(serve, model, labels, mode):
-    renders = serve(mode=mode).regenerate(model, 0)
-    assert renders.images.shape == (EXAMPLE_COUNT, 3, 8, 8)
-    assert not renders.images.requires_grad
-    assert renders.images.min() >= 0
-    assert renders.images.max() <= 1
-    assert renders.labels.dtype == torch.int64
-    assert torch.equal(renders.labels, labels)
-
-
-@pytest.mark.parametrize("mode", ["random", "adversarial"])
-def test_diagnostics_are_finite_numbers(serve, model, mode):
-    service = serve(mode=mode)
-    diagnostics = service.regenerate(model, 0).diagnostics
-    for value in diagnostics.values():
-        assert type(value) is float
-        assert math.isfinite(value)
-    for name in FRACTIONS & diagnostics.keys():
-        assert 0 <= diagnostics[name] <= 1
-    assert diagnostics["light_change"] > 0
-    assert service.phases.take().keys() == {"attack_classifier"}
 
 
 @pytest.mark.parametrize(
@@ -370,7 +345,6 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labe
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"init": "dark"}, "init=dark"),
         ({"warm_start": True, "vary": VariationSettings(instances=True)}, "warm_start=True"),
         (
             {"mode": "random", "attack": TrainingAttackSettings(albedo=StepSettings())},
@@ -381,11 +355,6 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labe
 def test_settings_that_are_out_of_range_or_contradict_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         AugmentationSettings(**settings)
-
-
-def test_an_amplitude_that_is_no_number_is_refused():
-    with pytest.raises(InputError, match="amplitude=nan"):
-        RandomLightSettings(amplitude=math.nan)
 
 
 def test_an_attack_without_a_scene_is_refused():
@@ -449,17 +418,6 @@ def test_a_service_from_meshes_renders_as_one_around_the_same_scene(model):
     scene = built(2, 0.25, 0.75)
     same = AugmentationService(settings, scene, renders.labels, 0, Phases())
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
-
-
-def test_a_service_from_meshes_resumes_and_writes_no_files(model, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    service = service_from_meshes()
-    service.regenerate(model, 0)
-    resumed = service_from_meshes()
-    resumed.load_state_dict(service.state_dict())
-    expected = service.regenerate(model, 1).images
-    assert torch.equal(resumed.regenerate(model, 1).images, expected)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("kind", [int, np.int64], ids=["number", "NumPy"])

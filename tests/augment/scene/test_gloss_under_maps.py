@@ -90,13 +90,6 @@ def brdf(
     """Return π times the BRDF (S, N) of glTF for a gray surface.
 
     The diffuse part below a varnish is that of Kulla and Conty (2017).
-
-    Args:
-        normals: Unit normals, shape (S, 3).
-        view: Unit vector towards the camera, shape (3,).
-        light: Unit vectors towards the light, shape (N, 3).
-        roughness: Square root of GGX's alpha.
-        metallic: 0 for a varnish, 1 for a metal.
     """
     alpha = roughness**2
     half = light + view
@@ -156,15 +149,7 @@ def integrated(
     roughness: float,
     metallic: float,
 ) -> np.ndarray:
-    """Return the radiance (P, 3) of the pear's pixels by quadrature over all texels.
-
-    Args:
-        path: The environment map.
-        mesh: The pear.
-        camera: The camera of the scene.
-        roughness: Of the pear.
-        metallic: Of the pear.
-    """
+    """Return the radiance (P, 3) of the pear's pixels by quadrature over all texels."""
     rasterizer = choose("numpy")
     [view] = build_fragments(mesh.vertices, mesh.faces, [camera], SETTINGS, rasterizer)
     surface = Surface(mesh, view, SETTINGS)
@@ -181,14 +166,7 @@ def integrated(
 
 
 def require_close(path: Path, largest_error: float, roughness: float, metallic: float) -> None:
-    """Require that both images agree and that hardly any lit pixel has a black channel.
-
-    Args:
-        path: The environment map.
-        largest_error: Limit of the relative root mean square error.
-        roughness: Of the pear.
-        metallic: Of the pear.
-    """
+    """Require that both images agree and that hardly any lit pixel has a black channel."""
     mesh = glossy_pear(roughness, metallic)
     image, camera = rendered(path, mesh)
     expected = integrated(path, mesh, camera, roughness, metallic)

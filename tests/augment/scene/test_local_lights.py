@@ -1,7 +1,7 @@
 """Projectors and lamps are attacked, stay within their limits, and are read back."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from augment.attacks.problem import SceneProblem
 from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
-from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
+from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings
 from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
@@ -50,15 +50,6 @@ def rendered(shown: Scene, conditions: Conditions | None = None) -> Tensor:
 def by_mean_color() -> augment.Classifier:
     """Return a classifier whose logits are the means of the channels."""
     return augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
-
-
-@pytest.mark.parametrize("kind", LOCAL_LIGHTS.values())
-def test_each_kind_of_local_light_has_settings_and_an_attack(kind):
-    basis, coefficients = build_local_light(LOCAL_LIGHT_SETTINGS[kind.name]())
-    assert type(basis) is kind
-    assert coefficients.shape == (basis.size, 3)
-    assert kind.name in {field.name for field in fields(SceneSettings)}
-    assert kind.name in {field.name for field in fields(augment.AttackSettings)}
 
 
 @pytest.mark.parametrize("kind", LOCAL_LIGHTS.values())

@@ -75,12 +75,7 @@ class Comparison:
     expected: torch.Tensor
 
     def require_close(self, mean: float, typical: float) -> None:
-        """Require a mean error and an error of 98 % of the pixels below these limits.
-
-        Args:
-            mean: Limit of the mean error, as a fraction of the largest irradiance.
-            typical: Limit of the errors of 98 % of the pixels, likewise.
-        """
+        """Require errors, in the mean and of 98 % of the pixels, below fractions of the largest."""
         largest = self.expected.max()
         assert largest < 1
         assert self.expected.min() < 0.6 * largest  # A shadow is in sight.
@@ -90,16 +85,7 @@ class Comparison:
 
 
 def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -> Comparison:
-    """Compute the irradiance of a surface behind or below a ball.
-
-    Args:
-        surface: "table" or "wall".
-        camera: The camera.
-        sky: Light of the mesh's scene.
-        lamps: Local lights of the mesh's scene.
-        light: Sky and direction of the room's light.
-        scale: Factor of the room's irradiance.
-    """
+    """Compute the irradiance of a surface behind or below a ball."""
     placed = place(surface, camera)
     camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))

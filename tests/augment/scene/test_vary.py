@@ -127,19 +127,6 @@ def test_views_in_perspective_have_the_lens_drawn_and_the_width_of_their_own():
         assert 2 <= camera.width <= 4
 
 
-def test_the_generator_decides_what_is_drawn(scene):
-    settings = {"shift": 0.1, "scale": [0.8, 1.2], "exposure": [0.5, 2.0]}
-    first = images_of(drawn(scene, 0, **settings))
-    again = images_of(drawn(scene, 0, **settings))
-    other = images_of(drawn(scene, 1, **settings))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
-def test_a_scene_without_variation_stays_the_same_object(scene):
-    assert drawn(scene) is scene
-
-
 # --------------------------------------------------------------- objects and props
 
 
@@ -197,26 +184,10 @@ def test_all_faces_of_an_object_have_one_gloss_and_its_props_keep_theirs(pears):
         np.testing.assert_allclose(of_props, expected, rtol=1e-6)
 
 
-def test_gloss_is_seen_and_is_the_same_when_it_is_drawn_again(pears):
-    glossy = images_of(drawn(pears, **VARNISHED))
-    assert torch.equal(glossy, images_of(drawn(pears, **VARNISHED)))
-    matte = images_of(drawn(pears, rotation=90.0, instances=True))
-    assert (matte - glossy).abs().max() > 0.02
-
-
 def test_gloss_of_views_that_are_shown_once_looks_the_same(pears):
     once = vary(pears, VariationSettings(**VARNISHED), generator(0), once=True)
     expected = images_of(drawn(pears, **VARNISHED))
     torch.testing.assert_close(images_of(once), expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("name", "limits"),
-    [("roughness", [0.1, 0.5]), ("specular_factor", [0.5, 1.5]), ("specular_factor", [1.0])],
-)
-def test_gloss_out_of_range_is_refused(name, limits):
-    with pytest.raises(InputError, match=f"^{name}"):
-        SpecularLayerSettings(**{name: limits})
 
 
 def test_instances_are_drawn_of_solids_without_a_seed_only():
@@ -295,12 +266,6 @@ def test_light_of_probes_varies_alike_in_every_degree(degree_6_and_9):
     low, high = (drawn(scene, **settings) for scene in degree_6_and_9)
     assert high.basis.degree == 9
     torch.testing.assert_close(images_of(high), images_of(low), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("settings", [{"directional_fraction": 1.0}, {"tables": 1.0}])
-def test_light_that_degree_6_cuts_off_varies_nearly_alike_in_every_degree(degree_6_and_9, settings):
-    low, high = (images_of(drawn(scene, **settings)) for scene in degree_6_and_9)
-    assert 0 < (high - low).abs().max() < 0.05
 
 
 def test_an_environment_beyond_the_degree_of_the_scene_is_refused(degree_6_and_9, tmp_path):
@@ -630,20 +595,6 @@ def test_a_gradient_passes_all_effects():
     assert gradient.abs().max() > 0.01
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("pattern_fraction", 1.5),
-        ("blur", -1.0),
-        ("noise", math.nan),
-        ("pattern_fill", [0.5, 0.2]),
-    ],
-)
-def test_settings_beyond_their_range_are_refused(name, value):
-    with pytest.raises(InputError, match=name):
-        augment.CameraEffectSettings(**{name: value})
-
-
 def test_a_pattern_has_at_most_two_colors_and_its_brighter_one_is_full():
     patterns = draw_patterns(200, 24, generator(0))
     assert patterns.shape == (200, 3, 24, 24)
@@ -662,11 +613,6 @@ def test_half_of_the_patterns_show_photographs_of_a_folder(tmp_path):
     gray = decode(torch.tensor(150 / 255, dtype=torch.float64), "srgb")
     shows_photograph = ((ratio - gray).abs() < 1e-4).all(1)
     assert 0.3 < shows_photograph.double().mean() < 0.7
-
-
-def test_slides_without_an_image_are_refused(tmp_path):
-    with pytest.raises(InputError, match="slides="):
-        photographed(pattern_fraction=1.0, slides=str(tmp_path))
 
 
 def test_a_photograph_is_turned_scaled_and_mirrored_beyond_its_border():

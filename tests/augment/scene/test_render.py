@@ -76,8 +76,7 @@ SHAPES = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
 
 
 @pytest.mark.parametrize("part", [None, *SHAPES])
-@pytest.mark.parametrize("examples", [[1], [2, 0], [0, 2, 2, 1, 0]])
-def test_examples_in_any_order_have_the_same_images(make_scene, part, examples):
+def test_examples_in_any_order_have_the_same_images(make_scene, part):
     scene = make_scene()
     changes = {}
     if part:
@@ -86,7 +85,7 @@ def test_examples_in_any_order_have_the_same_images(make_scene, part, examples):
     if part == "vertices":
         changes[part] += scene.vertices
     lights = own_lights(scene)
-    rows = torch.tensor(examples)
+    rows = torch.tensor([0, 2, 2, 1, 0])
     chosen = {name: value[rows] for name, value in changes.items()}
     images = scene.render(Conditions(lights[rows], **chosen), rows)
     expected = scene.render(Conditions(lights, **changes), EVERY)[rows]
@@ -190,13 +189,7 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
 
 
 def cup_image(gray: float, added: float, shadows: bool) -> Tensor:
-    """Render a cup, which shades itself inside.
-
-    Args:
-        gray: Its color.
-        added: A change of its albedo.
-        shadows: Whether it shades itself.
-    """
+    """Render a cup, which shades itself inside."""
     cup = solid("cup")
     mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
     scene = augment.build_scene(
