@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -135,7 +135,10 @@ def build_scene(
     given_cameras = _as_cameras(cameras, views, normalize)
     views = len(given_cameras) or views
     ImageSettings(size)
-    _require_known(options)
+    unknown = sorted(options.keys() - SCENE_OPTIONS - RENDERER_OPTIONS)
+    if unknown:
+        choices = ", ".join(sorted(SCENE_OPTIONS | RENDERER_OPTIONS))
+        raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
     members = _as_meshes(meshes)
     scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
     renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
@@ -167,9 +170,16 @@ def build_scene(
     if is_named and scene_settings.degree is None:
         lights_of_degree = partial(_build_lights, scene_settings, scene_settings.light)
     rasterizer = renderer_settings.rasterizer
+    given_cameras = given_cameras or orbit_cameras(
+        views,
+        scene_settings.width,
+        scene_settings.polar,
+        scene_settings.azimuth,
+        scene_settings.fov,
+    )
     return Scene.grid(
         objects,
-        given_cameras or _place_cameras(scene_settings, views),
+        given_cameras,
         load_backgrounds(scene_settings.backgrounds, size),
         lights.to(as_device(device)),
         renderer_settings.image(size),
@@ -179,15 +189,6 @@ def build_scene(
         basis=basis,
         lights_of_degree=lights_of_degree,
     )
-
-
-def _require_known(options: Mapping[str, Any]) -> None:
-    """Check that `build_scene` got known options only: fields of two classes of settings."""
-    known = SCENE_OPTIONS | RENDERER_OPTIONS
-    unknown = sorted(options.keys() - known)
-    if unknown:
-        choices = ", ".join(sorted(known))
-        raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
 
 
 def _as_meshes(meshes: object) -> list[Any]:
@@ -251,11 +252,6 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
         return fixed
     # The scene turns cameras about the origin. Make the origin the center of these cameras.
     return [camera.normalized(np.zeros(3), 1.0) for camera in fixed]
-
-
-def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:
-    """Place cameras on a circle around the object, as the settings of a scene say."""
-    return orbit_cameras(count, settings.width, settings.polar, settings.azimuth, settings.fov)
 
 
 def _build_lights(
