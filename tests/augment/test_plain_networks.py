@@ -79,14 +79,6 @@ def test_a_plain_network_is_attacked_like_its_classifier(network):
         assert torch.equal(result.logits, expected.logits)
 
 
-def test_an_index_is_a_target_as_its_name_is(network):
-    classifier = augment.Classifier(network, SIZE, CLASSES)
-    options = {"settings": light(), "force": True}
-    by_name = augment.attack(classifier, scene("orange"), target="apple", **options)
-    by_index = augment.attack(classifier, scene("orange"), target=2, **options)
-    assert torch.equal(by_name.images, by_index.images)
-
-
 def test_a_number_is_an_index_even_if_a_class_has_this_number_as_its_name(network):
     options = {"settings": light(), "force": True, "classes": ("1", "2", "0")}
     by_index = augment.attack(network, scene(1), target=2, **options).criterion

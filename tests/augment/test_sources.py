@@ -308,7 +308,6 @@ def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
         ("absent:f", "there is no module absent"),
         ("own_networks:hug", "has no function hug: did you mean huge"),
         ("own_networks:no_size", r"\(Identity, str, list\)"),
-        ("own_networks:huge", "size=1000000000"),
         ("own_networks:leaves", r"SystemExit.*line \d+ of .*own_networks.py"),
         ("own_networks:broken", r"ZeroDivisionError.*line \d+ of .*own_networks.py"),
     ],
