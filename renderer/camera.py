@@ -26,27 +26,25 @@ from renderer.errors import (
 from renderer.settings import MAX_VIEWS
 from renderer.validation import as_array, require_whole
 
-# Conventions for the axes of a camera in its view matrix. OpenCV
-# has y down and z forward. OpenGL has y up and z backward.
+# Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
+# has y up and z backward.
 CONVENTIONS = ("opencv", "opengl")
-# Default of a camera's `clip_range` in world units. A camera then shows
-# all of a normalized mesh, whose vertices are at most √3 from the origin.
+# Default of a camera's `clip_range` in world units. A camera then shows all of a normalized mesh,
+# whose vertices are at most √3 from the origin.
 CLIP_RANGE = 2.0
 # Largest polar angle, roll and first azimuth of an orbit in degrees: two turns.
 MAX_TURN = 720.0
-# Limits of the field of view in degrees, for
-# the cameras of an orbit and for projectors.
+# Limits of the field of view in degrees, for the cameras of an orbit and for projectors.
 MIN_FOV = 0.05
 MAX_FOV = 172.0
-# Smallest depth that a perspective camera can show, divided by the distance
-# between camera and origin. A mesh with a smaller depth raises an error.
+# Smallest depth that a perspective camera can show, divided by the distance between camera and
+# origin. A mesh with a smaller depth raises an error.
 MIN_NEAR_RATIO = 0.01
-# Smallest depth that a pinhole camera can show, divided by the depth of the
-# farthest point of the mesh. A mesh with a smaller depth raises an error.
+# Smallest depth that a pinhole camera can show, divided by the depth of the farthest point of the
+# mesh. A mesh with a smaller depth raises an error.
 MIN_DEPTH_RATIO = 1e-3
-# Tolerance for matrices of cameras: largest difference between
-# R Rᵀ and the identity for a rotation matrix R, and largest
-# skew of intrinsics as a fraction of the focal length.
+# Tolerance for matrices of cameras: largest difference between R Rᵀ and the identity for a rotation
+# matrix R, and largest skew of intrinsics as a fraction of the focal length.
 MATRIX_TOLERANCE = 1e-4
 
 
@@ -88,8 +86,8 @@ class Camera(ABC):
     clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
-    # Principal point relative to the image center, and aspect
-    # ratio of the pixels. Only a `PinholeCamera` has other values.
+    # Principal point relative to the image center, and aspect ratio of the pixels. Only a
+    # `PinholeCamera` has other values.
     principal_right: ClassVar[float] = 0.0
     principal_up: ClassVar[float] = 0.0
     pixel_aspect: ClassVar[float] = 1.0
@@ -217,8 +215,8 @@ class Camera(ABC):
         cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
-        # The sum equals sin_polar, except for rounding errors. Using
-        # sin_polar instead would change the last bits of images.
+        # The sum equals sin_polar, except for rounding errors. Using sin_polar instead would change
+        # the last bits of images.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
         up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
@@ -252,8 +250,7 @@ class Camera(ABC):
             infinitely far away, so its position is (x, y, z, 0) with the unit vector
             (x, y, z) toward the camera. Float64, shape (4,).
         """
-        # This is the position of an orthographic
-        # camera. `PerspectiveCamera` overrides it.
+        # This is the position of an orthographic camera. `PerspectiveCamera` overrides it.
         return np.append(self.axes()[2], 0.0)
 
     def differentiable_eye(self) -> Tensor:
@@ -267,8 +264,7 @@ class Camera(ABC):
 
     def _differentiable_axes(self) -> tuple[Tensor, Tensor]:
         """Compute `axes` differentiably, and the camera coordinates of the origin, shape (3,)."""
-        # Camera coordinates of the origin and of the
-        # unit vectors give the axes of the camera.
+        # Camera coordinates of the origin and of the unit vectors give the axes of the camera.
         origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
         coordinates = self._camera_coordinates(origin_and_units)
         origin = coordinates[:, 0]
@@ -466,8 +462,7 @@ class PerspectiveCamera(Camera):
         scale = 2 / self.width * (self.distance / depths)
         x = (right + self.right) * scale
         y = (up + self.up) * scale
-        # Coordinate of the near plane along the
-        # axis from the origin to the camera.
+        # Coordinate of the near plane along the axis from the origin to the camera.
         near_back = self.distance - self.near
         depth_scale = 2 * self.far / (self.far - self.near)
         normalized_depth = depth_scale * ((near_back - back) / depths) - 1
@@ -601,22 +596,19 @@ class PinholeCamera(PerspectiveCamera):
         require_choice("convention", convention, CONVENTIONS)
         rotation, translation = _split_view(view)
         if convention == "opencv":
-            # OpenCV's axes are right, down and
-            # forward. Ours are right, up and back.
+            # OpenCV's axes are right, down and forward. Ours are right, up and back.
             rotation = rotation * [[1], [-1], [-1]]
             translation = translation * [1, -1, -1]
         focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
         image_width, image_height = _as_image_size(size)
         side = min(image_width, image_height)
-        # The rows of the rotation matrix are the
-        # axes of the camera in world axes.
+        # The rows of the rotation matrix are the axes of the camera in world axes.
         right, up, back = rotation
         position = -translation @ rotation
         distance = float(np.linalg.norm(position)) or 1.0
         pivot = position - distance * back
         azimuth = math.atan2(back[1], back[0])
-        # This horizontal vector would be the camera's
-        # axis to the right if there were no roll.
+        # This horizontal vector would be the camera's axis to the right if there were no roll.
         right_without_roll = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         roll = math.atan2(-up @ right_without_roll, right @ right_without_roll)
         return cls(

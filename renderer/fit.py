@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
@@ -38,108 +38,80 @@ from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
-from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
 from renderer.solids import sphere
 from renderer.validation import as_tensor
 
-# Polar angles in degrees of the first cameras of a search:
-# the angles between +z and the direction to the camera.
+# Polar angles in degrees of the first cameras of a search: the angles between +z and the direction
+# to the camera.
 FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)
 # Number of first cameras at each polar angle, with equally spaced azimuths.
 FIRST_AZIMUTH_COUNT = 16
-# Width in world units that a first camera shows, before it is changed
-# so that the mesh looks as large as the object in the photograph.
+# Width in world units that a first camera shows, before it is changed so that the mesh looks as
+# large as the object in the photograph.
 FIRST_WIDTH = 2.0
-# Width and height in pixels of the small images in which cameras are
-# searched. The best cameras are then refined in images of the full size.
+# Width and height in pixels of the small images in which cameras are searched. The best cameras are
+# then refined in images of the full size.
 COARSE_SIZE = 32
-# The search refines this many of its first cameras: those whose images
-# differ least from the photograph. It returns at most as many.
+# The search refines this many of its first cameras: those whose images differ least from the
+# photograph. It returns at most as many.
 KEPT_CAMERAS = 3
-# Largest number of steps when one camera
-# is refined with the Gauss-Newton method.
+# Largest number of steps when one camera is refined with the Gauss-Newton method.
 MAX_STEPS = 20
-# The refinement of a camera ends if a step changes the
-# squared error, or the camera, by less than this fraction.
+# The refinement of a camera ends if a step changes the squared error, or the camera, by less than
+# this fraction.
 MIN_GAIN = 1e-3
-# Step sizes of numerical derivatives, times the image size in pixels. The
-# five parameters of a camera are the polar angle and the azimuth in radians,
-# the relative width, and the shifts right and up as fractions of the width.
+# Step sizes of numerical derivatives, times the image size in pixels. The five parameters of a
+# camera are the polar angle and the azimuth in radians, the relative width, and the shifts right
+# and up as fractions of the width.
 DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
-# Smallest angle in radians between a refined camera and +z
-# or -z. Exactly there, the azimuth would have no effect.
+# Smallest angle in radians between a refined camera and +z or -z. Exactly there, the azimuth would
+# have no effect.
 MIN_POLE_ANGLE = 0.02
 # Number of samples along one side of a pixel in renders.
 SAMPLES = 8
-# Two cameras count as the same one if all their
-# axes differ by less than this angle in degrees.
+# Two cameras count as the same one if all their axes differ by less than this angle in degrees.
 MIN_CAMERA_ANGLE = 2.0
-# A camera of the search in small images is refined in full size if its
-# squared error is at most this multiple of the smallest squared error.
+# A camera of the search in small images is refined in full size if its squared error is at most
+# this multiple of the smallest squared error.
 MAX_ERROR_RATIO = 3
-# Weight of the smoothness penalty of the light, relative to the squared
-# brightness of the object under uniform light. Without a penalty, light from
-# directions that the object hardly reflects could become arbitrarily bright.
+# Weight of the smoothness penalty of the light, relative to the squared brightness of the object
+# under uniform light. Without a penalty, light from directions that the object hardly reflects
+# could become arbitrarily bright.
 SMOOTHNESS_WEIGHT = 1e-6
-# A pixel of the photograph with this linear value or more counts as
-# clipped: the scene may have been brighter than the photograph can show.
+# A pixel of the photograph with this linear value or more counts as clipped: the scene may have
+# been brighter than the photograph can show.
 CLIPPED_VALUE = 0.995
-# The light is fitted up to this many times. Each fit ignores
-# the clipped pixels that the last fit made brighter than 1.
+# The light is fitted up to this many times. Each fit ignores the clipped pixels that the last fit
+# made brighter than 1.
 CLIPPING_ROUNDS = 3
-# Smallest radiance of a light in all directions of a grid, as a fraction of its
-# mean radiance. The margin keeps the radiance positive between the directions.
+# Smallest radiance of a light in all directions of a grid, as a fraction of its mean radiance. The
+# margin keeps the radiance positive between the directions.
 MIN_RADIANCE_RATIO = 0.01
-# Largest number of iterations of SciPy's `nnls`, per direction of the grid in
-# which the radiance of a light is constrained. Three iterations are usual.
+# Largest number of iterations of SciPy's `nnls`, per direction of the grid in which the radiance of
+# a light is constrained. Three iterations are usual.
 MAX_NNLS_ITERATIONS = 100
-# The radiance of a light is first constrained in every 16th direction of the
-# grid. Directions in which the radiance is negative are added afterwards.
+# The radiance of a light is first constrained in every 16th direction of the grid. Directions in
+# which the radiance is negative are added afterwards.
 FIRST_DIRECTION_STEP = 16
-# The search for a camera prevents negative radiance of its lights in the
-# directions of the vertices of an icosphere with this number of subdivisions.
+# The search for a camera prevents negative radiance of its lights in the directions of the vertices
+# of an icosphere with this number of subdivisions.
 SEARCH_GRID = 2
 # The same number for the light that is returned.
 FINAL_GRID = 5
-# The object covers a pixel completely if its share of the pixel
-# is larger than this. A limit of 0.99 would be too low: a white
-# background in the other hundredth of the pixel can be brighter
-# than the object, for example in the blue channel of a banana.
+# The object covers a pixel completely if its share of the pixel is larger than this. A limit of
+# 0.99 would be too low: a white background in the other hundredth of the pixel can be brighter than
+# the object, for example in the blue channel of a banana.
 WHOLE_PIXEL = 0.999
 # The bounding box of a mask contains the pixels that it covers by more than this.
 HALF_PIXEL = 0.5
-# A pixel on the border of the object gets the mean color of the pixels that the
-# object covers completely and that are at most this many rows and columns away.
+# A pixel on the border of the object gets the mean color of the pixels that the object covers
+# completely and that are at most this many rows and columns away.
 BORDER = 2
-# Side of the square window that is cut around an object,
-# divided by the longer side of the object's bounding box.
-WINDOW_SCALE = 1.6
-# A pixel of an 8-bit mask belongs to the
-# object if its value is larger than this.
-MASK_THRESHOLD = 127
-# First guess of the angle between +z and
-# the direction to the camera, in degrees.
-GUESSED_POLAR = 60.0
-# A window of the photograph is cut and fitted again if the first fit
-# changes a component of the axes of the window by more than this.
-MAX_AXIS_CHANGE = 1e-3
 # Smallest number of pixels of an image that the object must cover.
 MIN_COVERED_PIXELS = 16
 # Number of color channels.
 CHANNELS = 3
-
-
-class FittedPhotograph(NamedTuple):
-    """Camera and light of an object anywhere in a photograph, and the window that was fitted.
-
-    Attributes:
-        scene: Camera and light. The camera looks at the center of the mesh.
-        window: Square part of the photograph that the camera shows.
-    """
-
-    scene: FittedScene
-    window: Window
 
 
 class FittedScene(NamedTuple):
@@ -160,153 +132,6 @@ class FittedScene(NamedTuple):
     light: Tensor
     error: float
     overlap: float
-
-
-def fit_photograph(
-    photograph: UInt8[NDArray[Any], "height width 3"],
-    mask: UInt8[NDArray[Any], "height width"],
-    mesh: Mesh,
-    size: int = 64,
-    *,
-    fov: float | None = None,
-    encoding: str = "srgb",
-    **options: Any,
-) -> FittedPhotograph:
-    """Find the camera and the light of an object anywhere in a photograph.
-
-    The function cuts a square window around the object out of the photograph.
-    The window shows what a camera would see if it were turned toward the object
-    (see `renderer.photograph`). The window is fitted with `fit_scene`. The upward
-    direction in the window depends on the height of the camera, which is only
-    known after the fit. If the first window was tilted, a second window is cut
-    and fitted. The camera of the photograph is upright, and its optical axis passes through the
-    center of the photograph. The mask is white where the object is. `fov` is the field of view of
-    the window in degrees, or None for no perspective.
-    """
-    is_object = mask > MASK_THRESHOLD
-    rows = np.flatnonzero(is_object.any(axis=1))
-    columns = np.flatnonzero(is_object.any(axis=0))
-    if not len(rows):
-        raise InputError(
-            "the mask has no white pixels: give a mask that is white where the object is, "
-            "or a box around the object"
-        )
-    # Center (column, row) of the object's
-    # bounding box in the photograph, in pixels.
-    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
-    # Side of the window in pixels.
-    side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
-    focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
-    camera_image = Photograph(photograph, focal_length)
-    fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
-
-    # The window needs the direction of the world's z-axis
-    # in the axes of the photograph's camera: right, up and
-    # back. For the first fit, this direction is guessed.
-    guessed_polar = math.radians(GUESSED_POLAR)
-    guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
-    window = camera_image.window(center, side, guessed_up)
-    scene = fit.fit(window, None)
-    # The first fit gives a better direction of the z-axis for the second fit.
-    up = _up_direction(scene.camera, window)
-    # The camera of the photograph is upright,
-    # so the z-axis does not point to its right.
-    up[0] = 0
-    upright_window = camera_image.window(center, side, up)
-    if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
-        window = upright_window
-        scene = fit.fit(window, scene.camera)
-    return _centered_on_mesh(scene, window, camera_image)
-
-
-def _centered_on_mesh(
-    scene: FittedScene, window: Window, camera_image: Photograph
-) -> FittedPhotograph:
-    """Turn a fitted camera and its window so that the mesh center is in their center."""
-    camera = scene.camera
-    # Offset (right, up) of the mesh center from the window center, in pixels.
-    offset = np.array([camera.right, camera.up]) * window.side / camera.width
-    mesh_center = np.array(window.pixels(*offset))
-    up = _up_direction(camera, window)
-    centered_scene = scene._replace(camera=_turned_to_mesh(camera))
-    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, window.side, up))
-
-
-@dataclass(frozen=True)
-class _WindowFit:
-    """Photograph with the settings for fitting a camera and a light to windows of it.
-
-    Attributes:
-        photograph: Photograph with 8 bits per channel, shape (H, W, 3).
-        mask: Mask with 8 bits, white where the object is, shape (H, W).
-        mesh: Mesh of the object.
-        size: Number of pixels per side of the images that are compared.
-        options: Keyword arguments of `fit_scene`.
-    """
-
-    photograph: NDArray[Any]
-    mask: NDArray[Any]
-    mesh: Mesh
-    size: int
-    options: dict[str, Any]
-
-    def fit(self, window: Window, start: Camera | None) -> FittedScene:
-        """Fit the camera and the light in one window. Without a start camera, search for one."""
-        linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
-        # Share of each pixel that the object covers, shape (size, size).
-        coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
-        return fit_scene(linear_image, coverage, self.mesh, start=start, **self.options)
-
-
-def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
-    """Return the world's z-axis, a unit vector, in the photograph's axes right, up and back."""
-    # The z-components of the axes right, up and back of the fitted
-    # camera. These axes are also the axes of the window.
-    z_axis_in_window = camera.axes()[:, 2]
-    return window.axes.T @ z_axis_in_window
-
-
-def _turned_to_mesh(camera: Camera) -> Camera:
-    """Return a copy of a camera at the same place that looks at the center of the mesh.
-
-    The center of the mesh is the origin. A perspective camera is turned if it does
-    not show the origin in the center of its image. An orthographic camera is
-    shifted.
-    """
-    if not isinstance(camera, PerspectiveCamera):
-        return replace(camera, right=0.0, up=0.0)
-    x, y, z = camera.eye()[:3].tolist()
-    distance = math.hypot(x, y, z)
-    return replace(
-        camera,
-        polar=math.degrees(math.acos(z / distance)),
-        azimuth=math.degrees(math.atan2(y, x)),
-        width=camera.width * distance / camera.distance,
-        right=0.0,
-        up=0.0,
-        distance=distance,
-    )
-
-
-@dataclass(frozen=True)
-class _RenderOptions:
-    """Arguments for `render` and `precompute_transfer` while a camera or a light is fitted.
-
-    Attributes:
-        albedo_scale: Factor for the albedo of the mesh.
-        encoding: Encoding of image values, "linear" or "srgb".
-        normals: "flat" or "smooth".
-        rasterizer: "auto", "opengl", "numba" or "numpy".
-        samples: Number of samples along one side of a pixel.
-        bounces: Number of light bounces, with shadows.
-    """
-
-    albedo_scale: float
-    encoding: str
-    normals: str
-    rasterizer: str
-    samples: int = SAMPLES
-    bounces: int = 0
 
 
 def fit_scene(
@@ -387,7 +212,14 @@ def fit_scene(
             f"the mask covers no pixel by more than {HALF_PIXEL}: give a mask with values in "
             "[0, 1], 1 where the object is"
         )
-    options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
+    # Arguments of `render` and `precompute_transfer` for all images that are compared.
+    options = {
+        "albedo_scale": albedo_scale,
+        "encoding": encoding,
+        "normals": normals,
+        "rasterizer": rasterizer,
+        "samples": SAMPLES,
+    }
     photograph = photograph.double()
     mask = mask.double()
     target = _Target.from_photograph(photograph, mask, mesh, size, options)
@@ -400,9 +232,8 @@ def fit_scene(
         start_cameras = [start]
     refined_cameras = [target.refine_camera(camera) for camera in start_cameras]
     _, best_camera = target.rank_cameras(refined_cameras)[0]
-    # Bounces are slow to compute, so only the
-    # returned light is fitted with bounces.
-    target_with_bounces = target._replace(options=replace(options, bounces=bounces))
+    # Bounces are slow to compute, so only the returned light is fitted with bounces.
+    target_with_bounces = target._replace(options={**options, "bounces": bounces})
     return target_with_bounces.fit_final_light(best_camera)
 
 
@@ -421,9 +252,8 @@ def _plausible_cameras(
         for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov):
             first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
     ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
-    # All azimuths fit a round object equally well, so the
-    # best cameras may all have the same polar angle. The best
-    # camera of each polar angle is therefore refined, too.
+    # All azimuths fit a round object equally well, so the best cameras may all have the same polar
+    # angle. The best camera of each polar angle is therefore refined, too.
     best_of_polar: dict[float, Camera] = {}
     for camera in ranked_cameras:
         best_of_polar.setdefault(camera.polar, camera)
@@ -438,18 +268,14 @@ def _plausible_cameras(
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
     """Remove cameras whose axes all lie within `MIN_CAMERA_ANGLE` degrees of an earlier one's."""
-    kept_cameras: list[Camera] = []
+    kept: list[Camera] = []
     max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
     for camera in cameras:
-        is_new = True
-        for kept_camera in kept_cameras:
-            # Cosines of the angles between the axes
-            # right, up and back of both cameras.
-            cosines = (camera.axes() * kept_camera.axes()).sum(axis=1)
-            is_new = is_new and float(cosines.min()) < max_cosine
-        if is_new:
-            kept_cameras.append(camera)
-    return kept_cameras
+        # Smallest cosine of the angles between the axes right, up and back of both cameras.
+        cosines = [(camera.axes() * other.axes()).sum(axis=1).min() for other in kept]
+        if max(cosines, default=-1.0) < max_cosine:
+            kept.append(camera)
+    return kept
 
 
 class _LightFit(NamedTuple):
@@ -488,7 +314,7 @@ class _Target(NamedTuple):
     gray: float
     mesh: Mesh
     size: int
-    options: _RenderOptions
+    options: dict[str, Any]
 
     @staticmethod
     def from_photograph(
@@ -496,7 +322,7 @@ class _Target(NamedTuple):
         mask: Float[Tensor, "H H"],
         mesh: Mesh,
         size: int,
-        options: _RenderOptions,
+        options: dict[str, Any],
     ) -> _Target:
         """Resample a photograph and its mask, and replace the background by black or white.
 
@@ -504,22 +330,19 @@ class _Target(NamedTuple):
         background. They get the mean color of the object's pixels around them. Values are linear,
         and the mask is the share of each pixel that the object covers.
         """
-        # 1 in pixels that the object covers
-        # completely, and 0 elsewhere, shape (1, H, H).
+        # 1 in pixels that the object covers completely, and 0 elsewhere, shape (1, H, H).
         is_inside = (mask > WHOLE_PIXEL).double()[None]
-        # Side of the square of pixels around each
-        # pixel over which colors are averaged.
+        # Side of the square of pixels around each pixel over which colors are averaged.
         side = 2 * BORDER + 1
         mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
         inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
-        # Mean color of those pixels of the square
-        # that lie inside of the object.
+        # Mean color of those pixels of the square that lie inside of the object.
         border_color = mean_color / inside_fraction.clamp(min=1e-9)
         color = torch.where(is_inside > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
-        # The background becomes black behind a bright object, and
-        # white behind a dark one, so that the silhouette stands out.
+        # The background becomes black behind a bright object, and white behind a dark one, so that
+        # the silhouette stands out.
         is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum())
         gray = 0.0 if is_bright else 1.0
         image = object_image + gray * (1 - mask)
@@ -533,12 +356,11 @@ class _Target(NamedTuple):
         Only pixels of which the mesh and the mask both cover at least `min_coverage` count. The
         radiance is constrained at the vertices of an icosphere with `grid` subdivisions.
         """
-        operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
+        operator = precompute_transfer(self.mesh, camera, self.size, **self.options)
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
         unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
         unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
-        # Radiance of the P covered pixels under
-        # each of the 49 lights, shape (3, 49, P).
+        # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
         no_coverage = self.mask.new_zeros(self.size**2)
@@ -574,8 +396,8 @@ class _Target(NamedTuple):
         is_clipped = image >= CLIPPED_VALUE
         is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
-            # Matrix and right side of the normal equations of
-            # each channel, shape (3, 49, 49) and (3, 49).
+            # Matrix and right side of the normal equations of each channel, shape (3, 49, 49) and
+            # (3, 49).
             used_transfer = transfer * is_used[:, None]
             normal_matrix = used_transfer @ transfer.mT
             right_side = (used_transfer @ object_radiance[..., None])[..., 0]
@@ -607,16 +429,63 @@ class _Target(NamedTuple):
         depend on the scale of the albedo. Entry (j, k) of a normal matrix is the sum over pixels
         of the radiance under coefficient j times that under k.
         """
-        # Entry (0, 0) is the sum over pixels of the squared radiance under
-        # uniform light (coefficient 0). The small summand keeps the sum
-        # above 0 if the object is black.
+        # Entry (0, 0) is the sum over pixels of the squared radiance under uniform light
+        # (coefficient 0). The small summand keeps the sum above 0 if the object is black.
         squared_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
         return SMOOTHNESS_WEIGHT * squared_brightness * (1 + (band * (band + 1)).square())
 
-    def refine_camera(self, camera: Camera) -> Camera:
-        """Find the camera near a given camera whose render resembles the photograph most."""
-        return _Descent(self, camera).run()
+    def refine_camera(self, first: Camera) -> Camera:
+        """Find the camera near a given camera whose render resembles the photograph most.
+
+        The Gauss-Newton method in a trust region changes five parameters: the polar
+        angle and the azimuth in radians, and the width and the shifts right and up divided
+        by the width of the first camera. For each camera, the best light is computed
+        (variable projection). The error jumps slightly if a sample changes from one
+        face to another. Derivatives are therefore central differences over about a pixel.
+        """
+
+        def camera_of(parameters: Float[np.ndarray, " 5"]) -> Camera:
+            polar, azimuth, relative_width, right, up = parameters.tolist()
+            moved = replace(
+                first,
+                polar=math.degrees(polar),
+                azimuth=math.degrees(azimuth),
+                width=first.width * relative_width,
+                right=first.width * right,
+                up=first.width * up,
+            )
+            # The distance changes with the width, so that the field of view stays the same.
+            if isinstance(moved, PerspectiveCamera):
+                moved = replace(moved, distance=moved.distance * relative_width)
+            return moved
+
+        def residuals(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
+            return self.fit_light(camera_of(parameters)).residuals.numpy()
+
+        def jacobian(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
+            columns = []
+            # Row k of the diagonal matrix is a step that changes only parameter k.
+            for step in np.diag(np.array(DERIVATIVE_STEPS) / self.size):
+                difference = residuals(parameters + step) - residuals(parameters - step)
+                columns.append(difference / (2 * step.sum()))
+            return np.stack(columns, axis=1)
+
+        shift = [first.right / first.width, first.up / first.width]
+        lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
+        highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
+        start = [math.radians(first.polar), math.radians(first.azimuth), 1.0, *shift]
+        found = least_squares(
+            residuals,
+            np.clip(start, lowest, highest),
+            jacobian,
+            bounds=(lowest, highest),
+            x_scale="jac",
+            ftol=MIN_GAIN,
+            xtol=MIN_GAIN,
+            max_nfev=MAX_STEPS,
+        )
+        return camera_of(found.x)
 
     def render_linear(
         self, camera: Camera, light: Float[Tensor, "49 3"]
@@ -624,9 +493,8 @@ class _Target(NamedTuple):
         """Render the mesh in front of the gray background, and decode the image to linear
         values.
         """
-        options = asdict(self.options)
-        image = render(self.mesh, camera, light, self.size, self.gray, **options)
-        return decode(image, self.options.encoding).flatten(1)
+        image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
+        return decode(image, self.options["encoding"]).flatten(1)
 
     def fit_final_light(self, camera: Camera) -> FittedScene:
         """Fit the light for the final camera, and compute how well the render fits.
@@ -644,89 +512,6 @@ class _Target(NamedTuple):
         return FittedScene(camera, fit.light, float(error), float(overlap))
 
 
-class _Descent:
-    """Refinement of a camera: Gauss-Newton method in a trust region over five parameters.
-
-    The parameters are the polar angle and the azimuth in radians, the width
-    divided by the width of the first camera, and the shifts right and up divided
-    by the width of the first camera. For each camera, the best light is computed
-    (variable projection). The error jumps slightly if a sample changes from one
-    face to another. Derivatives are therefore differences over about a pixel.
-
-    Args:
-        target: Photograph that the render should resemble.
-        camera: First camera, from which the method starts.
-    """
-
-    def __init__(self, target: _Target, camera: Camera):
-        """Store the photograph and the first camera, without computing anything."""
-        self._target = target
-        self._first_camera = camera
-
-    def run(self) -> Camera:
-        """Minimize the error, and return the camera with the smallest error."""
-        camera = self._first_camera
-        right = camera.right / camera.width
-        up = camera.up / camera.width
-        # Bounds of the parameters: polar angle,
-        # azimuth, relative width, right and up.
-        lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
-        highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
-        polar = math.radians(camera.polar)
-        azimuth = math.radians(camera.azimuth)
-        start = np.array([polar, azimuth, 1.0, right, up]).clip(lowest, highest)
-        found = least_squares(
-            self._residuals,
-            start,
-            self._jacobian,
-            bounds=(lowest, highest),
-            x_scale="jac",
-            ftol=MIN_GAIN,
-            xtol=MIN_GAIN,
-            max_nfev=MAX_STEPS,
-        )
-        return self._camera_of(found.x)
-
-    def _camera_of(self, parameters: Float[np.ndarray, " 5"]) -> Camera:
-        """Convert the five parameters of the refinement to a camera.
-
-        They are the polar angle and the azimuth in radians, and the width and the shifts right
-        and up divided by the first camera's width.
-        """
-        polar, azimuth, relative_width, right, up = parameters.tolist()
-        width = self._first_camera.width
-        moved = replace(
-            self._first_camera,
-            polar=math.degrees(polar),
-            azimuth=math.degrees(azimuth),
-            width=width * relative_width,
-            right=width * right,
-            up=width * up,
-        )
-        # The distance changes with the width, so
-        # that the field of view stays the same.
-        if isinstance(moved, PerspectiveCamera):
-            moved = replace(moved, distance=moved.distance * relative_width)
-        return moved
-
-    def _residuals(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
-        """Compute the residuals of the best light. The sum of their squares is minimized."""
-        return self._target.fit_light(self._camera_of(parameters)).residuals.numpy()
-
-    def _jacobian(self, parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
-        """Compute the derivatives of the residuals by central differences.
-
-        The residuals are the differences between the photograph and a render.
-        """
-        columns = []
-        step_sizes = np.array(DERIVATIVE_STEPS) / self._target.size
-        # Row k of the diagonal matrix is a step that changes only parameter k.
-        for step in np.diag(step_sizes):
-            difference = self._residuals(parameters + step) - self._residuals(parameters - step)
-            columns.append(difference / (2 * step.sum()))
-        return np.stack(columns, axis=1)
-
-
 def _fit_channels(
     normal_matrix: Float[Tensor, "3 49 49"],
     right_side: Float[Tensor, "3 49"],
@@ -742,12 +527,11 @@ def _fit_channels(
     expected light, shape (49, 3) each. The latter is zero for the brightest channel.
     """
     regularized = normal_matrix + torch.diag(penalty)
-    # The brightest channel reflects most of a
-    # uniform light, which is coefficient 0.
+    # The brightest channel reflects most of a uniform light, which is coefficient 0.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
-    # The expected light of a channel is the multiple
-    # of `best_light` with the smallest squared error.
+    # The expected light of a channel is the multiple of `best_light` with the smallest squared
+    # error.
     squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
     factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
@@ -778,8 +562,7 @@ def _nonnegative_light(
         lower = np.linalg.cholesky(matrix)
         # L⁻¹ w is the value of y without constraints.
         unconstrained = solve_triangular(lower, right_side, lower=True)
-        # The columns of L⁻¹ Rᵀ are the vectors whose
-        # dot product with y must not be negative.
+        # The columns of L⁻¹ Rᵀ are the vectors whose dot product with y must not be negative.
         constraints = solve_triangular(lower, radiance_rows.T, lower=True)
         nearest = _nearest_in_cone(unconstrained, constraints)
         # The light is x = L⁻ᵀ y.
@@ -817,9 +600,8 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
-    # The product of column 0 and coefficient 0 is the
-    # mean radiance of the light. Reducing the column
-    # therefore subtracts the smallest allowed radiance.
+    # The product of column 0 and coefficient 0 is the mean radiance of the light. Reducing the
+    # column therefore subtracts the smallest allowed radiance.
     rows[:, 0] *= 1 - MIN_RADIANCE_RATIO
     return rows
 
@@ -831,16 +613,14 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     bounding box of the mask. The direction is kept. A perspective camera also gets another
     distance.
     """
-    # Bounding boxes in image coordinates from
-    # -1 to 1, with x to the right and y up.
+    # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)
     mesh_high = points.max(0)
     mask_low, mask_high = _mask_box(mask)
     mesh_area = float(np.prod(mesh_high - mesh_low))
     mask_area = float(np.prod(mask_high - mask_low))
-    # A camera that is wider by this factor
-    # shows the mesh smaller by this factor.
+    # A camera that is wider by this factor shows the mesh smaller by this factor.
     factor = math.sqrt(mesh_area / mask_area)
     width = camera.width * factor
     mask_center = (mask_low + mask_high) / 2

@@ -1,7 +1,7 @@
-"""Cut square windows out of photographs, as if the camera had been turned toward an object.
+"""Find the camera and the light of an object anywhere in a photograph.
 
-An object may be anywhere in a photograph. This module computes the square image
-that the camera would have taken if it had been turned toward the object. The
+A square window around the object is cut out of the photograph, as if the camera
+had been turned toward the object, and `renderer.fit` fits this window. The
 photograph and this image are related by a homography (Hartley and Zisserman
 2004, section 8.4.2). Photographs must not be cropped, because the optical axis
 of the camera must pass through the center of the photograph.
@@ -12,8 +12,8 @@ A camera has the axes right, up and back. It looks along minus back.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from renderer.camera import Camera, PerspectiveCamera
+from renderer.errors import InputError
+from renderer.fit import FittedScene, fit_scene
 from renderer.image import decode
+from renderer.mesh import Mesh
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
@@ -34,6 +38,28 @@ MIN_SAMPLES = 8
 # Number of additional rows and columns of pixels that are read on each side of
 # a window. The bicubic interpolation at the border of the window needs them.
 BORDER = 2
+# Side of the square window that is cut around an object, divided by the longer side of the object's
+# bounding box.
+WINDOW_SCALE = 1.6
+# A pixel of an 8-bit mask belongs to the object if its value is larger than this.
+MASK_THRESHOLD = 127
+# First guess of the angle between +z and the direction to the camera, in degrees.
+GUESSED_POLAR = 60.0
+# A window of the photograph is cut and fitted again if the first fit changes a component of the
+# axes of the window by more than this.
+MAX_AXIS_CHANGE = 1e-3
+
+
+class FittedPhotograph(NamedTuple):
+    """Camera and light of an object anywhere in a photograph, and the window that was fitted.
+
+    Attributes:
+        scene: Camera and light. The camera looks at the center of the mesh.
+        window: Square part of the photograph that the camera shows.
+    """
+
+    scene: FittedScene
+    window: Window
 
 
 @dataclass(frozen=True)
@@ -208,3 +234,107 @@ class _Rectangle:
         """
         extent = [self.right - self.left, self.bottom - self.top]
         return 2 * (points - [self.left, self.top]) / extent - 1
+
+
+def fit_photograph(
+    photograph: UInt8[NDArray[Any], "height width 3"],
+    mask: UInt8[NDArray[Any], "height width"],
+    mesh: Mesh,
+    size: int = 64,
+    *,
+    fov: float | None = None,
+    encoding: str = "srgb",
+    **options: Any,
+) -> FittedPhotograph:
+    """Find the camera and the light of an object anywhere in a photograph.
+
+    The function cuts a square window around the object out of the photograph.
+    The window shows what a camera would see if it were turned toward the object
+    (see `renderer.photograph`). The window is fitted with `fit_scene`. The upward
+    direction in the window depends on the height of the camera, which is only
+    known after the fit. If the first window was tilted, a second window is cut
+    and fitted. The camera of the photograph is upright, and its optical axis passes through the
+    center of the photograph. The mask is white where the object is. `fov` is the field of view of
+    the window in degrees, or None for no perspective.
+    """
+    is_object = mask > MASK_THRESHOLD
+    rows = np.flatnonzero(is_object.any(axis=1))
+    columns = np.flatnonzero(is_object.any(axis=0))
+    if not len(rows):
+        raise InputError(
+            "the mask has no white pixels: give a mask that is white where the object is, "
+            "or a box around the object"
+        )
+    # Center (column, row) of the object's bounding box in the photograph, in pixels.
+    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
+    # Side of the window in pixels.
+    side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
+    focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
+    camera_image = Photograph(photograph, focal_length)
+
+    def fit(window: Window, start: Camera | None) -> FittedScene:
+        """Fit the camera and the light in one window. Without a start camera, search for one."""
+        linear_image = window.cut(photograph, size, encoding)
+        # Share of each pixel that the object covers, shape (size, size).
+        coverage = window.cut(mask[..., None], size, beyond=0)[0]
+        fixed = {"fov": fov, "encoding": encoding, "start": start}
+        return fit_scene(linear_image, coverage, mesh, **fixed, **options)
+
+    # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
+    # right, up and back. For the first fit, this direction is guessed.
+    guessed_polar = math.radians(GUESSED_POLAR)
+    guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
+    window = camera_image.window(center, side, guessed_up)
+    scene = fit(window, None)
+    # The first fit gives a better direction of the z-axis for the second fit.
+    up = _up_direction(scene.camera, window)
+    # The camera of the photograph is upright, so the z-axis does not point to its right.
+    up[0] = 0
+    upright_window = camera_image.window(center, side, up)
+    if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
+        window = upright_window
+        scene = fit(window, scene.camera)
+    return _centered_on_mesh(scene, window, camera_image)
+
+
+def _centered_on_mesh(
+    scene: FittedScene, window: Window, camera_image: Photograph
+) -> FittedPhotograph:
+    """Turn a fitted camera and its window so that the mesh center is in their center."""
+    camera = scene.camera
+    # Offset (right, up) of the mesh center from the window center, in pixels.
+    offset = np.array([camera.right, camera.up]) * window.side / camera.width
+    mesh_center = np.array(window.pixels(*offset))
+    up = _up_direction(camera, window)
+    centered_scene = scene._replace(camera=_turned_to_mesh(camera))
+    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, window.side, up))
+
+
+def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
+    """Return the world's z-axis, a unit vector, in the photograph's axes right, up and back."""
+    # The z-components of the axes right, up and back of the fitted camera. These axes are also the
+    # axes of the window.
+    z_axis_in_window = camera.axes()[:, 2]
+    return window.axes.T @ z_axis_in_window
+
+
+def _turned_to_mesh(camera: Camera) -> Camera:
+    """Return a copy of a camera at the same place that looks at the center of the mesh.
+
+    The center of the mesh is the origin. A perspective camera is turned if it does
+    not show the origin in the center of its image. An orthographic camera is
+    shifted.
+    """
+    if not isinstance(camera, PerspectiveCamera):
+        return replace(camera, right=0.0, up=0.0)
+    x, y, z = camera.eye()[:3].tolist()
+    distance = math.hypot(x, y, z)
+    return replace(
+        camera,
+        polar=math.degrees(math.acos(z / distance)),
+        azimuth=math.degrees(math.atan2(y, x)),
+        width=camera.width * distance / camera.distance,
+        right=0.0,
+        up=0.0,
+        distance=distance,
+    )

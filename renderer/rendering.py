@@ -44,18 +44,18 @@ from renderer.validation import as_list, as_tensor, require_kind, require_number
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import choose
 
-# Type of a local light for `render`: a `Lamps` or a
-# `Projector` object, alone or in a pair with its coefficients.
+# Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair with its
+# coefficients.
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
 # Words with which errors ask for the argument `lights` of `render`.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
-# Default camera for pictures of lights. It looks from the
-# same direction as the first camera of `orbit_cameras`.
+# Default camera for pictures of lights. It looks from the same direction as the first camera of
+# `orbit_cameras`.
 _OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)
-# Choosing the rasterizer "opengl" tests the graphics driver, which
-# takes longer than rendering an image. The choice is therefore cached.
+# Choosing the rasterizer "opengl" tests the graphics driver, which takes longer than rendering an
+# image. The choice is therefore cached.
 _choose = cache(choose)
 
 
@@ -171,8 +171,8 @@ def render(
 
     is_moved = vertices is not None
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
-    # Rasterizing and ray tracing have no gradients, so they take
-    # a mesh and cameras with plain numbers instead of tensors.
+    # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
+    # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
     fixed_cameras = [camera.fixed() for camera in all_cameras]
     views = build_fragments(
@@ -187,8 +187,7 @@ def render(
     if backgrounds.ndim > 3 and len(backgrounds) not in (1, len(views)):
         raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {len(views)}")
     backgrounds = backgrounds.expand(len(views), -1, -1, -1)
-    # Object that computes bounces and shadows
-    # of environment light. None without both.
+    # Object that computes bounces and shadows of environment light. None without both.
     colored_mesh = moved_mesh
     if albedo is not None and bounces:
         colored_mesh = _recolored(moved_mesh, albedo, encoding)
@@ -200,8 +199,8 @@ def render(
         indirect = None
         if transport:
             surface = Surface(moved_mesh, view, settings, given_gloss=gloss)
-            # Function of the albedo and the environment light. It returns
-            # the radiance that shadows and bounces add to the pixels.
+            # Function of the albedo and the environment light. It returns the radiance that shadows
+            # and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
         shaded_view = ShadedView(
             mesh=mesh,

@@ -102,8 +102,8 @@ class ShadedView:
 
     def radiance(self) -> Float[Tensor, "3 P"]:
         """Compute the linear radiance of the P covered pixels, times their coverage."""
-        # Autograd adds up gradients in the reverse of this order,
-        # so another order would change the last bits of gradients.
+        # Autograd adds up gradients in the reverse of this order, so another order would change the
+        # last bits of gradients.
         summands = [
             self._environment_radiance(self.fragments),
             self._indirect_radiance(),
@@ -176,8 +176,7 @@ class ShadedView:
         the covered ones.
         """
         fragments = self.fragments
-        # Each sample becomes a pixel of a finer
-        # image, so that it is shaded alone.
+        # Each sample becomes a pixel of a finer image, so that it is shaded alone.
         finer_fragments = replace(fragments.by_sample(), camera=camera)
         summands = [
             self._environment_radiance(finer_fragments),
@@ -187,8 +186,7 @@ class ShadedView:
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2
-        # Radiance of each sample as a constant,
-        # through which no gradients flow.
+        # Radiance of each sample as a constant, through which no gradients flow.
         sample_radiance = at_samples.detach()
         indirect = self._indirect_radiance()
         if indirect is not None:

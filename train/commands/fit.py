@@ -14,10 +14,10 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_file
-from renderer.fit import fit_photograph
 from renderer.image import decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.files import save_light
+from renderer.photograph import fit_photograph
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack import build_attacked
 from train.data.masks import read_mask
