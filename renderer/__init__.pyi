@@ -1,7 +1,6 @@
 from renderer.camera import Camera as Camera
 from renderer.camera import OrthographicCamera as OrthographicCamera
 from renderer.camera import PerspectiveCamera as PerspectiveCamera
-from renderer.camera import PinholeCamera as PinholeCamera
 from renderer.camera import orbit_cameras as orbit_cameras
 from renderer.errors import InputError as InputError
 from renderer.fit import FittedScene as FittedScene
@@ -20,6 +19,7 @@ from renderer.mesh import normalize as normalize
 from renderer.mesh import subdivide as subdivide
 from renderer.operators.apply import TransferOperator as TransferOperator
 from renderer.operators.stack import TransferOperators as TransferOperators
+from renderer.pinhole import PinholeCamera as PinholeCamera
 from renderer.rendering import light_sphere as light_sphere
 from renderer.rendering import precompute_transfer as precompute_transfer
 from renderer.rendering import render as render

@@ -42,38 +42,31 @@ from renderer.rendering import precompute_transfer, render
 from renderer.solids import sphere
 from renderer.validation import as_tensor
 
-# Polar angles in degrees of the first cameras of a search: the angles between +z and the direction
-# to the camera.
+# Polar angles in degrees of the first cameras of a search.
 FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)
 # Number of first cameras at each polar angle, with equally spaced azimuths.
 FIRST_AZIMUTH_COUNT = 16
-# Width in world units that a first camera shows, before it is changed so that the mesh looks as
-# large as the object in the photograph.
+# Width in world units that a first camera shows, before the mesh gets the size of the object.
 FIRST_WIDTH = 2.0
-# Width and height in pixels of the small images in which cameras are searched. The best cameras are
-# then refined in images of the full size.
+# Pixels per side of the small images in which cameras are searched, before the full size.
 COARSE_SIZE = 32
-# The search refines this many of its first cameras: those whose images differ least from the
-# photograph. It returns at most as many.
+# The search refines this many of its best first cameras, and returns at most as many.
 KEPT_CAMERAS = 3
 # Largest number of steps when one camera is refined with the Gauss-Newton method.
 MAX_STEPS = 20
-# The refinement of a camera ends if a step changes the squared error, or the camera, by less than
-# this fraction.
+# The refinement ends if a step changes the squared error, or the camera, by less than this.
 MIN_GAIN = 1e-3
 # Step sizes of numerical derivatives, times the image size in pixels. The five parameters of a
 # camera are the polar angle and the azimuth in radians, the relative width, and the shifts right
 # and up as fractions of the width.
 DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
-# Smallest angle in radians between a refined camera and +z or -z. Exactly there, the azimuth would
-# have no effect.
+# Smallest angle in radians of a refined camera to the z-axis, where the azimuth has no effect.
 MIN_POLE_ANGLE = 0.02
 # Number of samples along one side of a pixel in renders.
 SAMPLES = 8
 # Two cameras count as the same one if all their axes differ by less than this angle in degrees.
 MIN_CAMERA_ANGLE = 2.0
-# A camera of the search in small images is refined in full size if its squared error is at most
-# this multiple of the smallest squared error.
+# A camera is refined in full size if its squared error is at most this multiple of the smallest.
 MAX_ERROR_RATIO = 3
 # Weight of the smoothness penalty of the light, relative to the squared brightness of the object
 # under uniform light. Without a penalty, light from directions that the object hardly reflects
@@ -82,22 +75,18 @@ SMOOTHNESS_WEIGHT = 1e-6
 # A pixel of the photograph with this linear value or more counts as clipped: the scene may have
 # been brighter than the photograph can show.
 CLIPPED_VALUE = 0.995
-# The light is fitted up to this many times. Each fit ignores the clipped pixels that the last fit
-# made brighter than 1.
+# Largest number of fits of a light. Each ignores clipped pixels that the last made brighter than 1.
 CLIPPING_ROUNDS = 3
 # Smallest radiance of a light in all directions of a grid, as a fraction of its mean radiance. The
 # margin keeps the radiance positive between the directions.
 MIN_RADIANCE_RATIO = 0.01
-# Largest number of iterations of SciPy's `nnls`, per direction of the grid in which the radiance of
-# a light is constrained. Three iterations are usual.
+# Largest number of iterations of `nnls` for each direction of the grid. Three are usual.
 MAX_NNLS_ITERATIONS = 100
-# The radiance of a light is first constrained in every 16th direction of the grid. Directions in
-# which the radiance is negative are added afterwards.
+# The radiance is first constrained in every 16th direction. Negative ones are added afterwards.
 FIRST_DIRECTION_STEP = 16
-# The search for a camera prevents negative radiance of its lights in the directions of the vertices
-# of an icosphere with this number of subdivisions.
+# Radiance is not negative at the vertices of an icosphere with this number of subdivisions: in the
+# search for a camera, and for the light that is returned.
 SEARCH_GRID = 2
-# The same number for the light that is returned.
 FINAL_GRID = 5
 # The object covers a pixel completely if its share of the pixel is larger than this. A limit of
 # 0.99 would be too low: a white background in the other hundredth of the pixel can be brighter than
@@ -110,7 +99,6 @@ HALF_PIXEL = 0.5
 BORDER = 2
 # Smallest number of pixels of an image that the object must cover.
 MIN_COVERED_PIXELS = 16
-# Number of color channels.
 CHANNELS = 3
 
 
@@ -487,22 +475,14 @@ class _Target(NamedTuple):
         )
         return camera_of(found.x)
 
-    def render_linear(
-        self, camera: Camera, light: Float[Tensor, "49 3"]
-    ) -> Float[Tensor, "3 pixels"]:
-        """Render the mesh in front of the gray background, and decode the image to linear
-        values.
-        """
-        image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
-        return decode(image, self.options["encoding"]).flatten(1)
-
     def fit_final_light(self, camera: Camera) -> FittedScene:
         """Fit the light for the final camera, and compute how well the render fits.
 
         Only the pixels that the object covers completely count.
         """
         fit = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
-        rendered = self.render_linear(camera, fit.light)
+        image = render(self.mesh, camera, fit.light, self.size, self.gray, **self.options)
+        rendered = decode(image, self.options["encoding"]).flatten(1)
         is_inside = self.mask > WHOLE_PIXEL
         inside_image = self.image[:, is_inside]
         error = (rendered - self.image)[:, is_inside].norm() / inside_image.norm()
@@ -617,7 +597,11 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)
     mesh_high = points.max(0)
-    mask_low, mask_high = _mask_box(mask)
+    size = len(mask)
+    rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
+    columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())
+    mask_low = np.array([2 * columns[0] / size - 1, 1 - 2 * (rows[-1] + 1) / size])
+    mask_high = np.array([2 * (columns[-1] + 1) / size - 1, 1 - 2 * rows[0] / size])
     mesh_area = float(np.prod(mesh_high - mesh_low))
     mask_area = float(np.prod(mask_high - mask_low))
     # A camera that is wider by this factor shows the mesh smaller by this factor.
@@ -629,15 +613,3 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     if isinstance(framed, PerspectiveCamera):
         framed = replace(framed, distance=framed.distance * factor)
     return framed
-
-
-def _mask_box(mask: Float[Tensor, "size size"]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Find the corners (lower left, upper right; -1 to 1) of the pixels covered by over half."""
-    size = len(mask)
-    rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
-    columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())
-    left = 2 * columns[0] / size - 1
-    right = 2 * (columns[-1] + 1) / size - 1
-    bottom = 1 - 2 * (rows[-1] + 1) / size
-    top = 1 - 2 * rows[0] / size
-    return np.array([left, bottom]), np.array([right, top])

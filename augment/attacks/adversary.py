@@ -15,7 +15,7 @@ from torch import Tensor
 
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
     MAX_SCALE,
     InputError,
@@ -34,6 +34,7 @@ from renderer.light.files import read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
+from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.short_repr import ShortRepr
 from renderer.surface.albedo import with_added_albedo

@@ -13,15 +13,11 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import (
-    OrthographicCamera,
-    PerspectiveCamera,
-    PinholeCamera,
-    orbit_cameras,
-)
+from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.operators.rays import Surface
+from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import choose

@@ -11,7 +11,7 @@ import trimesh
 from oracles import mesh_of
 from torch import Tensor
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera, PinholeCamera
+from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
@@ -25,6 +25,7 @@ from renderer.mitsuba_scene import (
 )
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
+from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.vectors import unit_vectors

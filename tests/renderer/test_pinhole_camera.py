@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import renderer
-from renderer.camera import PinholeCamera
 from renderer.errors import InputError
 from renderer.operators.rays import Surface
+from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizer import choose

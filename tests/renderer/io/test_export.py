@@ -15,16 +15,12 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from renderer.camera import (
-    OrthographicCamera,
-    PerspectiveCamera,
-    PinholeCamera,
-    orbit_cameras,
-)
+from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh
+from renderer.pinhole import PinholeCamera
 from renderer.solids import solid
 
 EPS32 = np.finfo(np.float32).eps

@@ -12,10 +12,11 @@ from oracles import draw_uniform, named_mesh
 from torch import Tensor
 
 import renderer
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.mesh import concatenate
+from renderer.pinhole import PinholeCamera
 from renderer.solids import SOLIDS
 
 FAR = OrthographicCamera(63.0, 22.9, 2.8)
