@@ -424,7 +424,7 @@ def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier
     return Classifier(*call_python(name), f"python:{name}")
 
 
-# Sources by their names. The module `train.saved_networks` adds "run:", for networks that this
+# Sources by their names. The module `train.checkpoints` adds "run:", for networks that this
 # project trains.
 SOURCES = {
     "efficientnet_lite0": _efficientnet_lite(0),

@@ -38,8 +38,8 @@ from augment.augmentation_settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility.rasterizer import choose
+from train.checkpoints import load_run
 from train.device import GraphedNetwork, MixedPrecision, choose_precision, set_deterministic
-from train.saved_networks import load_run
 
 NETWORK = "pretrained/none"
 MESH_COUNT = 2

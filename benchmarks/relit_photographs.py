@@ -23,9 +23,9 @@ import norm_balls as nb
 from augment.classifier import Classifier
 from augment.network import compute_outputs
 from benchmarks.many_objects import ScoredGroup, mean_with_interval
+from train.checkpoints import load_network
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.tables import Estimate, format_interval
-from train.saved_networks import load_network
 
 # Photographs per pass.
 BATCH = 32

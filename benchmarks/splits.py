@@ -41,6 +41,7 @@ from augment.plain_networks import NetworkFacts
 from augment.sources import build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
+from train.checkpoints import is_classifier, load_network, load_run
 from train.command_settings import LabSettings
 from train.data.cache import content_hash
 from train.data.photographs import TABLE
@@ -53,7 +54,6 @@ from train.results.predictions import PREDICTIONS, Prediction, write_predictions
 from train.results.scoring import Predictor
 from train.results.store import RunSummary, summarize
 from train.results.tables import Estimate, Table, format_interval
-from train.saved_networks import is_classifier, load_network, load_run
 from train.training.loop import evaluate
 
 ROOT = Path(__file__).parent.parent

@@ -1,6 +1,7 @@
 import logging
 
 from train.auditing.report import AuditReport as AuditReport
+from train.checkpoints import load_run as load_run
 from train.command_settings import AuditSettings as AuditSettings
 from train.command_settings import EvaluateSettings as EvaluateSettings
 from train.command_settings import LabSettings as LabSettings
@@ -9,7 +10,6 @@ from train.commands.evaluate import evaluate as evaluate
 from train.commands.harden import harden as harden
 from train.publication import load as load
 from train.publication import publish as publish
-from train.saved_networks import load_run as load_run
 from train.settings import DataSettings as DataSettings
 from train.settings import EvaluationSettings as EvaluationSettings
 from train.settings import ExperimentSettings as ExperimentSettings

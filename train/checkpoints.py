@@ -1,26 +1,54 @@
-"""Checkpoints. They are written atomically with a hash of their content, and read without pickle.
+"""Files of networks: checkpoints, the network that a run selected, published and exported ones.
 
-A file holds a dictionary of plain values and tensors. best.pt has `model` (the network's state
+Checkpoints are written atomically with a hash of their content, and read without pickle. A
+checkpoint holds a dictionary of plain values and tensors. best.pt has `model` (the network's state
 dict), `architecture` (what rebuilds the network, see `train.networks.describe`) and `epoch`.
 last.pt has all of `train.training.loop.Trainer.state_dict`.
 """
 
 import io
-from collections.abc import Mapping
+import json
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
-from torch import Tensor, cuda
+from safetensors import safe_open
+from torch import Tensor, cuda, nn
 
-from renderer.errors import InputError, require_file
+from augment.classifier import Classifier, OperatingPoint
+from augment.files import is_network_file
+from augment.network import unwrapped, with_normalized_light
+from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
+from augment.settings import NormalizeLight
+from augment.sources import SOURCES, load_classifier
+from renderer.errors import InputError, require_file, single_line
 from renderer.io.files import atomic_write
+from renderer.validation import as_path, require_kind
+from train.command_settings import ClassifierSettings
 from train.data.cache import content_hash
-from train.networks import VERSION
-from train.run_folder import LAST, PREVIOUS
+from train.networks import PYTHON, VERSION, WIDERESNET, build_network
+from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
+from train.settings import published
+from train.user_errors import keyed
 
 # Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
+# A name of a classifier that begins with this text names the folder of a training run.
+RUN = "run:"
+# Entries in the file of a published network, in addition to the weights.
+PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
+# Entries in the description of a network that are no arguments of `build_network`.
+FACTS = ("version", "encoding", "validation")
+# Entry in the description of a network that normalizes the light of images, with its settings.
+NORMALIZE_LIGHT = "normalize_light"
+# If a network normalizes the light of images, the names of its weights begin with this text.
+LIGHT_PREFIX = "network."
+# Largest number of characters of a reason that an error message quotes.
+LONGEST_REASON = 300
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
@@ -107,3 +135,233 @@ def restore_random_state(state: Mapping[str, Any]) -> None:
     torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
         cuda.set_rng_state(values, device)
+
+
+def load_network(
+    name: str,
+    weights: str | Path | None = None,
+    classes: Sequence[str] | str | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    normalize_light: NormalizeLight = None,
+    trust_code: bool = False,
+) -> Classifier:
+    """Load a classifier by its name: the network of a training run, or any other classifier.
+
+    The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
+    its own weights, classes, size and normalization, so these must then be None.
+    """
+    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    folder = _find_run(Path(name))
+    if folder is not None:
+        raise InputError(
+            f"name={name} is a training run or a file of one: give name={RUN}{folder} instead",
+            "name",
+        )
+    if name.startswith(RUN):
+        require_no_facts(name, as_facts(classes, size, normalization))
+        # Error messages about the argument `run` begin with `name` instead, the argument of
+        # this function.
+        with keyed(run="name"):
+            classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
+        return classifier.normalizing_light(normalize_light)
+    return load_classifier(name, weights, classes, size, normalization, normalize_light, trust_code)
+
+
+def _find_run(path: Path) -> Path | None:
+    """Return the folder of a training run if a path is this folder, or its file weights.pt."""
+    folder = path.parent if path.name == WEIGHTS else path
+    return folder if (folder / BEST).is_file() else None
+
+
+def load_chosen(settings: ClassifierSettings) -> Classifier:
+    """Load the classifier that the settings of a command choose."""
+    return load_network(
+        str(settings.network),
+        settings.weights,
+        settings.classes,
+        settings.size,
+        settings.normalization,
+        settings.normalize_light,
+        settings.trust,
+    )
+
+
+def load_run(
+    run: str | Path,
+    weights: str | Path | None = None,
+    model: str | None = None,
+    trust_code: bool = False,
+) -> Classifier:
+    """Load the network that a training run selected, or a published network.
+
+    Args:
+        run: Folder of the run, folder below pretrained/, or the file of the network in it.
+        weights: Must be None, because a run has its own weights.
+        model: "python:package.module:function" if this function of the user built the network.
+            The file of the network names the function, too, but code from a file is never run
+            unless the user names it. None for any other network.
+        trust_code: Whether the run may have hardened a network in a file of TorchScript or
+            `torch.export`, which is then loaded again, and can run any code.
+
+    Returns:
+        The network.
+
+    Raises:
+        InputError: If there is no such network, if `weights` is not None, or if `model` or
+            `trust_code` is missing.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> nb.load_run("pretrained/best").size
+        32
+    """
+    if weights is not None:
+        raise InputError(
+            f"weights={weights} cannot replace the weights of {RUN}{run}: leave weights out",
+            "weights",
+        )
+    require_kind("model", model, str | None, "python:package.module:function, or None")
+    path, state = load_selected(as_path("run", run))
+    # Arguments of `build_network`, and entries for the wrapper around the network.
+    shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
+    name = str(shape.get("name", WIDERESNET))
+    if name.startswith(PYTHON) and name != model:
+        raise InputError(
+            f"the network in {path} is built by {name}: "
+            f"give model={name} to run that code or, "
+            f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights",
+        )
+    with checks_architecture(path):
+        size = int(shape.pop("size"))
+        classes = tuple(map(str, shape.pop("classes")))
+        light = shape.pop(NORMALIZE_LIGHT, None)
+        built = build_network(classes, size, trust_code=trust_code, **shape)
+        network = with_normalized_light(built, light)
+        network.load_state_dict(state["model"])
+        classifier = Classifier(network, size, classes, f"{RUN}{run}")
+        classifier.operating_points = _operating_points(state)
+        for point in classifier.operating_points:
+            # This call raises InputError if the network lacks the class.
+            classifier.label(point.label)
+        say_inputs_of(classifier)
+        return classifier
+
+
+def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
+    """Read the operating points (thresholds on the log-odds) that are stored with a network."""
+    stored = state.get("operating_point", [])
+    if not isinstance(stored, list):
+        stored = [stored]
+    return [OperatingPoint(**values) for values in stored]
+
+
+@contextmanager
+def checks_architecture(path: Path) -> Iterator[None]:
+    """Raise InputError if the block cannot load weights into a network of another architecture."""
+    try:
+        yield
+    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
+        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
+        raise InputError(
+            f"checkpoint {path} is from another architecture ({reason}): "
+            "use the model settings of the training run that wrote the checkpoint",
+        ) from error
+
+
+def is_classifier(name: str) -> bool:
+    """Return whether a name stands for a classifier that no training run has made."""
+    source, colon, _ = name.partition(":")
+    return source + colon in SOURCES or is_network_file(name)
+
+
+def selected_file(run: Path) -> Path | None:
+    """Find the file of the network that a training run selected, or of a published network.
+
+    None if there is none. `run` can also be the file itself, or a folder below pretrained/.
+    """
+    found = published(run)
+    for file in (found, found / BEST, found / PUBLISHED):
+        if file.is_file():
+            return file
+    return None
+
+
+def is_state_dict(path: Path) -> bool:
+    """Return whether a file has a state dict: weights without a description of their network.
+
+    `torch.save(network.state_dict(), path)` writes such a file.
+    """
+    if not path.is_file() or path.suffix == ".safetensors":
+        return False
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:  # `torch.load` raises errors of many types for other files.
+        return False
+    if not isinstance(content, dict):
+        return False
+    return all(isinstance(value, Tensor) for value in content.values())
+
+
+def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Read the file of the network that a training run selected, or of a published network."""
+    path = selected_file(run)
+    if path is None:
+        raise InputError(
+            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote",
+            "run",
+        )
+    if path.suffix == ".safetensors":
+        return path, _load_published(path)
+    return path, load(path)
+
+
+def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the weights in the file of a network, without a wrapper that normalizes light."""
+    weights: dict[str, Tensor] = state["model"]
+    if NORMALIZE_LIGHT not in state["architecture"]:
+        return weights
+    return {name.removeprefix(LIGHT_PREFIX): value for name, value in weights.items()}
+
+
+def write_published(path: Path, state: Mapping[str, Any]) -> None:
+    """Write the network of a checkpoint in half precision, as a file for other users.
+
+    The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
+    """
+    metadata = {}
+    for key in PUBLISHED_FACTS:
+        if key in state:
+            metadata[key] = json.dumps(state[key], ensure_ascii=False)
+    weights = {}
+    for name, value in state["model"].items():
+        weights[name] = value.half().contiguous() if value.is_floating_point() else value
+    atomic_write(path, safetensors.torch.save(weights, metadata), durable=True)
+
+
+def _load_published(path: Path) -> dict[str, Any]:
+    """Read a file of `write_published`. The weights, in single precision, are in "model"."""
+    weights: dict[str, Tensor] = {}
+    try:
+        with safe_open(path, "pt") as file:
+            facts = {name: json.loads(text) for name, text in file.metadata().items()}
+            for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
+                value = file.get_tensor(name)
+                weights[name] = value.float() if value.is_floating_point() else value
+    except Exception as error:
+        # safetensors and json raise errors of many types for a damaged file.
+        raise InputError(
+            f"checkpoint {path} is damaged or has no architecture: use another checkpoint",
+        ) from error
+    return checked({**facts, "model": weights}, path)
+
+
+def export(path: Path, network: nn.Module) -> None:
+    """Write the trained weights of a classifier of the user, so that the user can load them.
+
+    The weights have the names of the user's own network, without wrappers of this library.
+    """
+    state = unwrapped(network).state_dict()
+    content = io.BytesIO()
+    torch.save({name: value.cpu() for name, value in state.items()}, content)
+    atomic_write(path, content.getbuffer(), durable=True)

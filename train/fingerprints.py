@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from train.checkpoints import selected_file
 from train.data.photographs import visible_files
 from train.networks import PYTHON
-from train.saved_networks import selected_file
 from train.settings import dotted, published
 
 # The files of a folder with more bytes are not read. Their sizes and times count instead.

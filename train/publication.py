@@ -8,6 +8,7 @@ from typing import Any
 from augment.classifier import Classifier, OperatingPoint
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
+from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
 from train.networks import PYTHON
 from train.results.metrics import METRICS, Metrics
@@ -17,7 +18,6 @@ from train.results.store import summarize, trained_labels
 from train.results.tables import Estimate
 from train.run_config import mapped
 from train.run_folder import PUBLISHED
-from train.saved_networks import load_run, load_selected, write_published
 from train.settings import published
 from train.user_errors import keyed, writable_folder
 

@@ -27,7 +27,7 @@ SCHEDULES = ("step", "cosine", "one_cycle")
 FLIPS = ("random", "alternating")
 # Choices of train.augmentation that are transforms of torchvision.
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
-# Augmentation by the light of a projector; see `train.training.relit_batches`.
+# Augmentation by the light of a projector; see `train.training.augmentations`.
 RELIGHT = "relight"
 # Choices of train.augmentation.
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)

@@ -27,7 +27,7 @@ from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.visibility.rasterizer import choose
-from train.saved_networks import load_network
+from train.checkpoints import load_network
 
 # Meshes whose shape is attacked are subdivided until they have more vertices
 # (the paper's Section 4).

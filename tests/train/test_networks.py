@@ -9,10 +9,9 @@ from torch import Tensor, nn
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
-from train.checkpoints import save
+from train.checkpoints import load_network, load_run, load_selected, save, write_published
 from train.networks import Dropout, WideResNet, build_network, describe
 from train.run_folder import BEST, PUBLISHED
-from train.saved_networks import load_network, load_run, load_selected, write_published
 from train.training.initial import Initial
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"

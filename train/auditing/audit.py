@@ -48,6 +48,7 @@ from train.auditing.relit import (
     write_photographs_page,
 )
 from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
+from train.checkpoints import load_chosen, load_network
 from train.class_names import class_name, class_of_meshes, require_others, with_class_name
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import find_photographs, find_unlabeled
@@ -58,7 +59,6 @@ from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer
-from train.saved_networks import load_chosen, load_network
 from train.settings import OTHER_PREFIX, published, read_objects, simplified, solid_name
 from train.system import command_line
 from train.user_errors import keyed, writable_folder

@@ -41,6 +41,7 @@ from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility.rasterizer import Rasterizer
+from train.checkpoints import load_chosen, load_network
 from train.class_names import class_name, class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.device import choose_device, choose_rasterizer
@@ -59,7 +60,6 @@ from train.results.relit import MODELED, RELIT, attack_folder
 from train.results.tables import Table
 from train.run_config import write_config
 from train.run_folder import sole_writer
-from train.saved_networks import load_chosen, load_network
 from train.settings import published, read_object, read_objects
 from train.system import command_line, is_verbose, shortened
 from train.user_errors import keyed, keys_of, writable_folder

@@ -19,6 +19,7 @@ from augment.plain_networks import (
 )
 from augment.settings import NormalizeLight
 from renderer.validation import as_folder
+from train.checkpoints import load_chosen, load_run
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.photographs import choose_labels, class_folders, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
@@ -27,7 +28,6 @@ from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
 from train.results.store import trained_labels
 from train.run_folder import sole_writer
-from train.saved_networks import load_chosen, load_run
 from train.settings import label_names, published
 from train.system import is_verbose
 from train.user_errors import keyed, writable_folder

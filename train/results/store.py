@@ -253,7 +253,7 @@ def _read(folder: Path) -> RunSummary | None:
         return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
         # This import is here because it imports torch, which other results do not need.
-        from train.saved_networks import load_selected
+        from train.checkpoints import load_selected
 
         stored = load_selected(folder)[1].get("scores", {})
         scores = {}

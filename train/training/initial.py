@@ -15,14 +15,7 @@ from augment.sources import load_source
 from renderer.errors import InputError
 from renderer.validation import as_path
 from train import console
-from train.class_names import (
-    class_of_name,
-    name_of_mesh,
-    with_class_names,
-)
-from train.data.sets import HELD_OUT, DataSet
-from train.networks import CLASSIFIER, PYTHON, describe
-from train.saved_networks import (
+from train.checkpoints import (
     NORMALIZE_LIGHT,
     RUN,
     checks_architecture,
@@ -31,6 +24,13 @@ from train.saved_networks import (
     load_selected,
     plain_weights,
 )
+from train.class_names import (
+    class_of_name,
+    name_of_mesh,
+    with_class_names,
+)
+from train.data.sets import HELD_OUT, DataSet
+from train.networks import CLASSIFIER, PYTHON, describe
 from train.settings import ExperimentSettings, label_names
 from train.train_settings import WIDERESNET
 from train.user_errors import keyed

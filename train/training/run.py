@@ -24,6 +24,7 @@ from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
+from train.checkpoints import NORMALIZE_LIGHT, export
 from train.data.photographs import choose_labels, find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import (
@@ -41,7 +42,6 @@ from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
-from train.saved_networks import NORMALIZE_LIGHT, export
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.initial import (

@@ -19,11 +19,10 @@ from train.data.batches import Batch
 from train.device import GraphedNetwork, MixedPrecision, compiles
 from train.processes import wrap_ddp
 from train.train_settings import RELIGHT, TrainSettings
+from train.training.augmentations import Baseline, RelitBatches
 from train.training.averages import Averages
-from train.training.baselines import Baseline
 from train.training.losses import TrainingLoss
 from train.training.recipe import build_optimizer, learning_rate
-from train.training.relit_batches import RelitBatches
 from train.training.shared_teacher import share_layers
 from train.user_errors import keyed
 

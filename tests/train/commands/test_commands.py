@@ -22,13 +22,13 @@ from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network
 from train import console
+from train.checkpoints import load_run
 from train.cli import USER_ERROR
 from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
 from train.results.store import trained_labels
 from train.run_folder import LOCK, sole_writer
-from train.saved_networks import load_run
 
 EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]

@@ -29,8 +29,8 @@ from tests.train.own_networks import (
 )
 from train.__main__ import main as train_command
 from train.auditing import audit
+from train.checkpoints import load_run
 from train.networks import build_network
-from train.saved_networks import load_run
 from train.training.initial import load_initial
 from train.training.run import _network_shape
 

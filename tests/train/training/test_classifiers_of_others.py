@@ -18,8 +18,8 @@ from augment.sources import load_classifier
 from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command
+from train.checkpoints import load_run
 from train.run_folder import read_metrics
-from train.saved_networks import load_run
 from train.training.inputs import load_data
 
 NAME = "shufflenet_v2_x0_5"

@@ -13,17 +13,16 @@ from augment.random_streams import generator
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.checkpoints import load
+from train.checkpoints import load, load_run
 from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
-from train.saved_networks import load_run
 from train.settings import PHOTOGRAPHS_FIRST
 from train.train_settings import TrainSettings
 from train.training import run
+from train.training.augmentations import RelitBatches
 from train.training.averages import FACTORS, INTERPOLATION, mix
 from train.training.losses import TrainingLoss
-from train.training.relit_batches import RelitBatches
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32

@@ -15,7 +15,7 @@ from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
 from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
-from train.training.baselines import PGD, Baseline
+from train.training.augmentations import PGD, Baseline
 from train.training.losses import TrainingLoss
 from train.training.recipe import (
     SCHEDULE_FACTORS,

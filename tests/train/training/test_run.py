@@ -23,6 +23,7 @@ from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run, loaded_run
 from train import checkpoints, run_folder
+from train.checkpoints import load_run
 from train.command_settings import LabSettings
 from train.data import batches
 from train.data.cache import content_hash
@@ -31,7 +32,6 @@ from train.processes import Interrupted
 from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
-from train.saved_networks import load_run
 from train.training import loop
 from train.training.initial import choose_validation, load_initial
 from train.training.inputs import describe_test_images, load_data
