@@ -88,12 +88,9 @@ class _CameraEffects:
     """Function that applies the effects of a camera to the images of E examples.
 
     Attributes:
-        gains: Factor of the linear light of each pixel, shape
-            (E, 3, size, size).
-        blurs: Standard deviation of the blur of each example in pixels,
-            shape (E,).
-        noises: Noise that is added to each pixel value, shape
-            (E, 3, size, size).
+        gains: Factor of the linear light of each pixel.
+        blurs: Standard deviation of the blur of each example in pixels.
+        noises: Noise that is added to each pixel value.
         encoding: Encoding of the images, such as "srgb".
     """
 

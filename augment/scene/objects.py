@@ -361,9 +361,8 @@ class FaceMaterials:
     """Specular materials of the F faces of a mesh: an object, its props and its table.
 
     Attributes:
-        face_gloss: Roughness, metallic and specular factor of each face, shape (F, 3).
-        object_mask: Mask of the faces that belong to the object itself,
-            shape (F,).
+        face_gloss: Roughness, metallic and specular factor of each face.
+        object_mask: Mask of the faces that belong to the object itself.
     """
 
     face_gloss: Float[Tensor, "F 3"]

@@ -50,11 +50,10 @@ class Layer(NamedTuple):
     """Radiance of B images of a batch at the P pixels that their objects may cover.
 
     Attributes:
-        rows: Indices of the B images in the batch: a slice, or a tensor (B,) on
-            the device of the radiance.
-        pixels: Row-major index of each of the P pixels in an image, shape (P,).
-        composite: Linear radiance of the objects in front of the backgrounds,
-            shape (B, 3, P).
+        rows: Indices of the B images in the batch: a slice, or a tensor (B,) on the device of the
+            radiance.
+        pixels: Row-major index of each of the P pixels in an image.
+        composite: Linear radiance of the objects in front of the backgrounds.
     """
 
     rows: Rows
@@ -69,11 +68,10 @@ class _BuiltStack(NamedTuple):
 
     Attributes:
         operators: The stack, which covers P pixels of an image.
-        image_to_stack_image: For each of the N images of the scene, its index
-            among the M images of this stack, shape (N,). Images of other stacks
-            have arbitrary values.
-        background_terms: Linear radiance that the backgrounds add to the M
-            images at the P pixels, in C = 1 or 3 channels, shape (M, C, P).
+        image_to_stack_image: For each of the N images of the scene, its index among the M images of
+            this stack. Images of other stacks have arbitrary values.
+        background_terms: Linear radiance that the backgrounds add to the M images at the P pixels,
+            in C = 1 or 3 channels.
     """
 
     operators: OperatorStack
@@ -92,11 +90,11 @@ class OperatorRenderer:
     Attributes:
         objects: The objects.
         views: Index of the object, and the camera, for each of the N images.
-        image_to_background: Index of the background of each image, shape (N,).
-        backgrounds: Image values of B backgrounds, shape (B, 3 or 1, size²).
+        image_to_background: Index of the background of each image.
+        backgrounds: Image values of B backgrounds, in 1 or 3 channels.
         settings: Settings of the images.
-        build: Function that builds the operators of several cameras. Its
-            arguments are a mesh, cameras and `albedo_scale`.
+        build: Function that builds the operators of several cameras. Its arguments are a mesh,
+            cameras and `albedo_scale`.
         attack_bytes: Bytes that an attack needs in addition to the operators.
     """
 
@@ -219,10 +217,10 @@ class FrozenView(NamedTuple):
     """What shadows and bounces of light add to one view of a mesh.
 
     Attributes:
-        added_transfer: Radiance that is added to each channel of each pixel, for
-            each of the K harmonic coefficients of the light, shape (3, K, size²).
-        albedo_sums: Sum of the albedo of the samples of each pixel with which
-            `added_transfer` was computed, shape (3, size²).
+        added_transfer: Radiance that is added to each channel of each pixel, for each of the K
+            harmonic coefficients of the light.
+        albedo_sums: Sum of the albedo of the samples of each pixel with which `added_transfer` was
+            computed.
     """
 
     added_transfer: Float[Tensor, "3 K size²"]
@@ -513,7 +511,7 @@ class _IndirectLight:
         object_index: Index of the object.
         camera: The camera.
         fragments: The S samples of the shape that the camera sees, in P pixels.
-        positions: Vertices of the shape, shape (V, 3).
+        positions: Vertices of the shape.
         is_kept: Whether the view of this camera is kept for further calls.
     """
 

@@ -72,8 +72,8 @@ class _SeenPoints:
     """The points of table and wall that a camera sees, S points in each of P pixels.
 
     Attributes:
-        points: Positions in world units, shape (S, P, 3).
-        is_on_wall: Mask of the points on the wall, shape (S, P). The others are on the table.
+        points: Positions in world units.
+        is_on_wall: Mask of the points on the wall. The others are on the table.
     """
 
     points: Float[Tensor, "S P 3"]

@@ -253,11 +253,10 @@ class _DrawnLights:
     """The random lighting of E examples.
 
     Attributes:
-        environment: RGB coefficients of the environment lighting in K harmonics,
-            shape (E, K, 3).
-        directions: Unit vector from each object towards its directional light,
-            shape (E, 3). Zero stands for no directional light.
-        local: RGB coefficients of projector and lamps, shape (E, L, 3).
+        environment: RGB coefficients of the environment lighting in K harmonics.
+        directions: Unit vector from each object towards its directional light. Zero stands for no
+            directional light.
+        local: RGB coefficients of projector and lamps.
     """
 
     environment: Float[Tensor, "E K 3"]
