@@ -122,7 +122,7 @@ def test_a_laboratory_of_other_meshes_needs_a_label():
 
 
 MISTAKES = [
-    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe"),
+    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable: "),
     ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
     ([*EVALUATE, "label=[]"], "label=[]"),
     ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear'"),
