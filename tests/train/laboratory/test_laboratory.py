@@ -116,14 +116,6 @@ def test_the_same_settings_write_the_same_bytes(laboratory, tmp_path):
         assert (tmp_path / path).read_bytes() == (laboratory / path).read_bytes()
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"exposure": 4.0}], ids=str)
-def test_another_seed_or_exposure_writes_other_photographs(laboratory, tmp_path, change):
-    lab.write_laboratory(settings(tmp_path, **change))
-    for row in rows(laboratory):
-        path = row["path"]
-        assert (tmp_path / path).read_bytes() != (laboratory / path).read_bytes()
-
-
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
     """Show the same mesh under both labels: the photographs of a setup are the same."""
     meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]

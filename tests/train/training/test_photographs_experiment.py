@@ -13,7 +13,7 @@ from augment.random_streams import generator
 from renderer.image import to_unit
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.checkpoints import load, load_run
+from train.checkpoints import load
 from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
@@ -21,7 +21,7 @@ from train.settings import PHOTOGRAPHS_FIRST
 from train.train_settings import TrainSettings
 from train.training import run
 from train.training.augmentations import RelitBatches
-from train.training.averages import FACTORS, INTERPOLATION, mix
+from train.training.averages import FACTORS, INTERPOLATION
 from train.training.losses import TrainingLoss
 
 NAME = "shufflenet_v2_x0_5"
@@ -119,19 +119,6 @@ def test_statistics_of_batches_stay_those_of_the_original(finished, weights):
     for name, value in begin.items():
         if "running" in name:
             assert torch.equal(value, last[f"network.{name}"])
-
-
-def test_the_saved_network_loads_as_others_do(finished, photographs):
-    folder, _ = finished
-    classifier = load_run(folder)
-    exported = get_model(NAME)
-    exported.load_state_dict(torch.load(folder / "weights.pt"))
-    images = torch.rand(2, 3, SIZE, SIZE)
-    mean = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
-    std = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
-    with torch.no_grad():
-        expected = exported.eval()((images - mean) / std)
-        torch.testing.assert_close(classifier(images), expected, atol=1e-3, rtol=1e-3)
 
 
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, tmp_path):
@@ -266,12 +253,3 @@ def test_gradient_steps_lower_the_confidence_of_relit_batches():
         source = network(to_unit(images)).argmax(1, keepdim=True)
         confidence[steps] = network(to_unit(relit)).softmax(1).gather(1, source).mean()
     assert confidence[3] < confidence[0]
-
-
-def test_mixed_weights_are_the_ends_at_0_and_1():
-    begin = {"weight": torch.tensor([0.0, 1.0]), "count": torch.tensor(1)}
-    end = {"weight": torch.tensor([1.0, 5.0]), "count": torch.tensor(7)}
-    assert torch.equal(mix(begin, end, 0.0)["weight"], begin["weight"])
-    assert torch.equal(mix(begin, end, 1.0)["weight"], end["weight"])
-    assert torch.equal(mix(begin, end, 0.25)["weight"], torch.tensor([0.25, 2.0]))
-    assert mix(begin, end, 0.25)["count"] == 7

@@ -290,13 +290,6 @@ def test_the_norm_of_the_features_is_that_of_the_pooled_image(images):
     assert feature_norm(Scaled(3.0), units) == pytest.approx(3 * expected, rel=1e-6)
 
 
-def test_a_convolution_as_the_last_layer_has_the_norm_of_the_mean_over_positions(images):
-    units = to_unit(images)
-    network = nn.Sequential(nn.Conv2d(3, 4, 1), nn.AdaptiveAvgPool2d(1), nn.Flatten())
-    expected = units.mean((2, 3)).square().sum(1).mean().sqrt().item()
-    assert feature_norm(network, units) == pytest.approx(expected, rel=1e-6)
-
-
 @pytest.mark.parametrize("factor", [0.1, 30.0])
 def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_layer(images, factor):
     units = to_unit(images)
