@@ -23,14 +23,16 @@ from augment.network import (
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer.errors import (
     InputError,
+    as_list,
+    as_tensor,
     composed,
     describe,
     is_out_of_memory,
-    require_range,
+    require_kind,
+    require_whole,
     single_line,
 )
 from renderer.settings import MAX_SIZE
-from renderer.validation import as_list, as_tensor, require_kind, require_whole
 
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
@@ -192,8 +194,7 @@ class Classifier(LogitNetwork):
         require_kind(
             "network", network, Callable, "a torch.nn.Module, or a function from images to logits"
         )
-        require_whole(f"classifier {name}: size", size)
-        require_range(f"classifier {name}: size", size, 1, MAX_SIZE)
+        require_whole(f"classifier {name}: size", size, 1, MAX_SIZE)
         names = as_class_names(f"classifier {name}: classes", classes)
         super().__init__(network, f"classifier {name}", len(names))
         self.network = with_normalized_light(self.network, normalize_light)

@@ -40,10 +40,16 @@ from augment.projected_light import (
     require_photographs,
 )
 from augment.random_streams import generator
-from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_choice
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    MAX_SCALE,
+    InputError,
+    require_choice,
+    require_kind,
+    require_whole,
+)
 from renderer.image import decode, to_bytes, to_unit
 from renderer.short_repr import ShortRepr
-from renderer.validation import require_kind, require_seed
 
 # A photograph is lit by a projector that shows a picture, the slide. These are the names of three
 # lights: the slide as it is, the slide multiplied by the best of several random factors, and the
@@ -263,7 +269,7 @@ def attack_photographs(
     """
     require_photographs("photographs", photographs)
     require_kind("settings", settings, RelightingSettings | None, "RelightingSettings(...) or None")
-    require_seed("seed", seed)
+    require_whole("seed", seed)
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = photographs.shape[-1]

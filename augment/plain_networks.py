@@ -21,9 +21,16 @@ from augment.classifier import Classifier, LogitNetwork, as_class_names
 from augment.distributed import rank
 from augment.network import ChannelNormalization, Function, Network
 from augment.settings import NormalizeLight
-from renderer.errors import InputError, as_device, describe, require_file, require_range
+from renderer.errors import (
+    InputError,
+    as_device,
+    as_list,
+    describe,
+    require_file,
+    require_kind,
+    require_whole,
+)
 from renderer.settings import MAX_SIZE
-from renderer.validation import as_list, require_kind, require_whole
 
 # normalization="imagenet" stands for the following mean and standard deviation of red, green and
 # blue, which most networks use that were trained on ImageNet.
@@ -87,8 +94,7 @@ def as_facts(
         classes = [line.strip() for line in lines if line.strip()]
     names = None if classes is None else as_class_names("classes", classes)
     if size is not None:
-        require_whole("size", size)
-        require_range("size", size, 1, MAX_SIZE)
+        require_whole("size", size, 1, MAX_SIZE)
     if normalization is not None:
         mean_and_std(normalization)
     return NetworkFacts(names, size, normalization)

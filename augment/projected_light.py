@@ -22,9 +22,8 @@ from torch import Tensor
 
 from augment.random_streams import generator
 from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
-from renderer.errors import InputError
+from renderer.errors import InputError, require_kind, require_whole
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
-from renderer.validation import require_kind, require_seed
 
 # A random smooth surface interpolates random heights at a grid of this number of points per side.
 SURFACE_NODES = 4
@@ -204,7 +203,7 @@ def relight_photographs(
     require_photographs("photographs", photographs)
     if slides is not None:
         require_photographs("slides", slides)
-    require_seed("seed", seed)
+    require_whole("seed", seed)
     count, _, size, _ = photographs.shape
     light = draw_projected_light(count, size, generator(seed, "relight"), slides)
     relit = light.to(photographs.device).apply(to_unit(photographs))

@@ -32,16 +32,16 @@ from augment.scene.build import MeshSource, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from renderer.errors import InputError, describe
+from renderer.errors import (
+    InputError,
+    as_integers,
+    describe,
+    require_kind,
+    require_whole,
+)
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
-from renderer.validation import (
-    as_integers,
-    require_kind,
-    require_seed,
-    require_whole,
-)
 
 # Largest number of successfully attacked renders that are kept for figures each time that the
 # renders of a training run are made.
@@ -143,7 +143,7 @@ class AugmentationService:
         """Check the arguments, and raise the degree of the lighting if the settings need it."""
         expected = "nb.AugmentationSettings(...)"
         require_kind("settings", self.settings, AugmentationSettings, expected)
-        require_seed("seed", self.seed)
+        require_whole("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
         require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
@@ -219,7 +219,7 @@ class AugmentationService:
         """
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
-        require_seed("seed", seed)
+        require_whole("seed", seed)
         paper: dict[str, Any] = {
             "views": 10,
             "samples": 8,
@@ -262,7 +262,7 @@ class AugmentationService:
             InputError: If the network fails, or has no logit for a label.
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
-        require_seed("number", number)
+        require_whole("number", number)
         model = LogitNetwork(model, "model")
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)

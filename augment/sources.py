@@ -32,8 +32,7 @@ from augment.plain_networks import (
 )
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
-from renderer.errors import InputError, single_line
-from renderer.validation import as_path, require_flag, require_kind
+from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 
 if TYPE_CHECKING:
     # Importing torchvision takes a second. Functions import it when they need it.

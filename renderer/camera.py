@@ -20,9 +20,9 @@ from renderer.errors import (
     describe,
     is_number,
     require_range,
+    require_whole,
 )
 from renderer.settings import MAX_VIEWS
-from renderer.validation import require_whole
 
 # Default of a camera's `clip_range` in world units. A camera then shows all of a normalized mesh,
 # whose vertices are at most √3 from the origin.
@@ -483,8 +483,7 @@ def orbit_cameras(
     >>> nb.orbit_cameras(views=1, width=2.0, fov=30.0)[0].distance.__round__(3)
     3.732
     """
-    require_whole("views", views)
-    require_range("views", views, 1, MAX_VIEWS)
+    require_whole("views", views, 1, MAX_VIEWS)
     width = _as_scalar("width", width)
     polar = _as_scalar("polar", polar)
     azimuth = _as_scalar("azimuth", azimuth)

@@ -1,9 +1,9 @@
-"""Error class for mistakes that a user can fix, and checks of numbers, names, files and tensors.
+"""Error class for mistakes that a user can fix, and checks and conversions of arguments.
 
-`renderer.validation` converts arguments and checks their types.
-
-Commands check their settings with this module before they import torch and
-NumPy. Functions that need torch therefore import it themselves.
+Errors are one sentence that begins with the name of the argument, and says what
+was given and what is expected. Commands check their settings with this module
+before they import torch and NumPy. Functions that need them therefore import
+them themselves.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from __future__ import annotations
 import os
 import reprlib
 import unicodedata
-from collections.abc import Collection, Set
+from collections.abc import Collection, Iterable, Mapping, Set
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
     from torch import Tensor
 
@@ -26,6 +27,14 @@ MAX_MAGNITUDE = 1e12
 # Largest factor for lights, albedo and lengths in settings.
 # Products of two such factors stay below MAX_MAGNITUDE.
 MAX_SCALE = 1e5
+# Largest seed of random numbers, which is also the largest of other whole numbers.
+MAX_SEED = 2**63 - 1
+# Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" is a signed
+# integer, and "u" is an unsigned integer.
+_NUMBERS = "fiu"
+# Number of bytes of a float64 number. NumPy also has larger floating-point numbers, which torch
+# cannot read.
+_FLOAT64_BYTES = 8
 # Texts in the errors of torch, CUDA, cuDNN
 # and cuBLAS that say that memory ran out.
 OUT_OF_MEMORY = (
@@ -142,17 +151,27 @@ def require_file(path: str | Path, advice: str) -> None:
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """Check that a number, if it is not None, lies in a range, which NaN never does."""
+    """Check that a value is None or a number in a range, which NaN never is."""
     if value is None:
         return
-    try:
-        is_inside = bool(least <= value <= most)
-    except (TypeError, ValueError, RuntimeError) as error:
-        # The comparison fails for a string, a complex
-        # number or an array of several numbers.
-        raise InputError(f"{name}={_short_text(value)} must be a number", name) from error
-    if not is_inside:
+    if not is_number(value):
+        raise InputError(f"{name}={_short_text(value)} must be a number", name)
+    if not least <= value <= most:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
+
+
+def require_number(name: str, value: object, least: float, most: float) -> None:
+    """Check that a value is a number in a range. Unlike `require_range`, it refuses None."""
+    if not is_number(value):
+        raise InputError(f"{name} is {describe(value)}: give a number", name)
+    require_range(name, cast(float, value), least, most)
+
+
+def require_whole(name: str, value: object, least: float = 0, most: float = MAX_SEED) -> None:
+    """Check that a value is a whole number, which True and 1.0 are not, in a range."""
+    if not is_whole(value):
+        raise InputError(f"{name} is {describe(value)}: give a whole number", name)
+    require_range(name, cast(int, value), least, most)
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
@@ -189,6 +208,156 @@ def require_bounded(**tensors: Tensor) -> None:
                 "give finite values",
                 name,
             )
+
+
+def as_tensor(name: str, value: object) -> Tensor:
+    """Convert an argument to a tensor of floating-point numbers.
+
+    A floating-point tensor is returned unchanged. A floating-point NumPy array
+    keeps its precision. Integers, numbers and lists become float32. Lists of
+    tensors are stacked and stay differentiable. Strings, None, complex numbers and lists of
+    unequal lengths raise `InputError`.
+    """
+    import numpy as np
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        if value.is_floating_point():
+            return value
+        if not value.is_complex() and value.dtype != torch.bool:
+            return value.to(torch.get_default_dtype())
+    elif (
+        isinstance(value, list | tuple)
+        and value
+        and all(isinstance(item, torch.Tensor) for item in value)
+    ):
+        rows = [as_tensor(name, item) for item in value]
+        first = rows[0]
+        if all(row.shape == first.shape for row in rows):
+            return torch.stack([row.to(first) for row in rows])
+    else:
+        array = _as_numbers(value)
+        if array is not None:
+            keeps_precision = isinstance(value, np.ndarray) and array.dtype.kind == "f"
+            dtype = None if keeps_precision else torch.get_default_dtype()
+            return torch.as_tensor(array, dtype=dtype)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name
+    )
+
+
+def as_integers(name: str, value: object) -> Tensor:
+    """Convert an argument, such as labels or indices, to an int64 tensor.
+
+    Empty values may have any type.
+    """
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        is_real = not value.is_complex() and value.dtype != torch.bool
+        has_integers = is_real and not value.is_floating_point()
+        if has_integers or not value.numel():
+            return value.long()
+    else:
+        array = _as_numbers(value)
+        if array is not None and (array.dtype.kind in "iu" or not array.size):
+            return torch.as_tensor(array, dtype=torch.int64)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name
+    )
+
+
+def _as_numbers(value: object) -> np.ndarray | None:
+    """Convert a value to a contiguous array of real numbers that torch can read, or to None."""
+    import numpy as np
+
+    # NumPy calls methods of the value, such as `__array__`. They can raise any exception.
+    try:
+        array = np.asarray(value)
+    except Exception:
+        return None
+    if array.dtype.kind not in _NUMBERS:
+        return None
+    if array.dtype.kind == "f" and array.dtype.itemsize > _FLOAT64_BYTES:
+        array = array.astype(np.float64)
+    native_dtype = array.dtype.newbyteorder("=")
+    # `reshape` is needed because ascontiguousarray
+    # changes the shape () to (1,).
+    return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
+
+
+def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
+    """Convert an argument to a NumPy array of real numbers.
+
+    `kinds` are letters of `dtype.kind`: "iu" allows only integers. An array is returned
+    unchanged.
+    """
+    import numpy as np
+    import torch
+
+    array = _as_numbers(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
+    if array is None or (array.dtype.kind not in kinds and array.size):
+        noun = "numbers" if "f" in kinds else "whole numbers"
+        raise InputError(f"{name} is {describe(value)}: give an array or a list of {noun}", name)
+    return value if isinstance(value, np.ndarray) else array
+
+
+def as_path(name: str, value: object) -> Path:
+    """Convert an argument to a `Path`."""
+    if isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str):
+        return Path(value)
+    raise InputError(f"{name} is {describe(value)}: give a path as a string", name)
+
+
+def as_folder(name: str, value: object) -> Path:
+    """Convert an argument to the path of a folder that exists or can be created."""
+    path = as_path(name, value)
+    for ancestor in (path, *path.absolute().parents):
+        if not os.path.lexists(ancestor):
+            continue
+        # `exists` is False for a symbolic link
+        # without a target, which is no file.
+        if ancestor.exists() and not ancestor.is_dir():
+            raise InputError(
+                f"{name}={path} cannot be a folder, because {ancestor} is a file: give the path of "
+                "a folder",
+                name,
+            )
+        break
+    return path
+
+
+def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
+    """Convert an argument to a list, and check the type of its items.
+
+    Strings, mappings and sets are no lists. `expected` completes the error, such as "a list
+    of cameras".
+    """
+    # Tensors and arrays are iterable, but a value of shape () has no items.
+    is_scalar = getattr(value, "ndim", None) == 0
+    is_unordered_or_text = isinstance(value, str | bytes | Mapping | Set)
+    if is_scalar or is_unordered_or_text or not isinstance(value, Iterable):
+        raise InputError(f"{name} is {describe(value)}: give {expected}", name)
+    items = list(value)
+    for index, item in enumerate(items):
+        if not isinstance(item, kind):
+            raise InputError(f"{name}[{index}] is {describe(item)}: give {expected}", name)
+    return items
+
+
+def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
+    """Check the type of an argument."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is {describe(value)}: give {expected}", name)
+
+
+def require_flag(name: str, value: object) -> None:
+    """Check that an argument is True or False. The numbers 1 and 0 are accepted, too.
+
+    Without this check, a string such as "no" would count as True.
+    """
+    if not is_flag(value):
+        raise InputError(f"{name} is {describe(value)}: give True or False", name)
 
 
 def is_whole(value: object) -> bool:

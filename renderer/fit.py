@@ -33,14 +33,13 @@ from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
-from renderer.errors import InputError
+from renderer.errors import InputError, as_tensor
 from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
 from renderer.rendering import precompute_transfer, render
 from renderer.solids import sphere
-from renderer.validation import as_tensor
 
 # Polar angles in degrees of the first cameras of a search.
 FIRST_POLAR_ANGLES = (20, 40, 60, 80, 100)

@@ -15,9 +15,8 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded, require_choice
+from renderer.errors import InputError, as_tensor, require_bounded, require_choice
 from renderer.settings import ENCODINGS
-from renderer.validation import as_tensor
 
 # Linear value at which the sRGB curve changes
 # from a straight line to a power function.

@@ -19,7 +19,15 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from renderer.errors import InputError, describe, require_choice, require_range
+from renderer.errors import (
+    InputError,
+    as_array,
+    as_list,
+    describe,
+    require_choice,
+    require_range,
+    require_whole,
+)
 from renderer.normals import (
     CREASE,
     doubled_area_vectors,
@@ -28,7 +36,6 @@ from renderer.normals import (
     vertex_normals,
 )
 from renderer.settings import MAX_VERTICES, NORMALS
-from renderer.validation import as_array, as_list, require_whole
 
 # Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes from files
 # in which y points up to our axes, in which z points up.
@@ -511,9 +518,9 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
     """
     require_mesh("mesh", mesh)
     # A whole number may be written as a float, such as 1e4.
-    is_whole_float = isinstance(vertices, float) and vertices.is_integer()
-    require_whole("vertices", int(vertices) if is_whole_float else vertices)
-    require_range("vertices", vertices, 0, MAX_VERTICES)
+    if isinstance(vertices, float) and vertices.is_integer():
+        vertices = int(vertices)
+    require_whole("vertices", vertices, 0, MAX_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)
     return mesh

@@ -11,8 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import MAX_TURN, PerspectiveCamera, in_radians, tensor_like
-from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_range
-from renderer.validation import as_array, require_whole
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    InputError,
+    as_array,
+    require_choice,
+    require_range,
+    require_whole,
+)
 
 # Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
 # has y up and z backward.
@@ -254,6 +260,5 @@ def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
     """Convert the size of an image to its width and its height, and check them."""
     width, height = size if isinstance(size, tuple | list) and len(size) == 2 else (size, size)
     for side in (width, height):
-        require_whole("size", side)
-        require_range("size", side, 1, MAX_MAGNITUDE)
+        require_whole("size", side, 1, MAX_MAGNITUDE)
     return width, height

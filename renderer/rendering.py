@@ -21,10 +21,13 @@ from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import (
     MAX_SCALE,
     InputError,
+    as_list,
+    as_tensor,
     describe,
     require_bounded,
     require_choice,
-    require_range,
+    require_kind,
+    require_number,
 )
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
@@ -40,7 +43,6 @@ from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
 from renderer.surface.albedo import NO_TEXTURE, face_albedo, surface_albedo
 from renderer.surface.gloss import Gloss
-from renderer.validation import as_list, as_tensor, require_kind, require_number
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizer import choose
 
@@ -407,8 +409,7 @@ def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
 
 def _require_scale(albedo_scale: float) -> None:
     """Raise `InputError` if `albedo_scale` is no number from 0 to `MAX_SCALE`."""
-    require_number("albedo_scale", albedo_scale)
-    require_range("albedo_scale", albedo_scale, 0, MAX_SCALE)
+    require_number("albedo_scale", albedo_scale, 0, MAX_SCALE)
 
 
 def _require_gloss(gloss: Gloss | None) -> None:

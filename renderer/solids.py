@@ -23,9 +23,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from renderer.errors import require_choice, require_range
+from renderer.errors import require_choice, require_whole
 from renderer.mesh import Mesh, concatenate
-from renderer.validation import require_whole
 
 # Colors of stalks and leaves, sRGB-encoded red, green and blue.
 STALK = (0.36, 0.27, 0.15)
@@ -67,7 +66,6 @@ def solid(name: str, seed: int = 0) -> Mesh:
     ((5120, 3), True)
     """
     require_whole("seed", seed)
-    require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | HARD_NEGATIVES
     require_choice("name", name, known)
     return known[name](np.random.default_rng(seed))

@@ -25,9 +25,8 @@ from augment.network import unwrapped, with_normalized_light
 from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
-from renderer.errors import InputError, require_file, single_line
+from renderer.errors import InputError, as_path, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
-from renderer.validation import as_path, require_kind
 from train.command_settings import ClassifierSettings
 from train.data.cache import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network

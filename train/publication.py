@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifier import Classifier, OperatingPoint
-from renderer.errors import InputError
-from renderer.validation import as_path, require_kind
+from renderer.errors import InputError, as_path, require_kind
 from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
 from train.networks import PYTHON

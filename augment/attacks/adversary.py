@@ -19,6 +19,7 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
     MAX_SCALE,
     InputError,
+    as_folder,
     require_bounded,
     require_file,
     require_range,
@@ -39,7 +40,6 @@ from renderer.settings import ImageSettings
 from renderer.short_repr import ShortRepr
 from renderer.surface.albedo import with_added_albedo
 from renderer.surface.gloss import Gloss
-from renderer.validation import as_folder
 from renderer.visibility.rasterizer import Rasterizer, choose
 
 # Names of files in the folder of an adversary, and of the images before and after the attack.

@@ -27,9 +27,8 @@ from augment.random_streams import generator
 from augment.scene.build import MAX_IRRADIANCE_ERROR, with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight
-from renderer.errors import InputError, is_whole
+from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light.harmonics import irradiance_error
-from renderer.validation import as_list, require_flag, require_kind, require_seed
 
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
@@ -113,7 +112,7 @@ def attack(
     """
     require_kind("scene", scene, Scene, "a scene, such as nb.build_scene(...)")
     require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
-    require_seed("seed", seed)
+    require_whole("seed", seed)
     require_flag("force", force)
     if torch.is_inference_mode_enabled():
         raise InputError(

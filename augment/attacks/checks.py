@@ -26,8 +26,13 @@ from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gra
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
-from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
-from renderer.validation import as_list, require_number
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    MAX_SCALE,
+    InputError,
+    as_list,
+    require_number,
+)
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
@@ -260,8 +265,7 @@ def transfer(
     )
     azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
     for azimuth in azimuths:
-        require_number("azimuths", azimuth)
-        require_range("azimuths", azimuth, -MAX_MAGNITUDE, MAX_MAGNITUDE)
+        require_number("azimuths", azimuth, -MAX_MAGNITUDE, MAX_MAGNITUDE)
     names = [parameter.name for parameter in result.problem.parameters]
     require_transferable(names, azimuths, objects)
 
@@ -465,8 +469,7 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
     if not listed:
         raise InputError("scales is empty: give factors of the radii, such as [0.5, 1, 2]")
     for scale in listed:
-        require_number("scales", scale)
-        require_range("scales", scale, 1 / MAX_SCALE, MAX_SCALE)
+        require_number("scales", scale, 1 / MAX_SCALE, MAX_SCALE)
     return listed
 
 

@@ -16,13 +16,12 @@ from augment.attacks.checks import CHECKED, warnings
 from augment.attacks.eot import as_jpeg
 from augment.attacks.result import AttackResult, predictions, require_result
 from augment.progress import progress
-from renderer.errors import InputError, require_choice
+from renderer.errors import InputError, as_folder, as_list, require_choice, require_kind
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import atomic_write
 from renderer.io.images import Tile, draw_grid, tiles_of, write_image
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
-from renderer.validation import as_folder, as_list, require_kind
 from renderer.visibility.rasterizer import Rasterizer
 
 # `save` also classifies the attacked images after JPEG compression with this quality.

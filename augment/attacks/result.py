@@ -20,11 +20,10 @@ from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
 from augment.classifier import Classifier
 from augment.scene.objects import Conditions
-from renderer.errors import require_choice, require_range
+from renderer.errors import as_path, require_choice, require_kind, require_whole
 from renderer.io.images import write_image
 from renderer.rendering import light_sphere
 from renderer.short_repr import ShortRepr
-from renderer.validation import as_path, require_kind, require_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -270,8 +269,7 @@ class AttackResult(ShortRepr):
         path = as_path("path", path)
         require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
         example, view = self._shown_view(example, view)
-        require_whole("frame_count", frame_count)
-        require_range("frame_count", frame_count, 2, MAX_FRAME_COUNT)
+        require_whole("frame_count", frame_count, 2, MAX_FRAME_COUNT)
         fractions = [index / (frame_count - 1) for index in range(frame_count)]
         images = [self._image_between(fraction, example, view) for fraction in fractions]
         balls = [self._ball_between(fraction, example) for fraction in fractions]
@@ -322,8 +320,7 @@ class AttackResult(ShortRepr):
 
 def _require_index(name: str, index: int, count: int) -> None:
     """Raise InputError unless an index is a whole number from 0 to count - 1."""
-    require_whole(name, index)
-    require_range(name, index, 0, count - 1)
+    require_whole(name, index, 0, count - 1)
 
 
 def require_result(result: object) -> None:

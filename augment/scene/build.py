@@ -25,7 +25,18 @@ from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_mat
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer.camera import Camera, orbit_cameras
-from renderer.errors import InputError, as_device, describe, is_whole, require_bounded
+from renderer.errors import (
+    InputError,
+    as_device,
+    as_list,
+    as_tensor,
+    describe,
+    is_whole,
+    require_bounded,
+    require_flag,
+    require_kind,
+    require_whole,
+)
 from renderer.io.images import gray_or_image
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
 from renderer.light.harmonics import degree_of, irradiance_error
@@ -36,7 +47,6 @@ from renderer.memory import has_memory
 from renderer.mesh import Mesh, require_mesh, select_faces, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.gloss import Gloss, smallest_roughness
-from renderer.validation import as_list, as_tensor, require_flag, require_kind, require_whole
 from renderer.visibility.rasterizer import choose
 
 if TYPE_CHECKING:

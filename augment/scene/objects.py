@@ -21,7 +21,7 @@ from torch import Tensor
 
 from augment.settings import MeshSettings, ObjectSettings, PropSettings
 from renderer.camera import Camera
-from renderer.errors import InputError
+from renderer.errors import InputError, as_tensor
 from renderer.mesh import (
     Mesh,
     center_and_extent,
@@ -33,7 +33,6 @@ from renderer.mesh import (
 from renderer.short_repr import ShortRepr
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
-from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -17,7 +17,15 @@ from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
 from renderer.camera import Camera
-from renderer.errors import InputError, describe, require_bounded
+from renderer.errors import (
+    InputError,
+    as_integers,
+    as_list,
+    as_tensor,
+    describe,
+    require_bounded,
+    require_kind,
+)
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.memory import require_memory
@@ -25,7 +33,6 @@ from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.operators.stack import OperatorStack, ScatterLayers
 from renderer.settings import ImageSettings
-from renderer.validation import as_integers, as_list, as_tensor, require_kind
 from renderer.visibility.rasterizer import Rasterizer
 
 # Largest total number of pixels of the images that are rendered at a time.

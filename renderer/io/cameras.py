@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from renderer.errors import InputError, require_file
+from renderer.errors import InputError, as_path, require_file
 from renderer.pinhole import PinholeCamera
-from renderer.validation import as_path
 
 # Names of the text files in which COLMAP
 # stores cameras and the poses of images.

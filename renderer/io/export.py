@@ -13,11 +13,10 @@ from jaxtyping import Bool, Float, Int
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, as_list, as_path, require_whole
 from renderer.image import decode
 from renderer.io.files import atomic_write
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
-from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
     # Importing trimesh takes half a second,
@@ -75,8 +74,7 @@ def export_mesh(
     path = as_path("path", path)
     cameras = as_list("cameras", cameras, Camera, "a list of cameras")
     if first is not None:
-        require_whole("first", first)
-        require_range("first", first, 0, len(mesh.faces))
+        require_whole("first", first, 0, len(mesh.faces))
     unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
         raise InputError(

@@ -11,7 +11,15 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_file, single_line
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    InputError,
+    as_path,
+    require_choice,
+    require_file,
+    require_flag,
+    single_line,
+)
 from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits, identify
 from renderer.io.mesh_file import OPAQUE, MeshFile, Part, colored_mesh, require_bounded, unit_colors
@@ -20,7 +28,6 @@ from renderer.io.off_and_stl import read_off, read_stl
 from renderer.io.ply import read_ply
 from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.normals import normal_groups
-from renderer.validation import as_path, require_flag
 
 # Suffixes of archive files, which are not read. trimesh could read them,
 # but the names of the files inside an archive cannot be checked first.

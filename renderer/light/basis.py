@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.errors import InputError, require_finite, require_range
+from renderer.errors import InputError, require_finite, require_whole
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.harmonics import (
     basis,
@@ -34,7 +34,6 @@ from renderer.light.harmonics import (
     nonzero_coefficients,
 )
 from renderer.settings import MAX_DEGREE
-from renderer.validation import require_whole
 from renderer.vectors import unit
 
 
@@ -146,8 +145,7 @@ class Harmonics(Basis):
 
     def __post_init__(self) -> None:
         """Check the degree."""
-        require_whole("degree", self.degree)
-        require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
+        require_whole("degree", self.degree, 0, MAX_DEGREE)
 
     def __str__(self) -> str:
         return f"{self.name} of degree {self.degree}"

@@ -10,14 +10,22 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from renderer.errors import MAX_SCALE, InputError, require_bounded, require_file, require_range
+from renderer.errors import (
+    MAX_SCALE,
+    InputError,
+    as_path,
+    as_tensor,
+    require_bounded,
+    require_file,
+    require_kind,
+    require_whole,
+)
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.environment import SUFFIXES, to_map, write_map
 from renderer.light.harmonics import irradiance_error
-from renderer.validation import as_path, as_tensor, require_kind, require_whole
 
 # Exceptions that are raised if a .json file is damaged, or does not describe a light.
 _DAMAGED_FILE_ERRORS = (
@@ -92,8 +100,7 @@ def save_light(
             "give coefficients of this shape"
         )
     if isinstance(basis, Harmonics) and is_map:
-        require_whole("height", height)
-        require_range("height", height, 1, MAX_MAP_HEIGHT)
+        require_whole("height", height, 1, MAX_MAP_HEIGHT)
         physical = basis.project_nonnegative(coefficients)
         write_map(path, to_map(physical, height).clamp(min=0))
         return float(irradiance_error(physical, coefficients))

@@ -29,9 +29,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from renderer.errors import InputError, require_finite, require_range
+from renderer.errors import InputError, as_tensor, require_finite, require_whole
 from renderer.settings import MAX_DEGREE
-from renderer.validation import as_tensor, require_whole
 from renderer.vectors import unit
 
 # Largest degree that `quadrature` accepts. A rule of degree D has about D² / 2
@@ -150,8 +149,7 @@ def require_degree(degree: int) -> None:
     Raises:
         InputError: If the degree is not whole or out of range.
     """
-    require_whole("degree", degree)
-    require_range("degree", degree, 0, MAX_DEGREE)
+    require_whole("degree", degree, 0, MAX_DEGREE)
 
 
 def evaluate_harmonics(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
@@ -490,8 +488,7 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
     Raises:
         InputError: If the degree is out of range.
     """
-    require_whole("degree", degree)
-    require_range("degree", degree, 0, MAX_QUADRATURE)
+    require_whole("degree", degree, 0, MAX_QUADRATURE)
     z, z_weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     radius = np.sqrt(1 - z**2)[:, None]
@@ -523,8 +520,7 @@ def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
         InputError: If the height or the width is out of range.
     """
     for name, count in (("height", height), ("width", width)):
-        require_whole(name, count)
-        require_range(name, count, 1, MAX_TEXELS)
+        require_whole(name, count, 1, MAX_TEXELS)
     # z at the upper and lower edges of the rows, shape (height + 1,).
     row_edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
     # Mean of z over the solid angle of each row.

@@ -14,13 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import PerspectiveCamera
-from renderer.errors import MAX_SCALE, InputError, require_range
+from renderer.errors import MAX_SCALE, InputError, as_array, as_tensor, require_range
 from renderer.io.mitsuba_entries import pose_of
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
 from renderer.light.projector import Projector
 from renderer.settings import require_field_types
-from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes
 
 # A surface point casts a ray to each point of a set of points on a disc lamp.

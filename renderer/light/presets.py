@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import InputError, require_bounded
+from renderer.errors import InputError, as_path, require_bounded
 from renderer.image import LUMINANCE
 from renderer.light.basis import COEFFICIENTS, DEGREE, Harmonics
 from renderer.light.environment import SUFFIXES, read_panorama
@@ -29,7 +29,6 @@ from renderer.light.harmonics import (
 )
 from renderer.light.ringing import window_without_ringing
 from renderer.mesh import Y_UP_TO_Z_UP
-from renderer.validation import as_path
 
 # Coefficients of three light probes, as RGB rows in the order L00, L1-1, L10,
 # L11, L2-2, L2-1, L20, L21, L22, in the axes of the probes, whose y is up.

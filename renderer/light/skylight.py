@@ -27,10 +27,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, is_number, require_finite
+from renderer.errors import InputError, as_tensor, is_number, require_finite
 from renderer.light.basis import HARMONICS
 from renderer.settings import TURBIDITY
-from renderer.validation import as_tensor
 
 # Smallest and largest zenith angle of the sun in degrees: from overhead to the horizon.
 ZENITH = (0.0, 90.0)

@@ -26,12 +26,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from renderer.errors import MAX_MAGNITUDE, InputError, as_device, require_bounded
+from renderer.errors import MAX_MAGNITUDE, InputError, as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
 from renderer.operators.lamp_paths import SparseTransfer
 from renderer.settings import ImageSettings
-from renderer.validation import as_tensor
 
 # Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")

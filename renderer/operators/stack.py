@@ -12,11 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError
+from renderer.errors import InputError, as_tensor
 from renderer.image import as_background, background_term, clamp, encode
 from renderer.operators.apply import TransferOperator, apply_transfer, require_image_gradient
 from renderer.operators.lamp_paths import SparseTransfer, concatenate_entries
-from renderer.validation import as_tensor
 
 # Operators of small images are copied into common tensors (a stack) until their images have
 # this many pixels in total. Larger stacks are not faster.

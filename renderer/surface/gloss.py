@@ -41,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import InputError, require_bounded
+from renderer.errors import InputError, as_tensor, require_bounded, require_flag
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
@@ -55,7 +55,6 @@ from renderer.surface.lobes import (
     lobe_functions,
     roughness_polynomials,
 )
-from renderer.validation import as_tensor, require_flag
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
 

@@ -83,7 +83,7 @@ class Rasterizer:
         limit = SPAN / resolution
         if max(-lowest, highest) > limit:
             points = np.clip(points, -limit, limit)
-        needed = (4 * len(points) + SHADED_BYTES) * resolution**2
+        needed = (4 * len(points) + SHADED_BYTES) * int(resolution) ** 2
         name = f"{len(points)} views of {resolution} samples per side"
         require_memory(name, needed, torch.device("cpu"))
         module = import_module(f"renderer.visibility.{self.name}")

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from renderer.errors import as_path
 from renderer.io.files import atomic_write
 from renderer.short_repr import ShortRepr
-from renderer.validation import as_path
 from train.auditing.lights import KINDS
 from train.auditing.network import AuditedNetwork
 from train.auditing.page import Audited

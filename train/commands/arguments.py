@@ -10,9 +10,8 @@ from typing import Any
 from augment.classifier import Classifier
 from augment.scene.objects import name_mesh
 from augment.settings import ObjectSettings
-from renderer.errors import InputError, describe
+from renderer.errors import InputError, as_folder, as_list, describe
 from renderer.mesh import Mesh
-from renderer.validation import as_folder, as_list
 from train.class_names import classes_of_meshes
 
 # File of a mesh, solid:NAME, or the mesh itself.

@@ -15,8 +15,7 @@ from augment.plain_networks import (
     gradient_flags_kept,
 )
 from augment.settings import NormalizeLight
-from renderer.errors import InputError
-from renderer.validation import as_list
+from renderer.errors import InputError, as_list
 from train.auditing.audit import run_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.auditing.report import AuditReport, read_audit

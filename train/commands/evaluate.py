@@ -18,7 +18,7 @@ from augment.plain_networks import (
     require_no_facts,
 )
 from augment.settings import NormalizeLight
-from renderer.validation import as_folder
+from renderer.errors import as_folder
 from train.checkpoints import load_chosen, load_run
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.photographs import choose_labels, class_folders, require_outside

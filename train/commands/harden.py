@@ -22,9 +22,8 @@ from augment.plain_networks import (
     require_evaluation_mode,
 )
 from augment.settings import NormalizeLight, RendererSettings
-from renderer.errors import InputError, describe
+from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings
-from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
 from train.class_names import require_others, with_class_names

@@ -24,12 +24,17 @@ from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_nam
 from augment.losses import log_odds
 from augment.network import compute_outputs
 from augment.progress import progress
-from renderer.errors import InputError, require_choice, require_range
+from renderer.errors import (
+    InputError,
+    as_folder,
+    require_choice,
+    require_kind,
+    require_whole,
+)
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.settings import MAX_SIZE
 from renderer.short_repr import ShortRepr
-from renderer.validation import as_folder, require_kind, require_whole
 from train.data.photo import Photograph
 from train.data.photographs import (
     TABLE,
@@ -143,8 +148,7 @@ class Predictor:
         kinds = "a torch.nn.Module, or a function from images to logits"
         require_kind("model", self.model, Callable, kinds)
         self.classes = as_class_names("classes", self.classes)
-        require_whole("size", self.size)
-        require_range("size", self.size, 1, MAX_SIZE)
+        require_whole("size", self.size, 1, MAX_SIZE)
 
     def predict(
         self,

@@ -12,8 +12,7 @@ from augment.files import is_network_file
 from augment.network import without_normalized_light
 from augment.plain_networks import as_facts, require_no_facts
 from augment.sources import load_source
-from renderer.errors import InputError
-from renderer.validation import as_path
+from renderer.errors import InputError, as_path
 from train import console
 from train.checkpoints import (
     NORMALIZE_LIGHT,
