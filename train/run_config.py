@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
@@ -135,6 +134,9 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
 
     Return the configuration, and the recorded command followed by the new arguments.
     """
+    # This import takes a fifth of a second, and only a resumed run needs it.
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     folder = Path(config.out).absolute()
     recorded = _read_recorded(folder)
     names = [item.name for item in fields(ExperimentSettings)]

@@ -144,7 +144,7 @@ def _report_on(network: AuditedNetwork) -> NetworkReport:
     return NetworkReport(
         name=network.name,
         answer=network.answer,
-        recognized={light: sum(is_) / len(is_) for light, is_ in network.recognized.items()},
+        recognized={light: sum(views) / len(views) for light, views in network.recognized.items()},
         attacks=attacks,
         scores=scores,
         transfers=network.transfers,

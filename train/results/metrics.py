@@ -157,7 +157,10 @@ class Metrics:
         A metric that an earlier version did not write is unknown. The number of images is not read,
         because summary.json has another entry of this name.
         """
-        kinds = {**dict.fromkeys(FRACTION_METRICS, Proportion), "auc": AreaUnderCurve}
+        kinds: dict[str, type[Estimate]] = {
+            **dict.fromkeys(FRACTION_METRICS, Proportion),
+            "auc": AreaUnderCurve,
+        }
         found: dict[str, Any] = {}
         for name in (*kinds, *TOP_RANKS):
             if entries.get(name):

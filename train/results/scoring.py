@@ -565,8 +565,9 @@ def _fraction_metrics(scores: Scores) -> list[str]:
 
 def _format_metric(metric: Estimate | None) -> str:
     """Write a fraction of images with its counts, and any other metric with its interval."""
-    is_fraction = isinstance(metric, Proportion)
-    return format_fraction(metric) if is_fraction else format_interval(metric)
+    if isinstance(metric, Proportion):
+        return format_fraction(metric)
+    return format_interval(metric)
 
 
 def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:

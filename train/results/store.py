@@ -93,7 +93,11 @@ class StoredScores:
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
         label = [*self.labels] if self.by_label else self.labels[0]
-        entries = {"images": self.images, "label": label, **self.overall.to_summary()}
+        entries: dict[str, Any] = {
+            "images": self.images,
+            "label": label,
+            **self.overall.to_summary(),
+        }
         if self.thresholds:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point

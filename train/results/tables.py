@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 # What a 95% interval is over. Images of few objects say nothing about other objects.
 OBJECTS = "objects"
@@ -162,9 +161,8 @@ def fraction(hits: int, n: int) -> Proportion:
     )
 
 
-def wilson(value: ArrayLike, n: int, quantile: ArrayLike) -> np.ndarray:
+def wilson(value: float | np.ndarray, n: int, quantile: float | np.ndarray) -> np.ndarray:
     """Compute the ends of Wilson's interval of a fraction of n units, with a quantile."""
-    value, quantile = np.asarray(value), np.asarray(quantile)
     shift = quantile**2 / n
     center = (value + shift / 2) / (1 + shift)
     half_width = (value * (1 - value) * shift + shift**2 / 4) ** 0.5 / (1 + shift)
