@@ -34,11 +34,7 @@ from augment.plain_networks import (
     gradient_flags_kept,
 )
 from augment.progress import progress
-from augment.projected_light import (
-    ProjectedLight,
-    draw_projected_light,
-    require_photographs,
-)
+from augment.projected_light import ProjectedLight, draw_projected_light, require_photographs
 from augment.random_streams import generator
 from renderer.errors import (
     MAX_MAGNITUDE,

@@ -32,13 +32,7 @@ from augment.scene.build import MeshSource, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from renderer.errors import (
-    InputError,
-    as_integers,
-    describe,
-    require_kind,
-    require_whole,
-)
+from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb

@@ -57,8 +57,6 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 _OPTIONAL = ("gloss", "normal_ids")
 # Names of the arrays of a mesh that have one row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "normal_ids")
-# Largest index of a normal. A larger one is a mistake that would take all memory.
-MAX_NORMAL_ID = 2**31 - 1
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
 # Corners of the four triangles into which a triangle is divided. Points 0, 1 and 2 are its corners.
@@ -142,8 +140,17 @@ class Mesh:
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
-        self._require_indices()
-        if self.normal_ids is None:
+        require_range("the number of faces", len(self.faces), 1, np.inf)
+        vertex_count = len(self.vertices)
+        lowest, highest = self.faces.min(), self.faces.max()
+        if not 0 <= lowest <= highest < vertex_count:
+            raise InputError(
+                f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
+                f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
+            )
+        if self.normal_ids is not None:
+            require_range("the smallest of normal_ids", self.normal_ids.min(), 0, np.inf)
+        else:
             object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
@@ -159,20 +166,6 @@ class Mesh:
                 f"{len(self.textures)} textures: give indices below {len(self.textures)}, "
                 f"or {NO_TEXTURE} for faces without a texture"
             )
-
-    def _require_indices(self) -> None:
-        """Raise `InputError` if there are no faces, or if a vertex index is out of range."""
-        require_range("the number of faces", len(self.faces), 1, np.inf)
-        vertex_count = len(self.vertices)
-        lowest, highest = self.faces.min(), self.faces.max()
-        if not 0 <= lowest <= highest < vertex_count:
-            raise InputError(
-                f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
-                f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
-            )
-        if self.normal_ids is not None:
-            require_range("the smallest of normal_ids", self.normal_ids.min(), 0, MAX_NORMAL_ID)
-            require_range("the largest of normal_ids", self.normal_ids.max(), 0, MAX_NORMAL_ID)
 
     @staticmethod
     def plain(

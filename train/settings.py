@@ -11,14 +11,7 @@ from typing import Any
 from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, count_views
 from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
 from renderer.errors import InputError, composed, describe, is_whole, require_range
-from renderer.settings import (
-    MAX_SIZE,
-    MAX_VIEWS,
-    Settings,
-    setting,
-    setting_like,
-    settings_from,
-)
+from renderer.settings import MAX_SIZE, MAX_VIEWS, Settings, setting, setting_like, settings_from
 from train.train_settings import NEEDS_INITIAL_NETWORK, ModelSettings, TrainSettings
 
 # Label of a hard negative (an object of another class than the positive class) for

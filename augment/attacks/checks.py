@@ -26,13 +26,7 @@ from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gra
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    MAX_SCALE,
-    InputError,
-    as_list,
-    require_number,
-)
+from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, require_number
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)

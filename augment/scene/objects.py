@@ -22,14 +22,7 @@ from torch import Tensor
 from augment.settings import MeshSettings, ObjectSettings, PropSettings
 from renderer.camera import Camera
 from renderer.errors import InputError, as_tensor
-from renderer.mesh import (
-    Mesh,
-    center_and_extent,
-    concatenate,
-    normalize,
-    select_faces,
-    subdivide,
-)
+from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, select_faces, subdivide
 from renderer.short_repr import ShortRepr
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss

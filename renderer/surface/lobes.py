@@ -35,12 +35,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.light.harmonics import bands, cache_tensors, evaluate_harmonics, rotate
-from renderer.microfacets import (
-    DIELECTRIC,
-    distribution,
-    fresnel,
-    masking_denominator,
-)
+from renderer.microfacets import DIELECTRIC, distribution, fresnel, masking_denominator
 from renderer.settings import MIN_ROUGHNESS
 from renderer.vectors import Angle, Components, rotate_about_x, rotate_about_y, rotate_about_z, unit
 

@@ -10,13 +10,7 @@ from torch import nn
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.photographs import (
-    ADVERSARIAL,
-    LIGHTS,
-    RANDOM,
-    RelitPhotographs,
-    attack_photographs,
-)
+from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, RelitPhotographs, attack_photographs
 from augment.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.errors import InputError

@@ -16,11 +16,7 @@ from renderer.normals import face_normals, vertex_normals
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import face_albedo, surface_albedo
-from renderer.surface.shading import (
-    irradiance,
-    normals_in_sight,
-    radiance,
-)
+from renderer.surface.shading import irradiance, normals_in_sight, radiance
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizer import choose
 

@@ -12,13 +12,7 @@ from torch import Tensor
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.fit import (
-    FINAL_GRID,
-    MIN_RADIANCE_RATIO,
-    FittedScene,
-    _nonnegative_light,
-    fit_scene,
-)
+from renderer.fit import FINAL_GRID, MIN_RADIANCE_RATIO, FittedScene, _nonnegative_light, fit_scene
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light

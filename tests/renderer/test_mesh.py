@@ -9,13 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, mesh_of
 
 from renderer.errors import InputError
-from renderer.mesh import (
-    Mesh,
-    concatenate,
-    normalize,
-    refine,
-    subdivide,
-)
+from renderer.mesh import Mesh, concatenate, normalize, refine, subdivide
 from renderer.solids import solid
 
 EPS32 = np.finfo(np.float32).eps

@@ -28,14 +28,7 @@ from train.results.intervals import (
     weighted_means,
 )
 from train.results.predictions import Prediction
-from train.results.tables import (
-    IMAGES,
-    OBJECTS,
-    THESE_OBJECTS,
-    Estimate,
-    Proportion,
-    fraction,
-)
+from train.results.tables import IMAGES, OBJECTS, THESE_OBJECTS, Estimate, Proportion, fraction
 
 # Names of the metrics that depend on the ranking of the images, in the order in which
 # `auc_and_recalls` returns them.

@@ -24,13 +24,7 @@ from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_nam
 from augment.losses import log_odds
 from augment.network import compute_outputs
 from augment.progress import progress
-from renderer.errors import (
-    InputError,
-    as_folder,
-    require_choice,
-    require_kind,
-    require_whole,
-)
+from renderer.errors import InputError, as_folder, require_choice, require_kind, require_whole
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.settings import MAX_SIZE

@@ -23,11 +23,7 @@ from train.checkpoints import (
     load_selected,
     plain_weights,
 )
-from train.class_names import (
-    class_of_name,
-    name_of_mesh,
-    with_class_names,
-)
+from train.class_names import class_of_name, name_of_mesh, with_class_names
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, PYTHON, describe
 from train.settings import ExperimentSettings, label_names

@@ -44,11 +44,7 @@ from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.training.averages import INTERPOLATION, interpolate, predict
-from train.training.initial import (
-    Initial,
-    ValidationPart,
-    choose_validation,
-)
+from train.training.initial import Initial, ValidationPart, choose_validation
 from train.training.inputs import (
     build_service,
     describe_test_images,

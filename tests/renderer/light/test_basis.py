@@ -7,12 +7,7 @@ import torch
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.light.basis import (
-    Harmonics,
-    SumBasis,
-    parts_of,
-    split_light,
-)
+from renderer.light.basis import Harmonics, SumBasis, parts_of, split_light
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector

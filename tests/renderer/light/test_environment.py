@@ -10,12 +10,7 @@ import torch
 from oracles import draw
 
 from renderer.errors import InputError
-from renderer.light.environment import (
-    negative_fraction,
-    read_map,
-    to_map,
-    write_map,
-)
+from renderer.light.environment import negative_fraction, read_map, to_map, write_map
 from renderer.light.harmonics import project
 from renderer.light.presets import load_light
 

@@ -13,17 +13,8 @@ from scipy import optimize
 from torch import Tensor
 
 from renderer.light.ball import Ball
-from renderer.light.harmonics import (
-    basis,
-    lambertian_factors,
-    project,
-    quadrature,
-)
-from renderer.light.nonnegative import (
-    TOLERANCE,
-    nearest_nonnegative,
-    project_nonnegative,
-)
+from renderer.light.harmonics import basis, lambertian_factors, project, quadrature
+from renderer.light.nonnegative import TOLERANCE, nearest_nonnegative, project_nonnegative
 from renderer.light.presets import ambient, load_light
 from renderer.light.ringing import nonnegative_window
 

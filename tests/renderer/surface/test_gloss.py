@@ -23,13 +23,7 @@ from torch import Tensor
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
-from renderer.light.basis import (
-    Basis,
-    Harmonics,
-    LightPaths,
-    LocalBasis,
-    SplitLight,
-)
+from renderer.light.basis import Basis, Harmonics, LightPaths, LocalBasis, SplitLight
 from renderer.light.harmonics import bands, basis, lambertian_factors
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light

@@ -18,12 +18,7 @@ from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.image import background_term, tonemap
-from renderer.light.harmonics import (
-    DIFFUSE_DEGREE,
-    basis,
-    lambertian_factors,
-    nonzero_coefficients,
-)
+from renderer.light.harmonics import DIFFUSE_DEGREE, basis, lambertian_factors, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.normals import normal_groups
 from renderer.settings import MAX_DEGREE, ImageSettings
