@@ -20,7 +20,7 @@ from augment.attack_settings import (
     RelightingSettings,
     StepSettings,
 )
-from augment.attacks.loop import minimize
+from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.optimizers import Gradient, Optimizer
@@ -125,7 +125,11 @@ class UniformDraws(Optimizer):
 
 
 # Optimizers that search for factors of the slide, by the names of the lights.
-OPTIMIZERS: dict[str, type[Optimizer]] = {RANDOM: UniformDraws, ADVERSARIAL: Gradient}
+OPTIMIZERS: dict[str, type[Optimizer]] = {
+    SLIDE: Gradient,
+    RANDOM: UniformDraws,
+    ADVERSARIAL: Gradient,
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -342,82 +346,75 @@ class _PhotographAttack:
         First, each photograph is shown in the light of its slide. If it keeps its class, random
         search and gradient descent look for factors of the slide that change the class.
         """
-        # Factors of 1, whose logarithms are 0, leave the slide as it is.
-        no_gain = self.log_gain[SLIDE][rows, slide]
-        # If factors are searched, the predictions for the other lights are replaced below.
+        problem = self._problem(rows, slide)
+        # Treat each photograph as an example of one view: the second axis has length 1.
+        criterion = Criterion(self.source[rows].to(self.device)[:, None])
+        examples = torch.arange(len(rows), device=self.device)
         for light in self.lights:
-            self._record(light, rows, slide, no_gain)
-        unchanged_rows = rows[~self.changed[SLIDE][rows, slide]]
-        if not len(unchanged_rows):
-            return
-        for light in self.lights[1:]:
-            log_gain = self._search(unchanged_rows, slide, OPTIMIZERS[light])
-            self._record(light, unchanged_rows, slide, log_gain)
+            objective = Objective(self.classifier, criterion, self._search_settings(light))
+            found = minimize(problem, objective, examples=examples, optimizer=OPTIMIZERS[light])
+            # If factors are searched, the records of the other lights are replaced later.
+            lights = self.lights if light == SLIDE else [light]
+            self._record(lights, rows, slide, criterion, found)
+            if light == SLIDE:
+                is_kept = ~self.changed[SLIDE][rows, slide]
+                rows = rows[is_kept]
+                examples = examples[is_kept.to(self.device)]
+                criterion = criterion.select(is_kept.to(self.device))
+            if not len(rows):
+                return
 
-    def _light(self, rows: Int[Tensor, " A"], slide: int) -> ProjectedLight:
-        """Draw the random light of a projector on some photographs.
+    def _problem(self, rows: Int[Tensor, " B"], slide: int) -> RelitPhotographs:
+        """Show photographs in the light of a slide each.
 
-        `slide` is the index of the picture of the projector among those of each photograph.
+        Each photograph has random numbers of its own, so that its light and its factors do not
+        depend on the other photographs.
         """
-        lights = _draw_lights(self.photographs, rows.tolist(), slide, self.seed)
-        return lights.to(self.device)
-
-    def _search(
-        self, rows: Int[Tensor, " A"], slide: int, optimizer: type[Optimizer]
-    ) -> Float[Tensor, "A 3 cells cells"]:
-        """Search for factors by which the slides on photographs are multiplied.
-
-        Return logarithms of those that change the class most surely or, if none changes it, of the
-        last accepted ones.
-        """
-        # Each photograph has a generator of its own, so that its factors do not depend on the
-        # other photographs.
-        generators = [generator(self.seed, "factors", row, slide) for row in rows.tolist()]
-        problem = RelitPhotographs(
+        indices = rows.tolist()
+        return RelitPhotographs(
             decode(self._load(rows), "srgb"),
-            self._light(rows, slide),
+            _draw_lights(self.photographs, indices, slide, self.seed).to(self.device),
             self.settings.cells,
             self.settings.radius,
             self.settings.steps,
-            generators,
+            [generator(self.seed, "factors", index, slide) for index in indices],
         )
-        criterion = Criterion(self.source[rows].to(self.device)[:, None])
-        # With this margin, which no search can reach, all passes are used.
-        settings = replace(
+
+    def _search_settings(self, light: str) -> AttackSettings:
+        """Return settings of a search that uses all passes, since no search reaches its margin.
+
+        The slide as it is takes no step.
+        """
+        return replace(
             self.success_settings,
-            optimizer=GRADIENT if optimizer is Gradient else RANDOM_SEARCH,
-            max_steps=self.settings.steps,
+            optimizer=RANDOM_SEARCH if light == RANDOM else GRADIENT,
+            max_steps=0 if light == SLIDE else self.settings.steps,
             max_queries=self.settings.passes,
             margin=MAX_SCALE,
             sensor_noise=0.0,
         )
-        objective = Objective(self.classifier, criterion, settings)
-        found = minimize(problem, objective, optimizer=optimizer)
-        return problem.log_gain(found.values).cpu()
 
-    @torch.no_grad()
     def _record(
         self,
-        light: str,
+        lights: Sequence[str],
         rows: Int[Tensor, " A"],
         slide: int,
-        log_gain: Float[Tensor, "A 3 cells cells"],
+        criterion: Criterion,
+        found: Minimum,
     ) -> None:
-        """Classify photographs in projected light, and record the predictions in the result.
+        """Record predictions of photographs in the result, and whether they hold with noise.
 
-        `light` is the key of the results: "slide", "random" or "adversarial".
+        `lights` are keys of the results: "slide", "random" or "adversarial".
         """
-        relit = self._light(rows, slide).apply(self._load(rows), log_gain.to(self.device))
-        predicted = self.model(relit).argmax(1)
-        # Treat each photograph as an example of one view: the second axis has length 1.
-        criterion = Criterion(self.source[rows].to(self.device)[:, None])
         # Index of the sensor noise, which differs for each pair of a photograph and a slide.
         noise_indices = rows * self.settings.slides + slide
         objective = Objective(self.classifier, criterion, self.success_settings, self.seed)
-        is_changed = objective.fooled_in_views(relit[:, None], predicted[:, None], noise_indices)
-        self.predicted[light][rows, slide] = predicted.cpu()
-        self.changed[light][rows, slide] = is_changed[:, 0].cpu()
-        self.log_gain[light][rows, slide] = log_gain
+        is_changed = objective.fooled_in_views(found.images, found.predicted, noise_indices)
+        for light in lights:
+            self.predicted[light][rows, slide] = found.predicted[:, 0].cpu()
+            self.changed[light][rows, slide] = is_changed[:, 0].cpu()
+            log_gain = found.values.cpu().view_as(self.log_gain[light][rows, slide])
+            self.log_gain[light][rows, slide] = log_gain
 
 
 def _draw_lights(

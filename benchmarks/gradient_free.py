@@ -123,7 +123,7 @@ def attack(
     leads = []
     for seed in range(seed_count):
         result = nb.attack(network, scene, settings=settings, seed=seed, force=True)
-        assert int(result.descent.queries.max()) <= settings.max_queries
+        assert int(result.minimum.queries.max()) <= settings.max_queries
         is_clean = result.clean_correct
         gaps = logit_gap(result.logits, result.criterion.source[:, 0])
         successes.append(result.success[is_clean])

@@ -434,8 +434,8 @@ def test_attack(name, verify):
         result.images_in_views_before,
         result.images_in_views,
         result.logits_in_views,
-        result.descent.values,
-        result.descent.cost,
+        result.minimum.values,
+        result.minimum.cost,
         result.steps,
     )
 

@@ -26,7 +26,7 @@ def test_an_attack_and_what_it_holds(classifier, tmp_path):
     result = nb.attack(classifier, scene, force=True)
     nb.save(result, tmp_path)
     adversary = nb.reload(tmp_path / "example_000")
-    for value in (result, result.descent, adversary, scene.conditions(torch.arange(2))):
+    for value in (result, result.minimum, adversary, scene.conditions(torch.arange(2))):
         assert len(repr(value)) < LONGEST
     assert f"images_in_views={tuple(result.images_in_views.shape)}" in repr(result).replace(
         "float32 ", ""

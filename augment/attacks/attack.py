@@ -16,7 +16,7 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.eot import NOISE_DRAWS, preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.parameters.light_parameter import environment_light
+from augment.attacks.parameters.lights import environment_light
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult
 from augment.classifier import Classifier, class_index, remembering
@@ -173,10 +173,10 @@ def _attack(
     objective = Objective(classifier, criterion, settings, seed, phases)
     with phases("attack"):
         restarts = random_starts(problem, settings.restarts, seed)
-        descent = minimize(problem, objective, restarts=restarts)
-        images = final_images(problem, descent.values, problem.all_examples, descent.images)
+        minimum = minimize(problem, objective, restarts=restarts)
+        images = final_images(problem, minimum.values, problem.all_examples, minimum.images)
 
-    if descent.zero_gradient.any():
+    if minimum.zero_gradient.any():
         warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
     logits = objective.logits(images)
@@ -192,8 +192,8 @@ def _attack(
         logits_in_views_before=logits_before,
         logits_in_views=logits,
         success_in_views=success_in_views,
-        descent=descent,
-        queries=_count_queries(descent, images, logits.argmax(2), criterion, settings),
+        minimum=minimum,
+        queries=_count_queries(minimum, images, logits.argmax(2), criterion, settings),
         seconds=phases.take(),
     )
 
@@ -215,7 +215,7 @@ def with_optimizer(
 
 
 def _count_queries(
-    descent: Minimum,
+    minimum: Minimum,
     images: Float[Tensor, "E V 3 size size"],
     predicted: Int[Tensor, "E V"],
     criterion: Criterion,
@@ -223,10 +223,10 @@ def _count_queries(
 ) -> Int[Tensor, " E"]:
     """Count the different images of each example that an attack showed to the classifier."""
     view_count = images.shape[1]
-    queries = descent.queries.clone()
-    # `final_images` may render images again that differ from those of the descent. The
+    queries = minimum.queries.clone()
+    # `final_images` may render images again that differ from those of the search. The
     # classifier saw them, too.
-    if images is not descent.images:
+    if images is not minimum.images:
         queries += view_count
     if settings.sensor_noise:
         # `fooled_in_views` tests an example with noise if at least one view meets the
@@ -344,11 +344,11 @@ def final_images(
     examples: Int[Tensor, " A"],
     images: Float[Tensor, "A V 3 size size"],
 ) -> Float[Tensor, "A V 3 size size"]:
-    """Return the images after a descent, with the shadows and bounces of the attacked shape.
+    """Return the images after a search, with the shadows and bounces of the attacked shape.
 
-    A descent that changes shape, colors or gloss computes shadows and bounces
+    A search that changes shape, colors or gloss computes shadows and bounces
     once, for the original shape. This function renders its images again. The
-    images of all other descents are returned as they are.
+    images of all other searches are returned as they are.
     """
     scene = problem.scene
     conditions = problem.conditions(values, examples)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -79,19 +79,19 @@ def check(result: AttackResult) -> dict[str, Any]:
         (1.0, True)
     """
     require_result(result)
-    descent = result.descent
+    minimum = result.minimum
     # Masks of the E examples, shape (E,) each.
     is_clean = result.clean_correct
     is_no_success_before = ~result.success_before
     # A successful example counts as one with a lower cost, even if its cost is higher.
-    has_lower_cost = (descent.cost < descent.cost_before) | result.success_without_noise
+    has_lower_cost = (minimum.cost < minimum.cost_before) | result.success_without_noise
 
     cost_fell = 1.0
     if is_no_success_before.any():
         cost_fell = _fraction(has_lower_cost[is_no_success_before])
 
     draws = generator(result.seed, "random search")
-    draw = partial(result.problem.sample, draws, descent.values)
+    draw = partial(result.problem.sample, draws, minimum.values)
     random = _success_by_draws(result, Successes.before(result), draw)
     # Success rates with and without sensor noise. The keys are numbers of steps or of queries.
     rate_by_steps = {}
@@ -100,10 +100,10 @@ def check(result: AttackResult) -> dict[str, Any]:
         rate_by_steps[steps] = _fraction(successes.with_noise[is_clean])
         rate_by_steps_without_noise[steps] = _fraction(successes.without_noise[is_clean])
     return {
-        "cost_before": float(descent.cost_before.mean()),
-        "cost": float(descent.cost.mean()),
+        "cost_before": float(minimum.cost_before.mean()),
+        "cost": float(minimum.cost.mean()),
         "cost_fell": cost_fell,
-        "zero_gradient": _fraction(descent.zero_gradient),
+        "zero_gradient": _fraction(minimum.zero_gradient),
         "success": _fraction(result.success[is_clean]),
         "success_without_noise": _fraction(result.success_without_noise[is_clean]),
         "success_with_margin": _fraction(result.success_with_margin[is_clean]),
@@ -136,7 +136,7 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
     """Measure how the success of an attack depends on the radius of the norm-balls.
 
-    The examples are attacked in balls of growing radius, once by descent and
+    The examples are attacked in balls of growing radius, once by the optimizer and
     once by uniform random draws. A success in a ball counts in all larger
     balls. The other examples are attacked again in the next ball, for
     `max_steps` steps from the values that they have reached, and with as many
@@ -151,7 +151,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
         A dictionary for each scale, in ascending order:
 
         - "radii": radius of each attacked parameter by its name.
-        - "adversarial", "random": whether the descent or the random search
+        - "adversarial", "random": whether the optimizer or the random search
           succeeds with sensor noise, for each of the N examples that are
           classified correctly before the attack, shape (N,), bool.
         - "adversarial_without_noise", "random_without_noise": the same without
@@ -170,8 +170,8 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     require_result(result)
     scales = _as_scales(scales)
     draws = generator(result.seed, "sweep")
-    # `_descend_further` changes both of the following in place: the D attack values of each of
-    # the E examples, shape (E, D), and the successes of the descent.
+    # `attack` changes both of the following in place: the D attack values of each of the E
+    # examples, shape (E, D), and the successes of the search.
     values = result.problem.start.clone()
     adversarial = Successes.before(result)
     random = adversarial.clone()
@@ -181,7 +181,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
         balls = {name: _scaled(settings, scale) for name, settings in parameters}
         scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
         problem = build_problem(scaled_settings, result.problem.scene)
-        _descend_further(result, problem, values, adversarial)
+        adversarial.attack(result, problem, values)
         random = _success_by_draws(result, random, partial(problem.sample, draws))
         rows.append(
             {
@@ -314,18 +314,15 @@ def require_transferable(
     """
     for name in parameters:
         kind = parameter_class(name)
-        if azimuths and not kind.fits_other_views:
-            _refuse_transfer("azimuths", name, "views")
-        if objects and not kind.fits_other_meshes:
-            _refuse_transfer("meshes", name, "meshes")
-
-
-def _refuse_transfer(argument: str, parameter: str, others: str) -> NoReturn:
-    """Raise the error that an attacked parameter does not fit other views or meshes."""
-    raise InputError(
-        f"{argument}: attacked {parameter} cannot be transferred to other {others}: "
-        f"remove {argument}, or attack another parameter",
-    )
+        for argument, values, others, fits in (
+            ("azimuths", azimuths, "views", kind.fits_other_views),
+            ("meshes", objects, "meshes", kind.fits_other_meshes),
+        ):
+            if values and not fits:
+                raise InputError(
+                    f"{argument}: attacked {name} cannot be transferred to other {others}: "
+                    f"remove {argument}, or attack another parameter",
+                )
 
 
 @dataclass(frozen=True)
@@ -356,6 +353,20 @@ class Successes:
     def unsuccessful(self) -> Tensor:
         """Return the indices of the examples without a success with sensor noise."""
         return torch.nonzero(~self.with_noise).squeeze(1)
+
+    def attack(
+        self, result: AttackResult, problem: SceneProblem, values: Float[Tensor, "E D"]
+    ) -> None:
+        """Attack the examples without a success, from the given values, and add the successes.
+
+        The values become those that the attack reaches.
+        """
+        examples = self.unsuccessful
+        if len(examples):
+            objective = result.objective().select(examples)
+            end = minimize(problem, objective, examples=examples, start=values[examples])
+            values[examples] = end.values
+            self.add(result, problem, values=end.values, examples=examples, images=end.images)
 
     def add(
         self,
@@ -392,11 +403,16 @@ def _success_by_draws(
 ) -> Successes:
     """Search for successes by random draws of the attack values.
 
-    Only examples without a success in `found` are searched. Return a copy of `found` with the
-    additional successes.
+    Only examples without a success in `found` are searched. An attack with gradients is compared
+    with one draw for each step, another with draws that show as many images to the classifier.
+    Return a copy of `found` with the additional successes.
     """
     found = found.clone()
-    for _ in progress(range(_count_draws(result)), "random search"):
+    settings = result.settings
+    count = settings.max_steps
+    if not settings.uses_gradients:
+        count = max(1, settings.step_limit // result.objective().passes_per_candidate)
+    for _ in progress(range(count), "random search"):
         examples = found.unsuccessful
         if not len(examples):
             break
@@ -405,21 +421,6 @@ def _success_by_draws(
             images = result.problem.render(values, examples)
         found.add(result, result.problem, values=values, examples=examples, images=images)
     return found
-
-
-def _count_draws(result: AttackResult) -> int:
-    """Return the number of random draws with which an attack is compared.
-
-    It is the largest number of steps of an attack with gradients. An attack without gradients is
-    compared with draws that show as many images to the classifier.
-    """
-    settings = result.settings
-    if settings.uses_gradients:
-        return settings.max_steps
-    # The classifier sees each view of a draw as it is and in its random transformations.
-    view_count = result.images_in_views.shape[1]
-    passes_per_draw = view_count * (1 + settings.eot.draws)
-    return max(1, settings.step_limit // passes_per_draw)
 
 
 def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
@@ -435,19 +436,8 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
     for factor in GROWTH:
         longer_settings = settings.with_budget(factor)
         successes = successes.clone()
-        unsuccessful = successes.unsuccessful
-        if len(unsuccessful):
-            longer = replace(result, settings=longer_settings)
-            descent = minimize(
-                result.problem, longer.objective().select(unsuccessful), examples=unsuccessful
-            )
-            successes.add(
-                result,
-                result.problem,
-                values=descent.values,
-                examples=unsuccessful,
-                images=descent.images,
-            )
+        start = result.problem.start.clone()
+        successes.attack(replace(result, settings=longer_settings), result.problem, start)
         successes_by_budget[longer_settings.step_limit] = successes
     return successes_by_budget
 
@@ -476,25 +466,6 @@ def _scaled(settings: StepSettings, scale: float) -> StepSettings:
     if settings.radius is None:
         return replace(settings, radius=scale)
     return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
-
-
-def _descend_further(
-    result: AttackResult,
-    problem: SceneProblem,
-    values: Float[Tensor, "E D"],
-    found: Successes,
-) -> None:
-    """Continue the descent of the examples without a success, in larger norm-balls.
-
-    Values and successes are updated in place.
-    """
-    examples = found.unsuccessful
-    if not len(examples):
-        return
-    objective = result.objective().select(examples)
-    end = minimize(problem, objective, examples=examples, start=values[examples])
-    values[examples] = end.values
-    found.add(result, problem, values=end.values, examples=examples, images=end.images)
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
@@ -572,26 +543,17 @@ class _Adversaries:
 
         The other classifier may have the classes in another order, so classes are found by name.
         """
-        view_count = self.result.problem.scene.views
-        attacked_classes = self.result.classifier.classes
-        sources = []
-        for adversary in self.after:
-            label = adversary.shown.label
-            name = label if isinstance(label, str) else attacked_classes[label]
-            sources.append([name] * view_count)
-        source = self._labels(sources, classifier)
-        if self.result.criterion.target is None:
+        criterion = self.result.criterion
+        classes = self.result.classifier.classes
+        labels = [adversary.shown.label for adversary in self.after]
+        names = [label if isinstance(label, str) else classes[label] for label in labels]
+        indices = [[classifier.label(name)] * criterion.view_count for name in names]
+        source = torch.tensor(indices).long().view(-1, criterion.view_count)
+        if criterion.target is None:
             return Criterion(source)
-        targets = [
-            [attacked_classes[index] for index in self.result.criterion.target[example].tolist()]
-            for example in self.examples
-        ]
-        return Criterion(source, self._labels(targets, classifier))
-
-    def _labels(self, names: list[list[str]], classifier: Classifier) -> Int[Tensor, "A V"]:
-        """Convert class names to indices of a classifier."""
-        indices = [classifier.label(name) for views in names for name in views]
-        return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
+        targets = criterion.target[self.examples].flatten().tolist()
+        target = torch.tensor([classifier.label(classes[index]) for index in targets]).long()
+        return Criterion(source, target.view_as(source))
 
     def _render(self, adversaries: list[Adversary], size: int) -> Float[Tensor, "A V 3 size size"]:
         """Render the V views of adversaries."""
@@ -628,9 +590,6 @@ def _with_size(images: Float[Tensor, "N C H W"], size: int) -> Tensor:
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    """Return a copy of an adversary whose cameras are turned around the vertical axis.
-
-    The angle in degrees is added to the azimuth of each camera.
-    """
+    """Return a copy of an adversary whose cameras are turned by an angle in degrees."""
     cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
     return replace(adversary, cameras=tuple(cameras))

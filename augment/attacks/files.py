@@ -138,11 +138,11 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
 
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     """Return the successes, costs and predictions of one example for attack.jsonl."""
-    descent = result.descent
+    minimum = result.minimum
     classes = result.classifier.classes
     before = predictions(result.logits_in_views_before[example], classes)
     # Change of each of the D attack values of this example, shape (1, D).
-    change = descent.values[[example]] - result.problem.start[[example]]
+    change = minimum.values[[example]] - result.problem.start[[example]]
     # Largest change of a value of each attacked parameter, such as "pose".
     largest_change = {}
     for parameter, part in result.problem.split_by_parameter(change):
@@ -157,8 +157,8 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "steps": int(result.steps[example]),
         "queries": int(result.queries[example]),
         "backward_passes": int(result.backward_passes[example]),
-        "cost_before": float(descent.cost_before[example]),
-        "cost": float(descent.cost[example]),
+        "cost_before": float(minimum.cost_before[example]),
+        "cost": float(minimum.cost[example]),
         "label": [classes[index] for index in result.criterion.source[example].tolist()],
         "predicted_before": before["predicted"],
         "confidence_before": before["confidence"],
@@ -288,7 +288,7 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
     scene = problem.scene
     examples = problem.all_examples[[example]]
     conditions_before = problem.conditions(problem.start[examples], examples)
-    conditions_after = problem.conditions(result.descent.values[examples], examples)
+    conditions_after = problem.conditions(result.minimum.values[examples], examples)
     # Both conditions contain one example only, at index 0.
     basis_before = scene.basis_under(conditions_before, 0)
     basis_after = scene.basis_under(conditions_after, 0)

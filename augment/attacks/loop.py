@@ -19,10 +19,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.attacks.cma_es import CMAES
 from augment.attacks.eot import NOISE_DRAWS
 from augment.attacks.objective import Objective, Score
-from augment.attacks.optimizers import Evaluation, Gradient, Optimizer, RandomSearch
+from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, RandomSearch
 from augment.attacks.problem import Problem
 from augment.network import frozen_eval_mode
 from augment.progress import progress

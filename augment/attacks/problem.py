@@ -9,9 +9,8 @@ from torch import Tensor
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lighting import Lighting
+from augment.attacks.parameters.lights import Lighting, Skylight
 from augment.attacks.parameters.parameter import Parameter
-from augment.attacks.parameters.skylight import Skylight
 from augment.progress import progress
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks import animation
 from augment.attacks.loop import Minimum
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
@@ -59,9 +58,9 @@ class AttackResult(ShortRepr):
             shape (E, V, C).
         success_in_views: Whether each view meets the criterion without noise and
             in each draw of sensor noise, shape (E, V), bool.
-        descent: Result of the optimizer, before the final images are rendered. If
-            the attack changes shape or colors, the images of the descent have
-            the shadows and bounces of the original shape. `descent.success` is
+        minimum: Result of the optimizer, before the final images are rendered. If
+            the attack changes shape or colors, the images of the search have
+            the shadows and bounces of the original shape. `minimum.success` is
             the success of these images without noise.
         queries: Number of images of each example that the attack showed to the
             classifier, (E,) int64. Images with sensor noise, which decide about
@@ -79,7 +78,7 @@ class AttackResult(ShortRepr):
     logits_in_views_before: Tensor
     logits_in_views: Tensor
     success_in_views: Tensor
-    descent: Minimum
+    minimum: Minimum
     queries: Tensor
     seconds: dict[str, float]
 
@@ -163,17 +162,17 @@ class AttackResult(ShortRepr):
     @property
     def steps(self) -> Tensor:
         """Number of steps of each example, (E,) int64."""
-        return self.descent.steps
+        return self.minimum.steps
 
     @property
     def backward_passes(self) -> Tensor:
         """Number of images of each example whose gradient was computed, shape (E,), int64."""
-        return self.descent.backward_passes
+        return self.minimum.backward_passes
 
     @property
     def conditions(self) -> Conditions:
         """Light, shape, colors and pose of the E examples after the attack."""
-        return self.problem.conditions(self.descent.values, self.problem.all_examples)
+        return self.problem.conditions(self.minimum.values, self.problem.all_examples)
 
     def plot(self, example: int | None = None, view: int | None = None) -> Figure:
         """Draw a view of an example as a figure with four parts.
@@ -196,7 +195,7 @@ class AttackResult(ShortRepr):
             InputError: If there is no such example or view.
         """
         # Importing matplotlib takes half a second.
-        from augment.attacks.plots import draw_attack
+        from augment.attacks.figures import draw_attack
 
         example, view = self._shown_view(example, view)
         conditions = self.conditions
@@ -238,7 +237,7 @@ class AttackResult(ShortRepr):
         Every frame shows the image, its predicted class with its probability,
         and a white ball in the light. The values that the attack found (light,
         shape, colors or pose) are interpolated linearly, so the frames between
-        the first and the last are not steps of the descent.
+        the first and the last are not steps of the search.
 
         Args:
             path: File to write, with the suffix .gif or .webp.
@@ -266,6 +265,9 @@ class AttackResult(ShortRepr):
             >>> Path("attack.gif").exists()
             True
         """
+        # Importing matplotlib takes half a second.
+        from augment.attacks.figures import draw_frames, frame_times
+
         path = as_path("path", path)
         require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
         example, view = self._shown_view(example, view)
@@ -278,8 +280,8 @@ class AttackResult(ShortRepr):
         captions = []
         for name, confidence in zip(predicted["predicted"], predicted["confidence"], strict=True):
             captions.append(f"{name} {confidence:.0%}")
-        first, *others = animation.draw_frames(images, balls, captions)
-        times = animation.frame_times(frame_count)
+        first, *others = draw_frames(images, balls, captions)
+        times = frame_times(frame_count)
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
     def _values_between(self, fraction: float) -> Float[Tensor, "E D"]:
@@ -288,7 +290,7 @@ class AttackResult(ShortRepr):
         The fraction is 0 before the attack and 1 after it.
         """
         start = self.problem.start
-        return start + fraction * (self.descent.values.to(start) - start)
+        return start + fraction * (self.minimum.values.to(start) - start)
 
     def _image_between(
         self, fraction: float, example: int, view: int
@@ -305,11 +307,13 @@ class AttackResult(ShortRepr):
 
     def _ball_between(self, fraction: float, example: int) -> Float[Tensor, "3 size size"]:
         """Render a white ball in light that is interpolated between before and after the attack."""
+        from augment.attacks.figures import SIDE
+
         examples = self.problem.all_examples[[example]]
         conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
         # `conditions` contain one example only, at index 0.
         basis = self.problem.scene.basis_under(conditions, 0)
-        return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
+        return light_sphere(conditions.light[0], SIDE, basis=basis)
 
     def _repr_png_(self) -> bytes:
         """Return `plot()` as a PNG file. Notebooks display it."""

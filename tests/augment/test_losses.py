@@ -64,11 +64,6 @@ def test_the_cost_grows_with_the_log_odds_on_both_sides_of_50():
     torch.testing.assert_close(cost[:3], torch.nn.functional.logsigmoid(odds[:3]), rtol=0, atol=0)
 
 
-def test_label_smoothing_leaves_complementary_labels_as_they_are():
-    smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
-    assert torch.equal(smoothed, label_loss(LOGITS, EXCLUDED))
-
-
 def test_a_class_costs_the_cross_entropy_in_a_batch_with_complementary_labels():
     is_class = ROWS % 2 == 0
     mixed = torch.where(is_class, CLASSES, EXCLUDED)
@@ -93,17 +88,6 @@ def test_the_gap_of_a_target_is_its_lead_and_without_one_that_of_the_best_other_
     target = torch.tensor([0, 2, NO_CLASS])
     assert logit_gap(logits, source, target).tolist() == [1.0, -1.0, -2.5]
     assert logit_gap(logits, source).tolist() == [2.0, -1.0, -2.5]
-
-
-def test_other_studied_classes_change_no_label_of_a_class():
-    assert torch.equal(label_loss(LOGITS, CLASSES, absent=[4]), label_loss(LOGITS, CLASSES))
-    right = is_correct(torch.arange(5), torch.full((5,), 4), [4])
-    assert right.tolist() == [False, False, False, False, True]
-
-
-def test_the_gradient_of_complementary_labels_is_exact():
-    logits = LOGITS.clone().requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda values: label_loss(values, EXCLUDED), logits)
 
 
 def test_the_gradient_is_finite_if_the_excluded_class_is_certain():

@@ -292,7 +292,7 @@ def success_by_light(
         counts[random] = [int(row[random].sum()) for row in by_radius]
     is_wrong = clean & result.success
     content = io.BytesIO()
-    np.savez(content, wrong=is_wrong.cpu(), values=result.descent.values.cpu())
+    np.savez(content, wrong=is_wrong.cpu(), values=result.minimum.values.cpu())
     atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
@@ -337,7 +337,7 @@ def transfer_success(
         problem = build_problem(result.settings, views.scene(other.size, kind))
         test = _TransferTest(result, other, problem)
         is_wrong = result.clean_correct & result.success
-        further = test.count(is_wrong, result.descent.values)
+        further = test.count(is_wrong, result.minimum.values)
         with np.load(out / f"{kind}.npz") as saved:
             is_wrong = torch.from_numpy(saved["wrong"])
             values = torch.from_numpy(saved["values"])
@@ -390,7 +390,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     same light), both JPEG in base64, and "probabilities" of these classes.
     """
     start = result.problem.start[example]
-    end = result.descent.values[example]
+    end = result.minimum.values[example]
     weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
     values = start + weights * (end - start)
     examples = torch.full((FRAME_COUNT,), example, device=start.device)

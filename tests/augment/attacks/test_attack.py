@@ -28,15 +28,15 @@ def result(request, attacked) -> augment.AttackResult:
 
 
 def test_every_parameter_alone_and_with_others_lowers_the_cost(result):
-    assert (result.descent.cost < result.descent.cost_before).all()
+    assert (result.minimum.cost < result.minimum.cost_before).all()
     assert (result.steps > 0).all()
 
 
 def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
     assert result.images.shape == (2, 3, 8, 8)
     labels = result.criterion.source[:, 0]
-    before = (result.images_before, result.logits_before, result.descent.cost_before)
-    after = (result.images, result.logits, result.descent.cost)
+    before = (result.images_before, result.logits_before, result.minimum.cost_before)
+    after = (result.images, result.logits, result.minimum.cost)
     for images, logits, cost in (before, after):
         assert torch.equal(logits, by_color(images))
         expected = adversarial_cost(logits, labels)
@@ -46,7 +46,7 @@ def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
 
 
 def test_the_images_are_those_of_the_values(result):
-    images = result.problem.render(result.descent.values, torch.arange(2))
+    images = result.problem.render(result.minimum.values, torch.arange(2))
     torch.testing.assert_close(images.detach(), result.images_in_views, rtol=0, atol=1e-6)
 
 
@@ -72,7 +72,7 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(attacked, by_color, parameters)
     results = []
     for device in ("cpu", "cuda"):
         scene = {"views": 2, "device": device}
-        results.append(attacked(parameters, scene, by_color.to(device), max_steps=1).descent)
+        results.append(attacked(parameters, scene, by_color.to(device), max_steps=1).minimum)
     expected, found = results
     cost_before = found.cost_before.cpu()
     torch.testing.assert_close(cost_before, expected.cost_before, rtol=1e-4, atol=1e-4)
@@ -106,8 +106,8 @@ def test_the_same_seed_gives_the_same_result(attacked, parameter):
     """Nothing reaches the target, so that a restart is drawn."""
     steps = {parameter: augment.StepSettings("linf", 0.02)}
     options = {"target": "sky", "restarts": 1, "max_steps": 2}
-    first = attacked(steps, **options).descent
-    second = attacked(steps, **options).descent
+    first = attacked(steps, **options).minimum
+    second = attacked(steps, **options).minimum
     assert first.steps.item() == 4
     assert not first.success.any()
     for name, value in vars(first).items():
@@ -128,7 +128,7 @@ def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(
     steps = augment.StepSettings("linf", 0.05, "sign", 0.03)
     settings = augment.AttackSettings(geometry=steps, albedo=steps, max_steps=2)
     result = augment.attack(by_color, scene, settings=settings, force=True)
-    with_initial_shadows = result.problem.images(result.descent.values)
+    with_initial_shadows = result.problem.images(result.minimum.values)
     assert (with_initial_shadows - result.images_in_views).abs().max() > 0.5 / 255
     (line,) = augment.save(result, tmp_path)
     assert line["versions"]["reload"]["largest_difference"] < 0.1 / 255
@@ -200,7 +200,7 @@ def test_a_network_may_return_logits_in_half_precision(tmp_path, optimizer, dtyp
     torch.testing.assert_close(
         result.logits[:, 0], brightness, rtol=torch.finfo(dtype).eps / 2, atol=1e-6
     )
-    assert (result.descent.cost < result.descent.cost_before).all()
+    assert (result.minimum.cost < result.minimum.cost_before).all()
     result.plot()
     augment.save(result, tmp_path)
 
@@ -217,7 +217,7 @@ def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color
     scene = orange_labeled("lime")
     with pytest.raises(InputError, match=r"1 of 1 images .*solid:orange"):
         augment.attack(by_color, scene)
-    assert augment.attack(by_color, scene, force=True).descent.success_before.all()
+    assert augment.attack(by_color, scene, force=True).minimum.success_before.all()
 
 
 @pytest.mark.parametrize(

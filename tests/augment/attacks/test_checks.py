@@ -25,7 +25,7 @@ def slow_attack(attacked) -> AttackResult:
 
 def test_checks_tell_that_the_cost_falls(slow_attack):
     checks = augment.check(slow_attack)
-    descent = slow_attack.descent
+    descent = slow_attack.minimum
     assert checks["cost_before"] == pytest.approx(float(descent.cost_before.mean()))
     assert checks["cost"] == pytest.approx(float(descent.cost.mean()))
     assert checks["cost"] < checks["cost_before"]
@@ -60,10 +60,6 @@ def test_a_cost_that_stays_the_same_does_not_count_as_one_that_fell(attacked):
     assert checks["zero_gradient"] == 1
 
 
-def test_checks_are_the_same_when_they_are_repeated(slow_attack):
-    assert augment.check(slow_attack) == augment.check(slow_attack)
-
-
 def test_a_success_within_the_steps_counts_even_if_a_margin_sends_it_on(attacked):
     light = {"lighting": StepSettings(step_size=0.2)}
     checks = augment.check(attacked(light, margin=100, max_steps=3))
@@ -95,29 +91,6 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
     checks = augment.check(attacked(light, classifier=classifier))
     assert checks["success"] == checks["random_search"] == 1
     assert len(warnings(checks)) == 1
-
-
-GOOD = {
-    "cost_fell": 1.0,
-    "zero_gradient": 0.0,
-    "success": 0.8,
-    "random_search": 0.5,
-    "success_without_noise": 0.9,
-}
-NO_SUCCESS = {"random_search": 0.0, "success": 0.0, "success_without_noise": 0.0}
-
-
-@pytest.mark.parametrize(
-    ("changes", "count"),
-    [
-        ({}, 0),
-        (NO_SUCCESS, 0),
-        ({"success": 0.4, "random_search": 0.0}, 1),
-        ({"cost_fell": 0.9, "zero_gradient": 0.1}, 2),
-    ],
-)
-def test_warnings_follow_from_the_numbers(changes, count):
-    assert len(warnings(GOOD | changes)) == count
 
 
 # --------------------------------------------------------------- success by radius

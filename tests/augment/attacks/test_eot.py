@@ -153,10 +153,10 @@ def test_success_is_by_the_image_itself_and_not_by_the_mean_over_transformations
     classifier = augment.Classifier(smooth_or_rough, 8, ("smooth", "rough"))
     noise = EOTSettings(draws=4, jitter=0.0, exposure=0.0, noise=0.5)
     result = attacked("lighting", classifier=classifier, max_steps=0, eot=noise)
-    assert result.descent.cost < -1  # The mean log-probability of the right class is low.
-    assert not result.descent.success.any()
+    assert result.minimum.cost < -1  # The mean log-probability of the right class is low.
+    assert not result.minimum.success.any()
     assert not result.success.any()
-    assert result.descent.predicted.item() == 0
+    assert result.minimum.predicted.item() == 0
 
 
 CHANGES = {"jitter": 0.2, "exposure": 0.5, "noise": 0.1, "jpeg": 60}

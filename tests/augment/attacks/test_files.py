@@ -63,8 +63,8 @@ def test_each_example_has_a_line_with_the_numbers_of_its_descent(saved):
         assert line["example"] == example
         assert line["label"] == ["orange"]
         for name in ("success", "success_before", "steps", "cost", "cost_before"):
-            assert line[name] == getattr(result.descent, name)[example].item()
-        change = result.descent.values[example] - result.problem.start[example]
+            assert line[name] == getattr(result.minimum, name)[example].item()
+        change = result.minimum.values[example] - result.problem.start[example]
         assert line["largest_change"] == {"lighting": change.abs().max().item()}
         assert line["largest_change"]["lighting"] > 0
 
@@ -159,7 +159,7 @@ def save_light_of(attacked, tmp_path_factory):
         result = attacked(steps, scene, force=True, max_steps=2)
         folder = tmp_path_factory.mktemp(name)
         (line,) = augment.save(result, folder)
-        light = result.descent.values[0].unflatten(0, (49, 3))
+        light = result.minimum.values[0].unflatten(0, (49, 3))
         return SavedLight(folder / "example_000", light, line, name)
 
     return save

@@ -1,111 +1,17 @@
-"""Attacks without gradients find known optima, stay in their balls and count their queries."""
-
-from dataclasses import dataclass, fields
+"""Attacks without gradients stay in their balls and count their queries."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.special import softmax
-from torch import Tensor, nn
+from torch import nn
 
 import augment
-from augment.attack_settings import AttackSettings, StepSettings
-from augment.attacks.loop import Minimum, minimize
-from augment.attacks.norm_ball import project
-from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
 from renderer.light.nonnegative import project_nonnegative
 from renderer.light.presets import load_light
 
 OPTIMIZERS = ["random_search", "cma_es"]
-VALUE_COUNT = 4
-RADIUS = 0.4
-EPS = torch.finfo(torch.float64).eps
-
-
-def random(*shape: int, seed: int) -> Tensor:
-    """Return normal numbers in float64."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-SLOPE = random(VALUE_COUNT, seed=0)
-CENTERS = random(3, VALUE_COUNT, seed=1)
-
-
-class Linear(nn.Module):
-    """Two classes. The first leads the second by 20 + slope · values of the image."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        lead = 20 + images.flatten(1) @ SLOPE
-        return torch.stack([lead, torch.zeros_like(lead)], dim=1)
-
-
-@dataclass
-class Values:
-    """A scene whose images are the values themselves, in balls around the start."""
-
-    ball: StepSettings
-    start: Tensor
-    group_size: int = 1000
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return values[:, None, None, None]
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return project(self.ball, values, self.start[examples])
-
-    def search_scale(self, examples: Tensor) -> Tensor:
-        return torch.full_like(self.start[examples], RADIUS / 2)
-
-
-def search(optimizer: str, norm: str, start: Tensor, queries: int, seed: int = 0) -> Minimum:
-    """Lower the lead of the first class, which always remains."""
-    problem = Values(StepSettings(norm, RADIUS), start)
-    criterion = Criterion(torch.zeros(len(start), 1, dtype=torch.int64))
-    settings = AttackSettings(optimizer=optimizer, max_queries=queries, quantized=False)
-    return minimize(problem, Objective(Linear(), criterion, settings, seed))
-
-
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_search_finds_the_lowest_point_of_an_l2_ball(optimizer):
-    result = search(optimizer, "l2", CENTERS, queries=400)
-    lowest = CENTERS - RADIUS * SLOPE / SLOPE.norm()
-    # The cost is quadratic in the distance from the lowest point of the sphere.
-    torch.testing.assert_close(result.values, lowest, rtol=0, atol=0.05 * RADIUS)
-    found = (result.values - CENTERS) @ SLOPE
-    assert (found < -0.999 * RADIUS * SLOPE.norm()).all()
-
-
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_search_finds_the_lowest_corner_of_an_linf_ball(optimizer):
-    result = search(optimizer, "linf", CENTERS, queries=400)
-    found = (result.values - CENTERS) @ SLOPE
-    assert (found < -0.999 * RADIUS * SLOPE.abs().sum()).all()
-
-
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_the_same_seed_gives_the_same_result_and_leaves_other_random_numbers(optimizer):
-    numpy_state = np.random.get_state()[1].copy()
-    torch_state = torch.random.get_rng_state()
-    first = search(optimizer, "l2", CENTERS, queries=60)
-    assert (np.random.get_state()[1] == numpy_state).all()
-    assert torch.equal(torch.random.get_rng_state(), torch_state)
-    again = search(optimizer, "l2", CENTERS, queries=60)
-    for field in fields(Minimum):
-        assert torch.equal(getattr(first, field.name), getattr(again, field.name)), field.name
-    other = search(optimizer, "l2", CENTERS, queries=60, seed=1)
-    assert not torch.equal(first.values, other.values)
-
-
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_an_example_is_searched_as_if_alone(optimizer):
-    together = search(optimizer, "l2", CENTERS, queries=60)
-    alone = search(optimizer, "l2", CENTERS[:1], queries=60)
-    torch.testing.assert_close(alone.values[0], together.values[0], rtol=0, atol=64 * EPS)
-
-
-# --------------------------------------------------------------- scenes
-
 BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 
 
@@ -142,12 +48,10 @@ PARAMETERS = ["lighting", "skylight", "geometry", "pose", "material", "albedo", 
 
 
 @pytest.mark.parametrize("parameter", PARAMETERS)
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_search_lowers_the_cost_of_every_parameter(attacked, optimizer, parameter):
-    pytest.importorskip("cma")
-    result = attacked(parameter, optimizer=optimizer, max_queries=30, margin=100.0)
-    assert result.descent.cost < result.descent.cost_before
-    assert not result.descent.zero_gradient.any()
+def test_search_lowers_the_cost_of_every_parameter(attacked, parameter):
+    result = attacked(parameter, optimizer="random_search", max_queries=30, margin=100.0)
+    assert result.minimum.cost < result.minimum.cost_before
+    assert not result.minimum.zero_gradient.any()
 
 
 def logits_of_means(images: np.ndarray) -> np.ndarray:
@@ -190,7 +94,7 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     assert len(function.images) == int(result.queries.sum()) + gray + probes
     assert len(set(function.images)) >= int(result.queries.sum())
     assert result.backward_passes.tolist() == [0] * len(scene)
-    assert (result.descent.queries <= 40).all()
+    assert (result.minimum.queries <= 40).all()
 
 
 @pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
@@ -214,11 +118,11 @@ def test_all_starts_together_show_at_most_the_given_number_of_images(
 def test_the_queries_of_a_gradient_attack_are_limited_and_counted_alike(attacked):
     options = {"max_steps": 50, "margin": 100.0}
     limited = attacked("lighting", max_queries=7, **options)
-    assert limited.descent.queries.tolist() == [7]
+    assert limited.minimum.queries.tolist() == [7]
     assert limited.backward_passes.tolist() == [7]
     assert limited.steps.tolist() == [6]
     steps = attacked("lighting", max_steps=6, margin=100.0)
-    assert torch.equal(limited.descent.values, steps.descent.values)
+    assert torch.equal(limited.minimum.values, steps.minimum.values)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:You are using the legacy")
@@ -254,9 +158,9 @@ def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_net
     torch_result, *others = [
         augment.attack(function, scene, settings=settings, force=True) for function in functions
     ]
-    assert torch_result.descent.cost < torch_result.descent.cost_before
+    assert torch_result.minimum.cost < torch_result.minimum.cost_before
     for other in others:
-        assert torch.equal(other.descent.values, torch_result.descent.values)
+        assert torch.equal(other.minimum.values, torch_result.minimum.values)
         torch.testing.assert_close(other.logits, torch_result.logits, rtol=1e-4, atol=1e-5)
 
 
@@ -300,7 +204,7 @@ def test_a_function_that_takes_only_the_dtype_of_the_scene_keeps_its_gradients(
 )
 def test_a_function_may_take_and_return_tensors_or_arrays(function):
     classifier = augment.Classifier(function, 4, ["red", "green", "blue"])
-    images = random(2, 3, 4, 4, seed=0).sigmoid().float()
+    images = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
     for _ in range(2):
         torch.testing.assert_close(classifier(images), images.mean((2, 3)))
 

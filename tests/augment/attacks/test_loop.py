@@ -1,15 +1,16 @@
-"""Descent follows its closed form on linear classifiers, and attacks each example by itself."""
+"""Optimizers find known minima of known problems, and each example is attacked by itself."""
 
 import dataclasses
 import math
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.attack_settings import STEPS, AttackSettings, StepSettings
+from augment.attack_settings import NORMS, OPTIMIZERS, STEPS, AttackSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.norm_ball import project, sample, scale_gradient
 from augment.attacks.objective import Criterion, Objective
@@ -26,16 +27,12 @@ def random(*shape: int, seed: int) -> Tensor:
 
 
 class Linear(nn.Module):
-    """Two classes whose logits are linear in the image.
+    """Two classes whose logits are linear in the image."""
 
-    Attributes:
-        image_count: How many images it was given.
-    """
-
-    def __init__(self, weight: Tensor, bias: float = 0.0):
+    def __init__(self, bias: float = 0.0):
         super().__init__()
-        self.weight = nn.Parameter(weight)
-        self.bias = torch.tensor([bias, 0.0], dtype=weight.dtype)
+        self.weight = nn.Parameter(WEIGHT)
+        self.bias = torch.tensor([bias, 0.0], dtype=torch.float64)
         self.image_count = 0
 
     def forward(self, images: Tensor) -> Tensor:
@@ -45,6 +42,8 @@ class Linear(nn.Module):
 
 WEIGHT = random(2, 12, seed=0)
 CAMERAS = random(2, VALUE_COUNT, 12, seed=1) / 4
+# Gradient of the lead of the first class with respect to the values, in each view.
+SLOPES = CAMERAS @ (WEIGHT[0] - WEIGHT[1])
 
 
 @dataclass
@@ -55,9 +54,7 @@ class LinearScene:
     """
 
     start: Tensor
-    rule: str = "unit"
-    step_size: float = 0.05
-    ball: StepSettings = field(default_factory=StepSettings)
+    steps: StepSettings = field(default_factory=StepSettings)
     views: int = 1
     center: Tensor | None = None
     """Centers of the balls, shape (E, D); None for the start."""
@@ -75,10 +72,13 @@ class LinearScene:
         return (images * brightness[:, None, None]).unflatten(2, IMAGE_SHAPE)
 
     def scale_gradient(self, gradient: Tensor) -> Tensor:
-        return scale_gradient(StepSettings(step=self.rule, step_size=self.step_size), gradient)
+        return scale_gradient(self.steps, gradient)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return project(self.ball, values, self.center[examples])
+        return project(self.steps, values, self.center[examples])
+
+    def search_scale(self, examples: Tensor) -> Tensor:
+        return torch.full_like(self.center[examples], self.steps.radius / 2)
 
 
 def settings_of(max_steps: int = 30, margin: float = 0.0, **others) -> AttackSettings:
@@ -95,57 +95,37 @@ def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **setting
     return descend(model, problem, Criterion(labels[:, None]), settings_of(steps, **settings))
 
 
-# --------------------------------------------------------------- closed forms
+# --------------------------------------------------------------- known minima
 
 
-@dataclass
-class Expected:
-    """Where descent on a linear classifier ends."""
-
-    displacement: Tensor
-    steps: int
-    margin_before: float
-    margin: float
-
-
-def closed_form(
-    step: str,
-    step_size: float,
-    max_steps: int,
-    slope: Tensor,
-    start: Tensor,
-) -> Expected:
-    """Descend on log σ(m) with the margin m = slope · values.
-
-    The gradient is σ(-m) · slope, so that its direction never changes.
-
-    Args:
-        step: Rule of the steps.
-        step_size: Length of a step.
-        max_steps: Number of steps after which descent ends.
-        slope: Gradient of the margin, shape (D,).
-        start: First values, shape (D,).
-    """
-    margin_before = float(slope @ start)
-    margin = margin_before
-    displacement = torch.zeros(VALUE_COUNT, dtype=torch.float64)
-    steps = 0
-    while margin > 0 and steps < max_steps:
-        if step == "unit":
-            move = slope / slope.norm()
-        elif step == "sign":
-            move = slope.sign()
-        else:
-            move = slope / (1 + math.exp(margin))
-        displacement -= step_size * move
-        margin -= step_size * float(slope @ move)
-        steps += 1
-    return Expected(displacement, steps, margin_before, margin)
-
-
-def log_probability(margin: float) -> float:
-    """Return log σ(margin)."""
-    return -math.log1p(math.exp(-margin))
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_the_lowest_point_of_a_ball_is_found_from_anywhere_in_it(optimizer, norm, views):
+    """The first class leads by 50, so that no example succeeds."""
+    if optimizer == "cma_es":
+        pytest.importorskip("cma")
+    step = "unit" if norm == "l2" else "sign"
+    ball = StepSettings(norm, 0.4, step, step_size=0.3)
+    center = random(3, VALUE_COUNT, seed=2)
+    start = sample(ball, center, torch.Generator().manual_seed(0))
+    # With a target, the cost is the sum of the leads of all views, which is linear in the values.
+    zeros = torch.zeros(3, views, dtype=torch.int64)
+    criterion = Criterion(zeros, zeros + 1)
+    queries = None if optimizer == "gradient" else 400 * views
+    settings = settings_of(120, optimizer=optimizer, max_queries=queries)
+    problem = LinearScene(start, ball, views, center)
+    result = descend(Linear(bias=50.0), problem, criterion, settings)
+    slope = SLOPES[:views].sum(0)
+    direction = slope / slope.norm() if norm == "l2" else slope.sign()
+    depth = (center - result.values) @ slope
+    # Random changes of all values at once seldom move the last one alone to its face of the cube.
+    share = 0.9 if (optimizer, norm) == ("random_search", "linf") else 0.999
+    assert (depth > share * 0.4 * direction @ slope).all()
+    if optimizer == "gradient":
+        # Each step turns the values towards the end by a factor of at least 0.4 / 0.7.
+        expected = (center - 0.4 * direction).expand(3, -1)
+        torch.testing.assert_close(result.values, expected, rtol=0, atol=64 * EPS)
 
 
 STEP_SIZES = {"unit": 0.3, "sign": 0.1, "raw": 0.4}
@@ -153,112 +133,73 @@ EXAMPLE_COUNT = 16
 MAX_STEPS = 6
 
 
-@pytest.fixture(params=STEP_SIZES)
-def linear_attack(request) -> tuple[Linear, LinearScene, Tensor, Minimum, list[Expected]]:
-    """Attack examples that succeed at once, on the way, and never."""
-    step = request.param
+@pytest.mark.parametrize("rule", STEP_SIZES)
+def test_descent_on_a_linear_classifier_follows_its_closed_form(rule):
+    """The cost is log σ(m) with the lead m = slope · values, and its gradient σ(−m) · slope.
+
+    Examples succeed at once, on the way, and never.
+    """
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
     labels = torch.arange(EXAMPLE_COUNT) % 2
-    problem = LinearScene(start, step, STEP_SIZES[step])
-    model = Linear(WEIGHT)
+    problem = LinearScene(start, StepSettings(step=rule, step_size=STEP_SIZES[rule]))
+    model = Linear()
     result = attack(model, problem, labels, steps=MAX_STEPS, batch_size=5)
-    slope = CAMERAS[0] @ (WEIGHT[0] - WEIGHT[1])
-    expected = []
-    for row in range(EXAMPLE_COUNT):
-        sign = 1 - 2 * int(labels[row])  # The margin of class 1 is the negative one of class 0.
-        row_slope = sign * (1 + row / 10) * slope
-        expected.append(closed_form(step, STEP_SIZES[step], MAX_STEPS, row_slope, start[row]))
-    assert {0, MAX_STEPS} < {row.steps for row in expected}
-    return model, problem, labels, result, expected
-
-
-def test_descent_on_a_linear_classifier_takes_the_steps_of_the_closed_form(linear_attack):
-    _, problem, _, result, expected = linear_attack
-    assert result.steps.tolist() == [row.steps for row in expected]
-    displacement = torch.stack([row.displacement for row in expected])
+    # The lead of class 1 is the negative one of class 0.
+    signs = (1 - 2 * labels) * (1 + torch.arange(EXAMPLE_COUNT).double() / 10)
+    slopes = signs[:, None] * SLOPES[0]
+    values = start.clone()
+    leads = (slopes * values).sum(1)
+    before = leads
+    steps = torch.zeros_like(labels)
+    for _ in range(MAX_STEPS):
+        moves = {
+            "unit": slopes / slopes.norm(dim=1, keepdim=True),
+            "sign": slopes.sign(),
+            "raw": slopes * (-leads).sigmoid()[:, None],
+        }
+        values = torch.where((leads > 0)[:, None], values - STEP_SIZES[rule] * moves[rule], values)
+        steps += leads > 0
+        leads = (slopes * values).sum(1)
+    assert {0, MAX_STEPS} < set(steps.tolist())
+    assert torch.equal(result.steps, steps)
     # Each of six steps rounds a few times, in sums of 12 terms.
-    found = result.values - problem.start
-    torch.testing.assert_close(found, displacement, rtol=0, atol=64 * EPS)
-
-
-def test_descent_on_a_linear_classifier_has_the_costs_and_successes_of_the_closed_form(
-    linear_attack,
-):
-    _, _, labels, result, expected = linear_attack
-    before = [row.margin_before for row in expected]
-    after = [row.margin for row in expected]
-    assert result.success_before.tolist() == [margin < 0 for margin in before]
-    assert result.success.tolist() == [margin < 0 for margin in after]
+    torch.testing.assert_close(result.values, values, rtol=0, atol=64 * EPS)
+    for cost, lead in ((result.cost_before, before), (result.cost, leads)):
+        torch.testing.assert_close(cost, nn.functional.logsigmoid(lead), rtol=128 * EPS, atol=0)
+    assert torch.equal(result.success_before, before < 0)
+    assert torch.equal(result.success, leads < 0)
     assert torch.equal(result.predicted[:, 0] != labels, result.success)
-    for costs, margins in ((result.cost_before, before), (result.cost, after)):
-        log_probabilities = [log_probability(margin) for margin in margins]
-        assert costs.tolist() == pytest.approx(log_probabilities, rel=128 * EPS)
     assert not result.zero_gradient.any()
-
-
-def test_successful_examples_are_not_rendered_again(linear_attack):
-    model, problem, _, result, _ = linear_attack
+    # Successful examples are not rendered again.
     assert torch.equal(problem.render_counts, result.steps + 1)
     assert model.image_count == int(problem.render_counts.sum())
-
-
-def test_the_images_are_those_of_the_final_values(linear_attack):
-    _, problem, _, result, _ = linear_attack
     images = problem.render(result.values, torch.arange(EXAMPLE_COUNT))
     torch.testing.assert_close(result.images, images, rtol=0, atol=16 * EPS)
 
 
-@pytest.mark.parametrize("step", ["unit", "raw"])
-@pytest.mark.parametrize("views", [1, 2])
-def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step):
-    """From starts off the center, the first steps lead elsewhere on the surface."""
-    ball = StepSettings("l2", 0.4)
-    center = random(8, VALUE_COUNT, seed=2)
-    start = sample(ball, center, torch.Generator().manual_seed(0))
-    problem = LinearScene(start, step, 0.3, ball, views, center)
-    zeros = torch.zeros(8, views, dtype=torch.int64)
-    criterion = Criterion(zeros, zeros + 1)
-    result = descend(Linear(WEIGHT, bias=50.0), problem, criterion, settings_of(120))
-    slope = (CAMERAS[:views] @ (WEIGHT[0] - WEIGHT[1])).sum(0)
-    expected = center - 0.4 * slope / slope.norm()
-    # Each step turns the values towards the end by a factor of at least 0.4 / 0.7.
-    torch.testing.assert_close(result.values, expected, rtol=0, atol=64 * EPS)
-
-
-# --------------------------------------------------------------- goals
-
-
 @pytest.mark.parametrize(
-    ("predicted", "is_reached"),
-    [([2, 2], True), ([1, 0], True), ([2, 1], False)],
+    ("source", "target", "predicted", "is_reached"),
+    [
+        ([0, 1], None, [2, 2], True),
+        ([0, 1], None, [1, 0], True),
+        ([0, 1], None, [2, 1], False),
+        ([0, 0], [1, 2], [1, 2], True),
+        ([0, 0], [1, 2], [2, 1], False),
+        ([0, 0], [1, 2], [1, 1], False),
+    ],
 )
-def test_an_untargeted_goal_is_reached_when_every_view_is_misclassified(predicted, is_reached):
-    criterion = Criterion(torch.tensor([[0, 1]]))
+def test_a_criterion_is_reached_by_all_views(source, target, predicted, is_reached):
+    """Without a target, every view is misclassified; with one, each view has its own target."""
+    targets = None if target is None else torch.tensor([target])
+    criterion = Criterion(torch.tensor([source]), targets)
     assert criterion.reached(torch.tensor([predicted])).tolist() == [is_reached]
-
-
-@pytest.mark.parametrize(
-    ("predicted", "is_reached"),
-    [([1, 2], True), ([2, 1], False), ([1, 1], False)],
-)
-def test_a_targeted_goal_is_reached_when_every_view_has_its_own_target(predicted, is_reached):
-    criterion = Criterion(torch.tensor([[0, 0]]), torch.tensor([[1, 2]]))
-    assert criterion.reached(torch.tensor([predicted])).tolist() == [is_reached]
-
-
-def test_a_goal_of_some_examples_is_theirs():
-    criterion = Criterion(torch.tensor([[0], [1], [2]]), torch.tensor([[1], [2], [0]]))
-    predicted = torch.tensor([[1], [0], [0]])
-    assert criterion.reached(predicted).tolist() == [True, False, True]
-    rows = torch.tensor([2, 1])
-    assert criterion.select(rows).reached(predicted[rows]).tolist() == [True, False]
 
 
 def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
-    problem = LinearScene(start, "unit", 0.3, views=2)
+    problem = LinearScene(start, StepSettings(step_size=0.3), views=2)
     criterion = Criterion(torch.zeros(EXAMPLE_COUNT, 2, dtype=torch.int64))
-    model = Linear(WEIGHT)
+    model = Linear()
     result = descend(model, problem, criterion, settings_of(30, margin=0.5))
     logits = model(result.images.flatten(0, 1)).unflatten(0, (-1, 2))
     leads = logits[..., 1] - logits[..., 0]
@@ -406,9 +347,9 @@ def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
     gray = torch.full((12,), 0.5)
     overexposed = torch.full((12,), 3.0)
     start = torch.stack([gray, overexposed]).double()
-    problem = ClampedScene(start, step, 0.01)
+    problem = ClampedScene(start, StepSettings(step=step, step_size=0.01))
     labels = torch.zeros(2, dtype=torch.int64)
-    result = attack(Linear(WEIGHT, bias=20.0), problem, labels, steps=4)
+    result = attack(Linear(bias=20.0), problem, labels, steps=4)
     assert result.zero_gradient.tolist() == [False, True]
     assert result.steps.tolist() == [4, 4]
     assert not result.success.any()
@@ -436,16 +377,17 @@ def small_network() -> nn.Sequential:
 NINE_STARTS = 3 * random(9, VALUE_COUNT, seed=3)
 
 
-def attack_nine(views: int, **settings) -> Minimum:
+def attack_nine(views: int, examples: Tensor | None = None, seed: int = 0, **settings) -> Minimum:
     """Attack nine examples, of which some succeed at once, some on the way and some never."""
-    problem = LinearScene(NINE_STARTS, step_size=0.3, views=views)
-    labels = torch.arange(9) % 4
-    criterion = Criterion(labels[:, None].expand(9, views))
-    return descend(small_network(), problem, criterion, settings_of(8, **settings))
+    problem = LinearScene(NINE_STARTS, StepSettings("l2", 3.0, step_size=0.3), views=views)
+    chosen = torch.arange(9) if examples is None else examples
+    criterion = Criterion((chosen % 4)[:, None].expand(-1, views))
+    objective = Objective(small_network(), criterion, settings_of(8, **settings), seed)
+    return minimize(problem, objective, examples=examples)
 
 
 @pytest.mark.parametrize("views", [1, 2])
-@pytest.mark.parametrize("batch_size", [1, 3, 4, 100])
+@pytest.mark.parametrize("batch_size", [1, 4, 100])
 def test_the_batch_size_does_not_matter(batch_size, views):
     """A batch may end between two views of an example."""
     whole = attack_nine(views, batch_size=9 * views)
@@ -457,30 +399,29 @@ def test_the_batch_size_does_not_matter(batch_size, views):
         torch.testing.assert_close(found, getattr(whole, name), rtol=0, atol=1e-12)
 
 
-class OneOfNine(LinearScene):
-    """A scene with one of the nine examples."""
-
-    row: int = 0
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        whole = LinearScene(NINE_STARTS, views=self.views)
-        return whole.render(values, examples + self.row)
-
-
-@pytest.mark.parametrize("backtracking", [False, True])
-@pytest.mark.parametrize("views", [1, 2])
-def test_every_example_is_attacked_as_if_alone(views, backtracking):
-    together = attack_nine(views, backtracking=backtracking)
-    settings = settings_of(8, backtracking=backtracking)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"backtracking": True},
+        {"optimizer": "random_search", "max_queries": 40},
+        {"optimizer": "cma_es", "max_queries": 40},
+    ],
+    ids=["gradient", "backtracking", "random_search", "cma_es"],
+)
+def test_every_example_is_attacked_as_if_alone_and_alike_with_the_same_seed(options):
+    numpy_state = np.random.get_state()[1].copy()
+    torch_state = torch.random.get_rng_state()
+    together = attack_nine(2, **options)
+    assert (np.random.get_state()[1] == numpy_state).all()
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
     for row in range(9):
-        alone = OneOfNine(NINE_STARTS[[row]], step_size=0.3, views=views)
-        alone.row = row
-        criterion = Criterion(torch.full((1, views), row % 4))
-        result = descend(small_network(), alone, criterion, settings)
+        alone = attack_nine(2, torch.tensor([row]), **options)
         for name in FIELDS:
-            found = getattr(result, name)[0]
-            expected = getattr(together, name)[row]
-            torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+            found = getattr(alone, name)[0]
+            torch.testing.assert_close(found, getattr(together, name)[row], rtol=0, atol=1e-12)
+    other = attack_nine(2, seed=1, **options)
+    assert torch.equal(other.values, together.values) == ("optimizer" not in options)
 
 
 @pytest.mark.parametrize("backtracking", [False, True])
@@ -492,68 +433,39 @@ def test_a_margin_changes_no_success_and_lets_successful_examples_continue(backt
     assert (with_margin.steps > without.steps)[without.success].any()
 
 
-# --------------------------------------------------------------- restarts
-
-
-@dataclass
-class Restarted:
-    """An attack with two restarts, and the same descents one by one."""
-
-    result: Minimum
-    render_counts: Tensor
-    single: list[Minimum]
-    first_success: list[int]
-    """Which of the single descents is the first that succeeds, or 0."""
-
-
-@pytest.fixture(scope="module")
-def restarted() -> Restarted:
-    """Attack 40 examples, of which some need one or two restarts and some never succeed."""
+def test_restarts_go_on_with_the_examples_without_success_and_keep_the_first_success():
+    """Of 40 examples, some need one or two restarts and some never succeed."""
     center = random(40, VALUE_COUNT, seed=3)
-    ball = StepSettings("linf", 0.5)
-    network = Linear(WEIGHT)
+    steps = StepSettings("linf", 0.5, "sign", 0.1)
     criterion = Criterion(torch.arange(40)[:, None] % 2)
     settings = settings_of(2, sensor_noise=0.0)
-    starts = [sample(ball, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
-    problem = LinearScene(center, "sign", 0.1, ball)
-    result = descend(network, problem, criterion, settings, restarts=starts)
+    starts = [sample(steps, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
+    problem = LinearScene(center, steps)
+    result = descend(Linear(), problem, criterion, settings, restarts=starts)
     single = []
     for start in (center, *starts):
-        alone = LinearScene(start, "sign", 0.1, ball, center=center)
-        single.append(descend(network, alone, criterion, settings))
+        alone = LinearScene(start, steps, center=center)
+        single.append(descend(Linear(), alone, criterion, settings))
     # The ball limits some values.
     radius = torch.tensor(0.5).double()
     assert torch.isclose((single[1].values - center).abs(), radius).any()
     successes = torch.stack([each.success for each in single])
+    # The first single descent that succeeds, or 0.
     first_success = successes.long().argmax(0).tolist()
     assert set(first_success) == {0, 1, 2}
     assert not result.success.all()
-    return Restarted(result, problem.render_counts, single, first_success)
-
-
-def test_restarts_keep_the_first_success(restarted):
-    """An example without any success keeps the result of the first descent."""
-    successes = torch.stack([each.success for each in restarted.single])
-    assert torch.equal(restarted.result.success, successes.any(0))
-    for row, chosen in enumerate(restarted.first_success):
+    assert torch.equal(result.success, successes.any(0))
+    for row, chosen in enumerate(first_success):
         for name in ("values", "images", "cost", "predicted"):
-            found = getattr(restarted.result, name)[row]
-            expected = getattr(restarted.single[chosen], name)[row]
+            found = getattr(result, name)[row]
+            expected = getattr(single[chosen], name)[row]
             torch.testing.assert_close(found, expected, rtol=0, atol=64 * EPS)
-
-
-def test_restarts_go_on_with_the_examples_without_success(restarted):
-    result = restarted.result
-    for row, chosen in enumerate(restarted.first_success):
         last = chosen if result.success[row] else 2
-        steps = sum(int(each.steps[row]) for each in restarted.single[: last + 1])
-        assert int(result.steps[row]) == steps
-        assert int(restarted.render_counts[row]) == steps + last + 1
-
-
-def test_restarts_report_the_first_descent_as_the_state_before(restarted):
+        step_count = sum(int(each.steps[row]) for each in single[: last + 1])
+        assert int(result.steps[row]) == step_count
+        assert int(problem.render_counts[row]) == step_count + last + 1
     for name in ("cost_before", "success_before", "zero_gradient"):
-        assert torch.equal(getattr(restarted.result, name), getattr(restarted.single[0], name))
+        assert torch.equal(getattr(result, name), getattr(single[0], name))
 
 
 # --------------------------------------------------------------- what is left as it was
@@ -615,7 +527,7 @@ def test_the_model_and_the_random_state_are_left_as_they_were(fails_at, grad_mod
 def test_the_start_is_not_written_to():
     start = random(1, VALUE_COUNT, seed=2)
     shared = start.expand(4, VALUE_COUNT)  # All four rows lie in one place in memory.
-    result = attack(Linear(WEIGHT), LinearScene(shared, step_size=0.3), torch.arange(4) % 2)
+    result = attack(Linear(), LinearScene(shared, StepSettings(step_size=0.3)), torch.arange(4) % 2)
     assert torch.equal(start, random(1, VALUE_COUNT, seed=2))
     assert not result.values.requires_grad
     assert not result.images.requires_grad

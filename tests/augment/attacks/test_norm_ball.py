@@ -217,18 +217,3 @@ def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step, expe
     settings = StepSettings(step=step, step_size=1.0)
     steps = scale_gradient(settings, torch.tensor(GRADIENT))
     torch.testing.assert_close(steps, torch.tensor(expected), rtol=0, atol=EPS)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"norm": "l1", "radius": 1.0}, "norm=l1"),
-        ({"norm": "l2", "radius": -0.1}, "radius=-0.1"),
-        ({"step": "newton"}, "step=newton"),
-        ({"step_size": 0.0}, "step_size=0.0"),
-        ({"step_size": math.nan}, "step_size=nan"),
-    ],
-)
-def test_balls_and_steps_that_do_not_exist_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        StepSettings(**options)

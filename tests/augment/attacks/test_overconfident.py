@@ -74,5 +74,5 @@ def test_a_network_of_half_precision_has_a_gradient_where_it_is_certain():
     settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.1), max_steps=1)
     result = nb.attack(classifier, scene, settings=settings)
     assert result.logits_before[0, 0] > 20
-    assert not result.descent.zero_gradient.any()
-    assert result.descent.cost < result.descent.cost_before
+    assert not result.minimum.zero_gradient.any()
+    assert result.minimum.cost < result.minimum.cost_before

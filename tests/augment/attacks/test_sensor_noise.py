@@ -16,7 +16,6 @@ from augment.attacks.result import AttackResult
 from augment.augmentation_settings import TrainingAttackSettings
 from augment.losses import NO_CLASS
 from augment.service import Renders
-from renderer.errors import InputError
 
 SIZE = 8
 PATTERN = torch.randn(3, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) / SIZE
@@ -93,11 +92,6 @@ def test_an_image_counts_with_the_probability_of_gaussian_noise_in_three_draws(w
     tolerance = 4 * math.sqrt(expected * (1 - expected) / len(images))
     rate = counted(images, nervous(0.0), quantized=False).double().mean().item()
     assert rate == pytest.approx(expected, abs=tolerance)
-
-
-def test_without_noise_every_image_with_a_lead_counts(with_lead):
-    _, images = with_lead
-    assert counted(images, nervous(0.0), sensor_noise=0.0, quantized=False).all()
 
 
 def noisy_images(images: Tensor, rows: Tensor, seed: int) -> list[Tensor]:
@@ -229,8 +223,8 @@ def test_noise_changes_neither_the_descent_nor_any_other_random_number(attacked)
     with_noise = small_attack(attacked, sensor_noise=1.0)
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.equal(without.images, with_noise.images)
-    for name, value in vars(without.descent).items():
-        assert torch.equal(value, getattr(with_noise.descent, name)), name
+    for name, value in vars(without.minimum).items():
+        assert torch.equal(value, getattr(with_noise.minimum, name)), name
 
 
 def test_fewer_attacks_count_with_noise(attacked):
@@ -302,57 +296,27 @@ def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(
     assert rates[0.0][1] < rates[None][1]
 
 
-@pytest.fixture(scope="module")
-def noisy_attack(attacked) -> AttackResult:
-    """Return an attack with noise and a margin."""
-    return small_attack(attacked, sensor_noise=1.0, margin=3.0)
-
-
-@pytest.fixture(scope="module")
-def checks(noisy_attack) -> dict:
-    """Return the checks of the attack with noise."""
-    return augment.check(noisy_attack)
-
-
-def test_checks_count_as_the_attack_does(noisy_attack, checks):
-    is_clean = noisy_attack.clean_correct
+def test_checks_files_transfers_and_sweeps_count_as_the_attack_does(attacked, tmp_path):
+    result = small_attack(attacked, sensor_noise=1.0, margin=3.0)
+    checks = augment.check(result)
+    lines = augment.save(result, tmp_path, checks, verify=["reload"])
     for name in ("success", "success_without_noise"):
-        expected = getattr(noisy_attack, name)[is_clean].double().mean().item()
-        assert checks[name] == expected
+        success = getattr(result, name)
+        assert checks[name] == success[result.clean_correct].double().mean().item()
+        for line, expected in zip(lines, success.tolist(), strict=True):
+            versions = line["versions"]
+            assert line[name] == versions["float"][name] == versions["reload"][name] == expected
     assert checks["success_by_steps"][12] == checks["success"]
     assert checks["random_search"] <= checks["random_search_without_noise"]
-
-
-def test_successes_by_steps_rise_and_are_fewer_with_noise(checks):
     with_noise = list(checks["success_by_steps"].values())
     without = list(checks["success_by_steps_without_noise"].values())
     assert with_noise == sorted(with_noise)
-    assert without == sorted(without)
-    for noisy, exact in zip(with_noise, without, strict=True):
-        assert noisy <= exact
-
-
-def test_files_count_as_the_attack_does(noisy_attack, checks, tmp_path):
-    lines = augment.save(noisy_attack, tmp_path, checks, verify=["reload"])
-    for row, line in enumerate(lines):
-        for name in ("success", "success_without_noise"):
-            expected = bool(getattr(noisy_attack, name)[row])
-            versions = line["versions"]
-            assert line[name] == expected
-            assert versions["float"][name] == expected
-            assert versions["reload"][name] == expected
-
-
-def test_transfers_to_the_attacked_classifier_count_as_the_attack_does(noisy_attack):
-    (row,) = augment.transfer(noisy_attack, [noisy_attack.classifier])
-    is_transferred = noisy_attack.clean_correct & noisy_attack.success
-    assert row["success"] == [True] * int(is_transferred.sum())
-
-
-@pytest.mark.parametrize("method", ["adversarial", "random"])
-def test_sweeps_of_the_radius_count_no_more_with_noise(noisy_attack, method):
-    (row,) = augment.success_by_radius(noisy_attack, [100.0])
-    assert (row[method] <= row[f"{method}_without_noise"]).all()
+    assert all(noisy <= exact for noisy, exact in zip(with_noise, without, strict=True))
+    (row,) = augment.transfer(result, [result.classifier])
+    assert row["success"] == [True] * int((result.clean_correct & result.success).sum())
+    (row,) = augment.success_by_radius(result, [100.0])
+    for method in ("adversarial", "random"):
+        assert (row[method] <= row[f"{method}_without_noise"]).all()
 
 
 # --------------------------------------------------------------- training
@@ -381,12 +345,3 @@ def test_training_attacks_count_without_noise_unless_told_otherwise():
     success_without_noise = noisy.diagnostics["attack_success_without_noise"]
     assert success_without_noise == without.diagnostics["attack_success"]
     assert success_without_noise >= noisy.diagnostics["attack_success"]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("sensor_noise", -0.1), ("sensor_noise", 256.0), ("noise_margin", math.nan)],
-)
-def test_impossible_noise_is_refused(name, value):
-    with pytest.raises(InputError, match=f"{name}="):
-        augment.AttackSettings(**{name: value})

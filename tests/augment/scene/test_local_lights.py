@@ -135,7 +135,7 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
 def test_a_joint_attack_lowers_the_cost(joint_attack):
     done, _, _ = joint_attack
     assert (done.images - done.images_before).abs().max() > 0.05
-    assert (done.descent.cost < done.descent.cost_before).all()
+    assert (done.minimum.cost < done.minimum.cost_before).all()
 
 
 def test_a_joint_attack_is_read_back_to_its_image(joint_attack):

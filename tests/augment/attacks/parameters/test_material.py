@@ -248,8 +248,8 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
     rows = torch.zeros(25, dtype=torch.int64)
     logits = by_color(result.problem.render(grid, rows)[:, 0])
     lowest = float(logits.log_softmax(1)[:, result.criterion.source[0, 0]].min())
-    before = float(result.descent.cost_before[0])
-    reached = float(result.descent.cost[0])
+    before = float(result.minimum.cost_before[0])
+    reached = float(result.minimum.cost[0])
     assert 0 < 0.98 * (before - lowest) < before - reached
 
 

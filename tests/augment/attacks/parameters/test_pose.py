@@ -153,8 +153,8 @@ def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, b
     grid[:, 6:8] = torch.cartesian_prod(steps, steps)
     others = torch.cat([grid, random_poses(result.problem, 20)])
     lowest = float(costs(result, by_color, others).min())
-    before = float(result.descent.cost_before[0])
-    reached = float(result.descent.cost[0])
+    before = float(result.minimum.cost_before[0])
+    reached = float(result.minimum.cost[0])
     assert 0 < 0.95 * (before - lowest) < before - reached
 
 

@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 
 import augment
 import renderer
-from augment.attacks.animation import SIDE
+from augment.attacks.figures import SIDE
 from renderer.io.images import MARGIN
 from tests.helpers import bright_or_dark
 

@@ -1,0 +1,241 @@
+"""Attacks on the light of a scene: its environment, a daylight sky, a projector, and lamps."""
+
+import math
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from augment.attack_settings import SkylightSettings, StepSettings
+from augment.attacks.parameters.parameter import Parameter
+from augment.scene.objects import Conditions
+from augment.scene.scene import Scene
+from renderer.errors import InputError
+from renderer.light.ball import Ball, nearest_in_box
+from renderer.light.basis import HARMONICS, Harmonics, LocalBasis, parts_of
+from renderer.light.lamps import LOCAL_LIGHTS
+from renderer.light.presets import mean_luminance
+from renderer.light.ringing import nonnegative_window
+from renderer.light.skylight import ZENITH
+from renderer.light.skylight import coefficients as sky_coefficients
+from renderer.settings import TURBIDITY
+
+
+class LightParameter(Parameter):
+    """Attack on all RGB coefficients of one light, such as the environment or the projector.
+
+    The attack starts at the light of the scene. If radiance must not be
+    negative, the start is the nearest light without negative radiance that has
+    the same mean. Each step then ends in the nearest coefficients that lie in
+    the norm-ball and have no negative radiance.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: StepSettings,
+        rows: slice,
+        basis: Harmonics | LocalBasis,
+        nonnegative: bool,
+    ):
+        """Compute the light at which the attack starts."""
+        self._rows = rows
+        self._basis = basis
+        self._nonnegative = nonnegative or not basis.allow_negative
+        initial_light = scene.lights[:, rows]
+        if self._nonnegative:
+            initial_light = basis.project_nonnegative(initial_light)
+        super().__init__(settings, start=initial_light.flatten(1))
+
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
+    ) -> Conditions:
+        """Return a copy of the conditions with other coefficients of this light."""
+        return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
+
+    def project_feasible(
+        self, values: Float[Tensor, "A D"], within: Ball | None = None
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest coefficients whose radiance is not negative."""
+        if not self._nonnegative:
+            return super().project_feasible(values, within)
+        # RGB of each of the K coefficients, shape (A, K, 3).
+        coefficients = values.unflatten(1, (-1, 3))
+        ball = None if within is None else within.unflatten(-1, 3)
+        return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
+
+
+def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
+    """Find the environment lighting among the lights of a scene.
+
+    Return its rows in the coefficients of all lights, and its basis.
+    """
+    # `parts_of` returns one pair for each light. The environment comes first.
+    lights = parts_of(scene.basis)
+    return lights[0]
+
+
+def replace_light(
+    conditions: Conditions, rows: slice, coefficients: Float[Tensor, "A K 3"]
+) -> Conditions:
+    """Return a copy of the conditions with other coefficients for one light.
+
+    `rows` are the rows of this light in the coefficients of all lights.
+    """
+    all_lights = conditions.light
+    # A scene with a single light needs no concatenation.
+    if coefficients.shape[1] == all_lights.shape[1]:
+        return replace(conditions, light=coefficients)
+    before = all_lights[:, : rows.start]
+    after = all_lights[:, rows.stop :]
+    return replace(conditions, light=torch.cat([before, coefficients, after], dim=1))
+
+
+class Lighting(LightParameter):
+    """Attack on the spherical-harmonic coefficients of the environment lighting.
+
+    Args:
+        scene: Scene to attack. Its projector and lamps stay as they are.
+        settings: Norm-ball and steps of the attack.
+        nonnegative: Whether radiance must not be negative in any direction.
+    """
+
+    name = "lighting"
+
+    def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
+        rows, basis = environment_light(scene)
+        super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=nonnegative)
+
+
+class LocalLight(LightParameter):
+    """Attack on the RGB coefficients of a projector (its pixels) or of lamps (their powers).
+
+    A coefficient lies between 0 and the power of the light.
+    """
+
+    def __init__(self, scene: Scene, settings: StepSettings, name: str):
+        """Find the light among the local lights of the scene."""
+        self.name = name
+        for rows, basis in scene.basis.local_lights:
+            if basis.name == name:
+                super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=True)
+                return
+        raise InputError(
+            f"{name} cannot be attacked, because the scene has none: "
+            f"build the scene with {name}=...",
+            name,
+        )
+
+
+# An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
+# divided by this unit. The turbidity, from 2 to 10, then has the range 2. The angles in radians
+# have the ranges 1.6 and 6.3. The ranges are of the same order, so one radius suits all values.
+TURBIDITY_UNIT = 4.0
+
+
+class Skylight(Parameter):
+    """Attack on a daylight sky: zenith angle and azimuth of the sun, and turbidity (haze).
+
+    The attack values are the angles divided by `SkylightSettings.sun`, and the
+    turbidity divided by `TURBIDITY_UNIT`.
+
+    The sky replaces the environment lighting of the scene. It is multiplied by
+    a constant factor, so that the initial sky has the mean luminance of the
+    lighting that it replaces. Projector and lamps stay as they are.
+
+    The coefficients of the sky end at degree 6, so that its radiance is negative
+    in some directions. If radiance must not be negative, the coefficients are
+    multiplied by `nonnegative_window`, which keeps the mean.
+    """
+
+    name = "skylight"
+
+    def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
+        """Compute the initial sky and its brightness."""
+        self._rows, self._basis = environment_light(scene)
+        initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
+        sky_luminance = mean_luminance(initial_sky)
+        replaced_lights = scene.lights[:, self._rows]
+        scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
+        # Factor by which the sky is multiplied in each example, shape (E,).
+        self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
+
+        self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
+        self._sun = settings.sun
+        values = [
+            settings.zenith / settings.sun,
+            settings.azimuth / settings.sun,
+            settings.turbidity / TURBIDITY_UNIT,
+        ]
+        start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
+        super().__init__(settings, start=start.expand(len(scene), -1))
+
+    def apply(
+        self, values: Float[Tensor, "A 3"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with the sky in place of the environment lighting.
+
+        The values are zenith angle, azimuth and turbidity, each divided by its unit.
+        """
+        # Convert the angles to degrees in float64, so that rounding is negligible.
+        zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
+        turbidity = values[:, 2] * TURBIDITY_UNIT
+        # RGB of the 49 harmonic coefficients of the sky model, shape (A, 49, 3).
+        sky = sky_coefficients(zenith, azimuth, turbidity)
+        sky = sky * self._scale[examples, None, None]
+        if self._window is not None:
+            sky = sky * self._window.to(sky)[:, None]
+        # The lighting of the scene may have more coefficients. Those of the sky are then 0.
+        missing_count = self._basis.size - sky.shape[-2]
+        sky = F.pad(sky, (0, 0, 0, missing_count))
+        return replace_light(conditions, self._rows, sky.to(conditions.light))
+
+    def project_feasible(
+        self, values: Float[Tensor, "A 3"], within: Ball | None = None
+    ) -> Float[Tensor, "A 3"]:
+        """Find the nearest values for which the sky model is defined."""
+        # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
+        lowest_zenith, highest_zenith = ZENITH
+        lowest_turbidity, highest_turbidity = TURBIDITY
+        low = values.new_tensor(
+            [lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT]
+        )
+        high = values.new_tensor(
+            [highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT]
+        )
+        return nearest_in_box(values, low, high, within)
+
+
+class Positions(Parameter):
+    """Attack on the position of each lamp: x, y and z in world units.
+
+    Shadows are cast from the changed positions. The gradient treats shadows as
+    fixed.
+    """
+
+    name = "positions"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        """Start at the positions of the lamps of the scene."""
+        light = scene.basis.movable_light
+        if light is None:
+            kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
+            raise InputError(
+                f"{self.name} cannot be attacked, because the scene has no {kinds}: "
+                f"build the scene with {kinds}=...",
+                self.name,
+            )
+        # All examples start at the same positions of the L lamps, shape (L, 3).
+        positions = light.basis.source_positions().to(scene.lights)
+        super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
+
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
+    ) -> Conditions:
+        """Return a copy of the conditions with moved lamps.
+
+        The values are x, y and z of the L lamps in world units.
+        """
+        return replace(conditions, positions=values.unflatten(1, (-1, 3)))

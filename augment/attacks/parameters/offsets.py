@@ -1,0 +1,144 @@
+"""Attacks that add an offset to each vertex (shape), to each face (colors) or to each pixel."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from augment.attack_settings import StepSettings
+from augment.attacks.parameters.parameter import Parameter
+from augment.scene.objects import Conditions
+from augment.scene.scene import Scene
+
+
+class MeshParameter(Parameter):
+    """Attack with three values for each vertex or each face of an object, such as x, y and z.
+
+    All examples have as many values as the largest mesh needs. Values of
+    vertices or faces that a smaller mesh lacks are not used. The mesh of an
+    object also contains its props (meshes beside the object) and its table. The
+    attack does not change these. The attack starts at zero.
+    """
+
+    def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
+        """Find the values that each example uses.
+
+        A mask for each object marks the vertices or faces that belong to the object itself, not to
+        its props or table.
+        """
+        # One row for each object, one column for each of the N vertices or faces of the largest
+        # mesh. Rows of smaller meshes end with False.
+        masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)
+        # Three values for each vertex or face, shape (objects, 3 N).
+        value_masks = masks.to(scene.lights.device).repeat_interleave(3, dim=1)
+        used_mask = value_masks[scene.object_of]
+        start = scene.lights.new_zeros(used_mask.shape)
+        super().__init__(settings, start=start, used_mask=used_mask)
+
+    def offsets(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A N 3"]:
+        """Reshape the attack values to one vector for each vertex or face.
+
+        The vectors of unused vertices or faces are zero.
+        """
+        if self.used_mask is not None:
+            values = values * self.used_mask[examples]
+        return values.unflatten(1, (-1, 3))
+
+
+class Geometry(MeshParameter):
+    """Attack on the shape: a displacement of each vertex of the object.
+
+    Displacements are in world units, in which the object spans [-1, 1]. The
+    gradient takes into account that normals turn as vertices move. If
+    `ImageSettings.silhouettes` is set, it also takes into account that the
+    silhouette of the object moves.
+
+    Args:
+        scene: Scene to attack. Props and table stay as they are.
+        settings: Norm-ball and steps of the attack.
+    """
+
+    name = "geometry"
+    fits_other_meshes = False
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        self._vertices = scene.vertices
+        self._object_of = scene.object_of
+        super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
+
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with displaced vertices.
+
+        The values are displacements of the N vertices of the largest mesh in world units.
+        """
+        # Vertices before the attack, shape (A, N, 3).
+        vertices = self._vertices[self._object_of[examples]]
+        return replace(conditions, vertices=vertices + self.offsets(values, examples))
+
+
+class Albedo(MeshParameter):
+    """Attack on the colors: a linear RGB offset that is added to the albedo of each face.
+
+    The renderer clamps the sum to [0, 1].
+
+    Args:
+        scene: Scene to attack. Props and table stay as they are.
+        settings: Norm-ball and steps of the attack.
+    """
+
+    name = "albedo"
+    fits_other_meshes = False
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, settings, [item.own_faces for item in scene.objects])
+
+    def apply(
+        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Conditions:
+        """Return a copy of the conditions with a color offset for each face.
+
+        The values are linear RGB offsets of the F faces of the largest mesh.
+        """
+        return replace(conditions, albedo=self.offsets(values, examples))
+
+
+class Pixels(Parameter):
+    """Attack on the pixels: an offset that is added to each pixel value of an image.
+
+    The sum of image and offset is clamped to [0, 1]. With one step of the kind
+    "sign" that is as long as the radius, the attack is FGSM (Goodfellow et al.
+    2014). With several smaller steps, it is the basic iterative method (Kurakin
+    et al. 2016). With random restarts in addition, it is PGD (Madry et al. 2017).
+
+    Args:
+        scene: Scene to attack.
+        settings: Norm-ball and steps of the attack.
+    """
+
+    name = "pixels"
+    fits_other_meshes = False
+    fits_other_views = False
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        size = scene.settings.size
+        self._images_shape = (scene.views, 3, size, size)
+        start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
+        super().__init__(settings, start)
+
+    def apply(
+        self, values: Float[Tensor, "A _"], conditions: Conditions, examples: Tensor
+    ) -> Conditions:
+        """Return a copy of the conditions with an offset for each pixel value.
+
+        The values are in the order (V, 3, size, size) of the images.
+        """
+        return replace(conditions, pixels=values.unflatten(1, self._images_shape))
