@@ -268,14 +268,10 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
 class _LightFit(NamedTuple):
     """Light with which a render from a given camera resembles the photograph most.
 
-    Attributes:
-        residuals: Differences between the render and the photograph for all pixels
-            and channels, followed by the weighted differences between the SH
-            coefficients of the light and of the expected light, shape (N,). The
-            sum of the squared residuals is the error of the camera.
-        light: SH coefficients, shape (49, 3).
-        coverage: Share of each pixel that the mesh covers in the render,
-            shape (size²,).
+    The residuals are the differences between the render and the photograph for all pixels
+    and channels, followed by the weighted differences between the light and the expected
+    light. The sum of their squares is the error of the camera. `coverage` is the share of
+    each pixel that the mesh covers in the render.
     """
 
     residuals: Float[Tensor, " N"]
@@ -286,14 +282,8 @@ class _LightFit(NamedTuple):
 class _Target(NamedTuple):
     """Photograph of an object that renders of a mesh should resemble.
 
-    Attributes:
-        image: Linear values of the photograph, shape (3, size²). Pixels outside
-            of the object have the value `gray`.
-        mask: Share of each pixel that the object covers, shape (size²,).
-        gray: Linear value outside of the object, 0 or 1.
-        mesh: Mesh of the object.
-        size: Number of pixels per side.
-        options: Arguments with which the mesh is rendered.
+    Pixels of `image` (linear) outside of the object have the value `gray`, 0 or 1. `mask` is
+    the share of each pixel that the object covers. Meshes are rendered with `options`.
     """
 
     image: Float[Tensor, "3 size²"]

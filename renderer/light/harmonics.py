@@ -55,12 +55,6 @@ def cache_tensors(function: Callable[..., Constant]) -> Callable[..., Constant]:
 
     The function runs outside of torch's inference mode. A cached tensor that was
     created in inference mode could not be used in training later.
-
-    Args:
-        function: Function to decorate.
-
-    Returns:
-        Function with a cache.
     """
     return cache(torch.inference_mode(False)(function))
 
@@ -141,14 +135,7 @@ def basis(
 
 
 def require_degree(degree: int) -> None:
-    """Check that the degree of a light is a whole number from 0 to `MAX_DEGREE`.
-
-    Args:
-        degree: Degree to check.
-
-    Raises:
-        InputError: If the degree is not whole or out of range.
-    """
+    """Check that the degree of a light is a whole number from 0 to `MAX_DEGREE`."""
     require_whole("degree", degree, 0, MAX_DEGREE)
 
 
@@ -217,20 +204,14 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
 
 
 @cache_tensors
-def gradient_matrices(degree: int) -> Tensor:
+def gradient_matrices(degree: int) -> Float64[Tensor, "3 K K"]:
     """Compute the matrices of the derivatives of harmonics with respect to x, y and z.
 
     Let r be the length of (x, y, z). For a harmonic Y_k of band l, r^l Y_k is a
     polynomial. Its derivative with respect to x, y or z is a sum over harmonics
     Y_j of band l - 1. With the coordinates (x_0, x_1, x_2) = (x, y, z), this is
     ∂(r^l Y_k)/∂x_d = Σ_j M[d, j, k] r^(l-1) Y_j.
-
-    Args:
-        degree: Highest band.
-
-    Returns:
-        Matrices M for the three coordinates, float64,
-        shape (3, (degree + 1)², (degree + 1)²).
+    The result is M, float64.
     """
     size = (degree + 1) ** 2
     matrices = torch.zeros(3, size, size, dtype=torch.float64)
@@ -278,7 +259,7 @@ def _set_gradients(matrices: Float[Tensor, "3 K K"], l: int, m: int) -> None:
 
 
 @cache_tensors
-def homogeneous_gradients(degree: int) -> Tensor:
+def homogeneous_gradients(degree: int) -> Float64[Tensor, "3 K K"]:
     """Compute the matrices of the derivatives of the homogeneous polynomials r^degree Y_k.
 
     Let r be the length of (x, y, z), and Y_k a harmonic of a band l with the
@@ -290,14 +271,7 @@ def homogeneous_gradients(degree: int) -> Tensor:
     gradient of the second factor is known from `gradient_matrices`. The gradient
     of the first factor is (degree - l) r^(degree - l - 2) (x, y, z). The products
     x_d Y_k in it are sums of harmonics of the bands l - 1 and l + 1.
-
-    Args:
-        degree: Degree of the polynomials.
-
-    Returns:
-        Matrices M for the three coordinates, float64,
-        shape (3, (degree + 1)², (degree + 1)²). Columns of bands of the other
-        parity have no meaning.
+    The result is M, float64. Columns of bands of the other parity have no meaning.
     """
     gradients = gradient_matrices(degree)
     band_of_column = bands(degree)
@@ -309,20 +283,14 @@ def homogeneous_gradients(degree: int) -> Tensor:
 
 
 @cache_tensors
-def monomial_coefficients(degree: int) -> Tensor:
+def monomial_coefficients(degree: int) -> Float64[Tensor, "monomials K"]:
     """Compute the matrix that expresses harmonics by monomials x^a y^b z^c, a + b + c = degree.
 
     Let r be the length of (x, y, z). For a harmonic Y_k of a band with the same
     parity as `degree`, r^degree Y_k = Σ_j M[j, k] monomial_j. The monomials are
     sorted from x^degree to z^degree, by falling power of x and then by falling
     power of y.
-
-    Args:
-        degree: Degree of the monomials.
-
-    Returns:
-        Matrix M, float64, shape ((degree + 1) (degree + 2) / 2, (degree + 1)²).
-        Columns of bands of the other parity have no meaning.
+    The result is M, float64. Columns of bands of the other parity have no meaning.
     """
     if degree == 0:
         return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
@@ -347,18 +315,11 @@ def monomial_coefficients(degree: int) -> Tensor:
     return derivatives / torch.tensor(powers)[:, None]
 
 
-def monomials(vectors: Tensor, degree: int) -> Tensor:
+def monomials(vectors: Float[Tensor, "3 N"], degree: int) -> Float[Tensor, "monomials N"]:
     """Evaluate all monomials x^a y^b z^c with a + b + c = degree.
 
-    Args:
-        vectors: Vectors (x, y, z), with the three components along the first
-            axis, shape (3, N).
-        degree: Degree of the monomials.
-
-    Returns:
-        Values of the monomials, shape ((degree + 1) (degree + 2) / 2, N). They
-        are sorted from x^degree to z^degree, by falling power of x and then by
-        falling power of y.
+    There is one row for each monomial. They are sorted from x^degree to z^degree, by
+    falling power of x and then by falling power of y.
     """
     x, y, z = vectors
     values = torch.ones_like(vectors[:1])

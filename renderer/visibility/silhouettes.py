@@ -258,8 +258,7 @@ class _MovingView:
         # The difference is NaN if one of the two samples shows no mesh.
         difference.nan_to_num_(0)
         self._correct_pixel_borders(dim, difference, upstream_at_samples)
-        # Set the difference to 0 if a silhouette passes between the two samples. The
-        # function `gradient_of_silhouettes` computes the gradient there.
+        # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
         is_in_row = self.crossings.horizontal
         is_along_axis = is_in_row if axis == X else ~is_in_row
         difference.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
@@ -398,16 +397,14 @@ def _find_crossings(
     """
     x, y, w = positions.T
     points = np.stack([x / w, y / w, nearness]).T
-    # Positions (x, y) of the vertices, with y down, in units of samples. They are rounded
-    # to subsamples as in the rasterizers.
+    # Positions (x, y), y down, in units of samples, rounded to subsamples as in rasterizers.
     places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
     ends = _silhouette_edges(places, faces)
     if len(fragments.sample_to_seen_face) == 0:
-        # If no sample shows the mesh, no silhouette is visible. Drop all edges.
-        ends = ends[:, :0]
+        ends = ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
     start = places[:, ends[0]]
     end = places[:, ends[1]]
-    # An edge (a, b) in axes with y down has the normal (b, a) in axes with y up.
+    # An edge (a, b) with y down has the normal (b, a) with y up.
     normal = np.stack([end[1] - start[1], end[0] - start[0]])
     # Edges without length divide by a small number instead of 0.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
@@ -422,16 +419,10 @@ def _find_crossings(
 class _Silhouettes:
     """N silhouette edges of a view, and what is needed to find their visible parts.
 
-    Attributes:
-        fragments: Covered samples, with tensors on the CPU.
-        places: Positions of the vertices in units of samples, x to the right
-            and y down, shape (2, V).
-        nearness: Number for each vertex that is larger for nearer points, and
-            that is linear in the image on each face, shape (V,).
-        sample_grid: Index of the covered sample at each sample of the image, or
-            NOT_COVERED, shape (size · s, size · s).
-        ends: Vertices at both ends of each edge, shape (2, N).
-        normal: Unit normal of each edge in the image, shape (2, N).
+    `places` are the positions of the vertices in units of samples, x to the right and y
+    down. `nearness` is larger for nearer points, and linear in the image on each face.
+    `sample_grid` is that of `_MovingView`. `ends` are the vertices at both ends of each
+    edge, and `normal` is its unit normal in the image.
     """
 
     fragments: Fragments
@@ -451,67 +442,48 @@ class _Silhouettes:
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
-        cuts = _cut_edges(
+        edge, line, fraction, next_sample = _cut_edges(
             start_across=start[1 - axis],
             end_across=end[1 - axis],
             start_along=start[axis],
             end_along=end[axis],
             resolution=resolution,
         )
-        edge = cuts.edge
-        # Find the row-major indices of the two samples around each cut: the first sample
-        # after the cut, and the sample before.
+        # Row-major indices of the first sample after each cut, and of the sample before.
         if axis == X:
-            after = cuts.line * resolution + cuts.next_sample
+            after = line * resolution + next_sample
             before = after - 1
         else:
-            after = cuts.next_sample * resolution + cuts.line
+            after = next_sample * resolution + line
             before = after - resolution
         cells = np.stack([before, after])
-        # Two rows, for the samples before and after the cuts: indices among the covered
-        # samples, or NOT_COVERED.
+        # Indices among the covered samples before and after the cuts, or NOT_COVERED.
         samples = self.sample_grid.ravel()[cells].astype(np.int64)
-        place = start[:, edge] + cuts.fraction * (end - start)[:, edge]
+        place = start[:, edge] + fraction * (end - start)[:, edge]
         surface_nearness = self._surface_nearness(samples, place)
-        is_visible = self._is_visible(cuts, samples, surface_nearness)
-        # Distance of each cut from the sample with the farther surface, plus a number that is
-        # the same for all cuts between the same two samples.
+        start_nearness, end_nearness = self.nearness[self.ends[:, edge]]
+        edge_nearness = start_nearness + fraction * (end_nearness - start_nearness)
+        # An edge is hidden if the surfaces at both samples beside it are nearer to the camera.
+        # It counts as hidden, too, if no sample beside it shows a surface. If one of them
+        # shows no surface, the minimum is minus infinity, and the edge is in front.
+        tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
+        is_in_front = edge_nearness >= surface_nearness.min(axis=0) - tolerance
+        is_visible = (samples != NOT_COVERED).any(axis=0) & is_in_front
+        # Distance from the sample with the farther surface, plus the same number for all cuts
+        # between the same two samples.
         distance = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         visible = np.flatnonzero(is_visible)
         # Of all cuts between the same two samples, keep the one with the smallest distance.
-        kept = visible[_smallest_in_groups(distance[visible], after[visible])]
+        order = visible[np.lexsort([distance[visible], after[visible]])]
+        kept = order[np.diff(after[order], prepend=-1) != 0]
         return (
             self.ends[:, edge[kept]],
-            cuts.fraction[kept],
+            fraction[kept],
             self.normal[:, edge[kept]],
             np.full(len(kept), axis == X),
             cells[:, kept],
             samples[:, kept],
         )
-
-    def _is_visible(
-        self,
-        cuts: _Cuts,
-        samples: Int[np.ndarray, "2 K"],
-        surface_nearness: Float[np.ndarray, "2 K"],
-    ) -> Bool[np.ndarray, " K"]:
-        """Tell at which of K places (cuts) a silhouette edge is visible.
-
-        A cut is the place where an edge crosses a row or a column of samples. The
-        edge is hidden there if the surfaces at both samples beside it are nearer to
-        the camera. It counts as hidden, too, if no sample beside it shows a surface. The
-        two rows are for the samples before and after each cut. The nearness is larger for
-        nearer points.
-        """
-        tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
-        start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
-        edge_nearness = start_nearness + cuts.fraction * (end_nearness - start_nearness)
-        # If one of the two samples shows no surface, the minimum is minus infinity, and the
-        # edge is in front.
-        farther_nearness = surface_nearness.min(axis=0)
-        is_in_front = edge_nearness >= farther_nearness - tolerance
-        shows_surface = (samples != NOT_COVERED).any(axis=0)
-        return shows_surface & is_in_front
 
     def _surface_nearness(
         self, samples: Int[np.ndarray, "2 K"], place: Float[np.ndarray, "2 K"]
@@ -542,50 +514,22 @@ class _Silhouettes:
         return np.where(samples >= 0, plane, -np.inf)
 
 
-def _smallest_in_groups(
-    values: Float[np.ndarray, " N"], groups: Int[np.ndarray, " N"]
-) -> np.ndarray:
-    """Find the index of the smallest value of each group, in ascending order of the groups."""
-    # Sort by the group, and then by the value.
-    order = np.lexsort([values, groups])
-    is_first_of_group = np.diff(groups[order], prepend=-1) != 0
-    return order[is_first_of_group]
-
-
-class _Cuts(NamedTuple):
-    """K cuts: places where edges cross rows of samples, or columns of samples.
-
-    Rows and columns are both called lines.
-
-    Attributes:
-        edge: Index of the edge of each cut, shape (K,).
-        line: Index of the line of each cut, shape (K,).
-        fraction: Position of the cut between the start (0) and the end (1) of
-            the edge, shape (K,).
-        next_sample: Index in the line of the first sample at or after the cut,
-            shape (K,).
-    """
-
-    edge: Int[np.ndarray, " K"]
-    line: Int[np.ndarray, " K"]
-    fraction: Float[np.ndarray, " K"]
-    next_sample: Int[np.ndarray, " K"]
-
-
 def _cut_edges(
     start_across: Float[np.ndarray, " N"],
     end_across: Float[np.ndarray, " N"],
     start_along: Float[np.ndarray, " N"],
     end_along: Float[np.ndarray, " N"],
     resolution: int,
-) -> _Cuts:
+) -> tuple[np.ndarray, ...]:
     """Find where N edges cross rows of samples, or columns of samples.
 
     Rows and columns are both called lines. For rows, y is the coordinate across
     the lines, and x the coordinate along the lines. For columns, it is the other
     way round. Coordinates are in units of samples. Line i has the coordinate i.
     Crossings before the first sample or after the last sample of a line are left
-    out.
+    out. The results are, for each of K crossings, the index of the edge, the index of
+    the line, the position on the edge from 0 (start) to 1 (end), and the index in the
+    line of the first sample at or after the crossing.
     """
     lower = np.minimum(start_across, end_across)
     upper = np.maximum(start_across, end_across)
@@ -603,12 +547,7 @@ def _cut_edges(
     position = start_along[edge] + fraction * (end_along - start_along)[edge]
     next_sample = np.ceil(position).astype(np.int64)
     is_inside = (next_sample > 0) & (next_sample < resolution)
-    return _Cuts(
-        edge=edge[is_inside],
-        line=line[is_inside],
-        fraction=fraction[is_inside],
-        next_sample=next_sample[is_inside],
-    )
+    return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
 
 
 def _silhouette_edges(
@@ -618,55 +557,38 @@ def _silhouette_edges(
 
     The result has the vertices at both ends of each edge.
     """
-    edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
+    ends, edge_of_face_side, face_count = _edges(
+        np.ascontiguousarray(faces, dtype=np.int64).tobytes()
+    )
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
-    (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
+    (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
     orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    # 1 for sides of faces that lead from the lower to the higher vertex index, and -1 for
+    # other sides, shape (3, F).
+    start, end = faces.T.take(EDGES, axis=0).swapaxes(0, 1)
+    direction = np.where(start < end, 1.0, -1.0)
     # One number for each face and each of its three edges: 1 if the face lies on one side of
     # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
-    side_of_face = (orientation * edges.direction).ravel()
-    side_sums = np.bincount(edges.edge_of_face_side, side_of_face, len(edges.face_count))
+    side_of_face = (orientation * direction).ravel()
+    side_sums = np.bincount(edge_of_face_side, side_of_face, len(face_count))
     # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
     # 1 - n if one of them is seen edge-on, because this face counts 0.
-    is_silhouette = np.abs(side_sums) > edges.face_count - 2
-    return edges.ends.take(np.flatnonzero(is_silhouette), axis=1)
-
-
-class _Edges(NamedTuple):
-    """The N edges of a mesh with F faces.
-
-    Each face has three sides: from corner 0 to corner 1, from 1 to 2, and from 2
-    to 0. Sides with the same two vertices are one edge.
-
-    Attributes:
-        corners: Vertex indices of the three corners of each face, shape (3, F).
-        ends: Vertices at both ends of each edge, the lower index first,
-            shape (2, N).
-        edge_of_face_side: Index of the edge of each side of each face,
-            shape (3 F,). Side i of face f is entry i F + f.
-        direction: 1 for sides of faces that lead from the lower to the higher
-            vertex index, and -1 for other sides, shape (3, F).
-        face_count: Number of faces at each edge, shape (N,).
-    """
-
-    corners: Int[np.ndarray, "3 F"]
-    ends: Int[np.ndarray, "2 N"]
-    edge_of_face_side: Int[np.ndarray, " 3*F"]
-    direction: Float[np.ndarray, "3 F"]
-    face_count: Int[np.ndarray, " N"]
+    is_silhouette = np.abs(side_sums) > face_count - 2
+    return ends.take(np.flatnonzero(is_silhouette), axis=1)
 
 
 @lru_cache(maxsize=4)
-def _edges(face_bytes: bytes) -> _Edges:
-    """Find the edges of a mesh.
+def _edges(face_bytes: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the N edges of a mesh with F faces, of which each has three sides.
 
-    Each face has three sides. Sides with the same two vertices are one edge. The argument
-    holds int64 vertex indices as bytes, because the cache needs a key that can be hashed.
+    Sides with the same two vertices are one edge. The results are the vertices at both
+    ends of each edge, the lower index first, shape (2, N); the edge of each side, with
+    side i of face f at i F + f, shape (3 F,); and the number of faces at each edge. The
+    argument holds int64 vertex indices as bytes, because a key of the cache is hashed.
     """
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    corners = np.ascontiguousarray(faces.T)
     # Vertices at both ends of the sides: one row for each side, one column for each face.
-    start, end = corners.take(EDGES, axis=0).swapaxes(0, 1)
+    start, end = faces.T.take(EDGES, axis=0).swapaxes(0, 1)
     low = np.minimum(start, end).ravel()
     high = np.maximum(start, end).ravel()
     vertex_count = int(high.max()) + 1
@@ -675,10 +597,4 @@ def _edges(face_bytes: bytes) -> _Edges:
     keys, edge_of_face_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )
-    return _Edges(
-        corners=corners,
-        ends=np.stack(np.divmod(keys, vertex_count)),
-        edge_of_face_side=edge_of_face_side.ravel(),
-        direction=np.where(start < end, 1.0, -1.0),
-        face_count=face_count,
-    )
+    return np.stack(np.divmod(keys, vertex_count)), edge_of_face_side.ravel(), face_count
