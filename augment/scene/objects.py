@@ -274,7 +274,8 @@ def _load(item: MeshSettings) -> Mesh:
         return mesh
     # If the setting is "file", `_load_with_color` has loaded the gloss of the file.
     if item.gloss != "file":
-        mesh = _as_gloss(item.gloss).on(mesh)
+        # The order of the values is roughness, metallic, specular factor.
+        mesh = Gloss(*(float(value) for value in item.gloss)).on(mesh)
     # Column 1 of the gloss is the metallic factor of each face.
     is_metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
     if is_metal and item.color is None and not _has_colors(mesh):
@@ -325,15 +326,6 @@ def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
 def _has_colors(mesh: Mesh) -> bool:
     """Return whether a mesh has textures, or vertex colors other than white."""
     return bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
-
-
-def _as_gloss(values: Sequence[float]) -> Gloss:
-    """Convert the values of the setting `gloss` to a gloss.
-
-    Their order is roughness, metallic, specular factor. Values at the end may be left out.
-    """
-    roughness, *others = [float(value) for value in values]
-    return Gloss(roughness, *others)
 
 
 # Each face has three numbers: roughness, metallic and specular factor. These are the positions of

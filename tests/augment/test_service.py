@@ -512,15 +512,6 @@ def test_attack_examples_show_the_images_and_predictions_before_and_after(serve,
             assert differences.min() < 100 * EPS32
 
 
-def test_attack_examples_are_right_before_and_wrong_after(serve, model):
-    renders = serve(attack=LONG).regenerate(model, 0)
-    examples = renders.attack_examples
-    success_before = renders.diagnostics["attack_success_before"]
-    assert renders.diagnostics["attack_success"] > success_before
-    assert torch.equal(examples.predictions[0].argmax(1), examples.labels)
-    assert (examples.predictions[1].argmax(1) != examples.labels).all()
-
-
 def test_attack_examples_do_not_show_those_that_were_wrong_before(serve, model, labels):
     """Half of the examples are given a class that the network does not see in them."""
     is_even = torch.arange(EXAMPLE_COUNT) % 2 == 0
@@ -530,3 +521,5 @@ def test_attack_examples_do_not_show_those_that_were_wrong_before(serve, model, 
     assert renders.diagnostics["attack_success_before"] >= 0.5
     assert len(examples) > 0
     assert (examples.labels != 1).all()
+    assert torch.equal(examples.predictions[0].argmax(1), examples.labels)
+    assert (examples.predictions[1].argmax(1) != examples.labels).all()

@@ -178,14 +178,6 @@ def moved_lamps(tmp_path_factory) -> tuple[augment.AttackResult, Adversary, Path
     return done, written, folder
 
 
-def test_moved_lamps_stay_in_their_norm_ball(moved_lamps):
-    done, _, _ = moved_lamps
-    offsets = done.conditions.positions - torch.tensor(LAMPS.positions)
-    distances = offsets.flatten(1).norm(dim=1)
-    assert (distances > 0.1).all()
-    assert (distances <= 0.6 * (1 + 1e-5)).all()
-
-
 def test_moved_lamps_are_read_back_where_they_ended(moved_lamps):
     done, written, folder = moved_lamps
     image = reload(folder).render(choose("numpy"))

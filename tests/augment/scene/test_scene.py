@@ -121,11 +121,6 @@ def test_a_background_is_the_center_square_of_an_image(tmp_path, kind):
     assert torch.equal(load_backgrounds([0.5, path], 4), torch.stack([gray, square]))
 
 
-def test_a_background_is_gray():
-    assert torch.equal(gray_or_image("backgrounds", "0.25", 4), torch.full((1, 4, 4), 0.25))
-    assert load_backgrounds([0, 0.5], 4).shape == (2, 1, 4, 4)
-
-
 # --------------------------------------------------------------- the degree of light
 
 SHINY = ObjectSettings("solid:pear", "pear", gloss=[0.35])
@@ -182,11 +177,6 @@ def test_light_of_a_higher_degree_shows_the_image_of_the_renderer(glossy, map_op
     camera = glossy.cameras[1][0]
     expected = renderer.render(mesh, camera, light, 16, samples=1, rasterizer="numpy")
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-5)
-
-
-def test_a_degree_that_is_too_low_for_the_gloss_is_told(map_options):
-    with pytest.warns(UserWarning, match="degree=7"):
-        assert build_scene([SHINY], 16, degree=7, **map_options).basis == Harmonics(7)
 
 
 def test_a_sky_in_light_of_a_higher_degree_has_49_coefficients(glossy):
