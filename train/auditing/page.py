@@ -25,7 +25,7 @@ from train.auditing.remedies import (
     Recommendation,
     recommend,
 )
-from train.results import compare, store
+from train.results import compare
 from train.results.first_screen import (
     NETWORKS,
     Compared,
@@ -227,7 +227,7 @@ def _score_sections(
         if key.endswith(NORMALIZED):
             name = f"{networks[key.removesuffix(NORMALIZED)].name}, normalized light"
             runs[name] = [_scored_run(name, out / key)]
-    return [scores_section(title, group) for title, group in store.group_by_images(runs).items()]
+    return [scores_section(title, group) for title, group in compare.group_by_images(runs).items()]
 
 
 def plain_sentence(network: AuditedNetwork, plain: PlainViews) -> str:

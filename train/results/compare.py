@@ -1,4 +1,4 @@
-"""Tables that compare finished training runs by their metrics on photographs.
+"""Comparison of finished training runs by their metrics on photographs.
 
 A method is a way to train a network. Runs that differ only in their seed are
 runs of the same method. An `Evaluation` holds the predictions of one run for one
@@ -8,35 +8,31 @@ interval.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from statistics import fmean
 
-from augment.augmentation_settings import MODES
 from renderer.errors import InputError
 from train.results.intervals import Jackknife, change
-from train.results.metrics import METRICS, TOP_RANKS, Pool, Pooled, metric_title
-from train.results.predictions import CONTACT_SHEET, Prediction
+from train.results.metrics import COUNTED_EACH, METRICS, TOP_RANKS, Pool, Pooled, metric_title
+from train.results.predictions import Prediction
 from train.results.store import (
     INITIAL,
+    Methods,
     RunSummary,
     Scored,
     ScoredRun,
-    accuracy_title,
-    group_by_images,
-    group_by_method,
-    label_title,
-    run_tables,
-    seconds_table,
 )
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
-from train.settings import PHOTOGRAPHS, in_words
+from train.settings import in_words
 
 # `class_table` has no rows if there are more classes than this.
 MAX_CLASSES = 30
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
 TITLES = [metric_title(name) for name in METRICS]
-# Metrics in the table that commands print without --verbose.
-SHORT_METRICS = ("recall", "false_positive_rate", "auc", "class_top1")
+
+
+def label_title(label: str) -> str:
+    """Return the title of the row of a positive class in tables, such as "label=orange"."""
+    return f"label={label}"
 
 
 @dataclass(frozen=True)
@@ -106,6 +102,43 @@ class Evaluation:
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
+def group_by_images(methods: Methods) -> dict[str, Scored]:
+    """Group runs by the images on which they were scored."""
+    groups: dict[str, dict[str, list[ScoredRun]]] = {}
+    for method, runs in methods.items():
+        for run in runs:
+            for name, scores in run.photographs.items():
+                group = groups.setdefault(scores.images, {})
+                group.setdefault(method, []).append(ScoredRun(run, name))
+    titled: dict[str, Scored] = {}
+    for group in groups.values():
+        title = _title_of(group)
+        if title in titled:
+            title = f"{title} ({len(titled) + 1})"
+        titled[title] = group
+    return titled
+
+
+def _title_of(group: Scored) -> str:
+    """Write a title for the images on which a group of networks was scored."""
+    members = [scored for scored_runs in group.values() for scored in scored_runs]
+    # The name of the sub-folder comes from a training run if there is one, because the user
+    # has chosen this name. Only a training run has epochs.
+    of_training = [scored for scored in members if scored.run.epochs]
+    first = of_training[0] if of_training else members[0]
+    auc = first.scores.overall.auc
+    if not auc.positives + auc.negatives:
+        return first.name
+    labels = first.scores.labels
+    title = (
+        f"{first.name}: {auc.positives:,} images of {' or '.join(labels)}, "
+        f"{auc.negatives:,} images of other objects"
+    )
+    if len(labels) > 1:
+        title += COUNTED_EACH
+    return f"{title}; {describe_intervals([auc])}" if auc.low is not None else title
+
+
 def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
     """Read the predictions of runs that were scored on the same images.
 
@@ -133,7 +166,7 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
         )
 
 
-def _require_meshes(methods: Evaluations, by: str) -> None:
+def require_meshes(methods: Evaluations, by: str) -> None:
     """Check that the photographs have meshes if scores by mesh are asked for."""
     for method, evaluations in methods.items():
         if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
@@ -309,169 +342,3 @@ def overall_differences(methods: Evaluations) -> Table:
             title = f"{table.title}, {name}" if name else table.title
             rows.append([title, *cells])
     return Table("differences on the same images", ["networks", *TITLES], rows)
-
-
-def format_table(runs: Sequence[RunSummary]) -> str:
-    """Compare runs in the tables that pnb-train --verbose prints after training."""
-    methods = group_by_method(runs)
-    groups = group_by_images(methods)
-    tables = run_tables(methods, groups)
-    for group in groups.values():
-        tables.append(overall_differences(read_evaluations(group)))
-
-    used_modes = {run.method for run in runs}
-    captions = [f"{mode}: {caption}" for mode, caption in MODES.items() if mode in used_modes]
-    sheets = []
-    for run in runs:
-        sheets += [f"image: {run.folder / name / CONTACT_SHEET}" for name in run.photographs]
-    parts = [_format_tables(tables), "; ".join(captions), "\n".join(sheets)]
-    return "\n\n".join(part for part in parts if part)
-
-
-def _format_tables(tables: Sequence[Table]) -> str:
-    """Write tables as Markdown, with an empty line between them.
-
-    A table without rows, and a column without known values, are left out.
-    """
-    return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
-
-
-def format_comparison(
-    runs: Sequence[RunSummary],
-    exclude: Sequence[str],
-    photographs: str = PHOTOGRAPHS,
-    by: str = "source",
-) -> str:
-    """Compare runs in the tables that pnb-compare prints."""
-    methods = group_by_method(runs)
-    groups = group_by_images(methods)
-    tables = run_tables(methods, groups)
-    overall = _title_of_all(exclude)
-    group = _find_group(list(groups.values()), photographs)
-    if group is not None:
-        evaluations = read_evaluations(group, exclude)
-        _require_meshes(evaluations, by)
-        tables.append(group_table(evaluations, overall, by))
-        tables += difference_tables(evaluations, overall, by)
-    tables.append(seconds_table(methods))
-    return _format_tables(tables)
-
-
-def format_short_comparison(
-    runs: Sequence[RunSummary],
-    exclude: Sequence[str] = (),
-    photographs: str = PHOTOGRAPHS,
-    by: str = "source",
-) -> str:
-    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
-
-    Without the usual sub-folder "photographs", the first photographs of the runs are compared. The
-    gain in AUC is over the first method.
-    """
-    methods = group_by_method(runs)
-    groups = group_by_images(methods)
-    group = _find_group(list(groups.values()), photographs)
-    if group is None and groups:
-        # The first images on which runs were scored.
-        group = next(iter(groups.values()))
-    evaluations = read_evaluations(group, exclude) if group else {}
-    _require_meshes(evaluations, by)
-    if by != "source" and evaluations:
-        return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
-    titles = [title for title, members in groups.items() if members is group]
-    rows = []
-    for method, runs_of_method in methods.items():
-        if method not in evaluations and not exclude:
-            # A published network has stored metrics, but no predictions.
-            scored_runs = group.get(method, ()) if group else ()
-            metrics = [_mean_stored_metric(scored_runs, name) for name in SHORT_METRICS]
-        else:
-            of_method = evaluations.get(method, ())
-            metrics = [mean_metric(of_method, ALL, name) for name in SHORT_METRICS]
-        values = [_format_value(metric) for metric in (_mean_accuracy(runs_of_method), *metrics)]
-        gain = _format_gain(evaluations, method)
-        rows.append([method, len(runs_of_method), *values, gain])
-    every_run = [run for runs_of_method in methods.values() for run in runs_of_method]
-    header = ["network", "runs", accuracy_title(every_run), *map(metric_title, SHORT_METRICS)]
-    return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
-
-
-def _mean_accuracy(runs: Sequence[RunSummary]) -> Estimate | None:
-    """Average the accuracy on the test images over runs."""
-    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
-    return Estimate(fmean(accuracies)) if accuracies else None
-
-
-def _title_of_all(exclude: Sequence[str]) -> str:
-    """Return the title of the row of all images: "all", or "all but A, B" without these sources."""
-    return f"all but {', '.join(exclude)}" if exclude else "all"
-
-
-def _mean_stored_metric(scored_runs: Sequence[ScoredRun], name: str) -> Estimate | None:
-    """Average a metric over the stored scores of runs, which lack the file predictions.csv."""
-    values = []
-    for scored in scored_runs:
-        metric = scored.scores.overall.find(name)
-        if metric is not None and metric.value is not None:
-            values.append(metric.value)
-    return Estimate(fmean(values)) if values else None
-
-
-def _format_value(metric: Estimate | None) -> str:
-    """Write the value of a metric without its interval, or "-" if it is unknown."""
-    return format_interval(None if metric is None else Estimate(metric.value))
-
-
-def _format_gain(methods: Evaluations, method: str) -> str:
-    """Write the gain in AUC: the AUC of a method minus the AUC of the first method.
-
-    It is "-" for the first method itself, and for a method without evaluations.
-    """
-    first = next(iter(methods), method)
-    if method == first or method not in methods:
-        return "-"
-    gain = difference(methods[method], methods[first], ALL, "auc")
-    return format_interval(gain, sign="+")
-
-
-def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
-    """Find the runs whose scores lie in a sub-folder of a given name.
-
-    None if no run has the usual sub-folder "photographs"; any other name that no run has is an
-    error.
-    """
-    found = [group for group in groups if _is_scored_on(group, photographs)]
-    if len(found) > 1:
-        first = _first_folder(found[0])
-        second = _first_folder(found[1])
-        raise InputError(
-            f"{second} has other photographs or sources than {first}: "
-            "score both networks on the same folder with pnb-evaluate",
-        )
-    if not found and photographs != PHOTOGRAPHS:
-        raise InputError(
-            f"photos={photographs}: no run has a sub-folder of this name with scores: "
-            "give a name in the setting photos of the runs",
-        )
-    return found[0] if found else None
-
-
-def _first_folder(group: Scored) -> Path:
-    """Return the folder of the scores of the first run in a group."""
-    first_runs = next(iter(group.values()))
-    return first_runs[0].folder
-
-
-def _is_scored_on(group: Scored, photographs: str) -> bool:
-    """Return whether the scores of a group of networks may be those of a given sub-folder.
-
-    A run has its scores in a sub-folder, whose name the user chooses. A network
-    that is not a run, such as a published network, has no seed and no such
-    sub-folder. Its scores may be compared with those in any sub-folder.
-    """
-    for scored_runs in group.values():
-        for scored in scored_runs:
-            is_run = scored.run.seed is not None
-            if scored.name == photographs or not is_run:
-                return True
-    return False

@@ -38,6 +38,7 @@ from train.results.pictures import (
     read_pictures,
 )
 from train.results.predictions import CONTACT_SHEET
+from train.results.run_tables import run_tables, score_table, seconds_table
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import (
     Table,
@@ -95,7 +96,7 @@ def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen 
         if first.epochs:
             renders[method] = _read_renders(first, "epoch", "Renders")
             examples[method] = _read_renders(first, "attacks", "Renders before and after")
-    groups = store.group_by_images(shown)
+    groups = compare.group_by_images(shown)
     screen = _first_screen(groups)
     path = write_page(
         out,
@@ -105,11 +106,11 @@ def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen 
         title=_title(found, methods),
         screen=screen,
         lead=[*_accuracy_sentences(methods), *_relit_sentences(methods)],
-        tables=[table for table in store.run_tables(methods, {}) if table.rows],
+        tables=[table for table in run_tables(methods, {}) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
         curves=_plot_metrics(_collect_epochs(shown, found.unfinished)),
-        seconds=store.seconds_table(shown),
+        seconds=seconds_table(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders=renders,
         examples=examples,
@@ -455,7 +456,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         path = scored_runs[0].folder / CONTACT_SHEET
         alt = f"predictions of {method} on {title}"
         sheets[method] = read_pictures(path, alt, SHEET_WIDTH)
-    tables = [store.score_table("", group)]
+    tables = [score_table("", group)]
     rocs: list[Picture | None] = []
     problem = ""
     try:

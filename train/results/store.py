@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -17,20 +16,16 @@ from augment.augmentation_settings import MODES
 from renderer.errors import InputError, single_line
 from train import console, run_config, run_folder
 from train.results.metrics import (
-    COUNTED_EACH,
-    METRICS,
     Metrics,
     Pooled,
     Thresholds,
     describe_point,
-    metric_title,
     operating_points,
 )
 from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
-from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_config import CONFIG, read_config
-from train.run_folder import BEFORE, PHASES, PUBLISHED, read_json, read_metrics
-from train.settings import UNLABELED, label_names, published
+from train.run_folder import BEFORE, PUBLISHED, read_json, read_metrics
+from train.settings import label_names, published
 
 # Methods are named by numbers instead of by their settings if there are more than this.
 MAX_NAMED = 30
@@ -380,170 +375,6 @@ def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
             identity = repr((run.before.settings, images))
             networks[identity] = run.before
     return [*networks.values()]
-
-
-def group_by_images(methods: Methods) -> dict[str, Scored]:
-    """Group runs by the images on which they were scored."""
-    groups: dict[str, dict[str, list[ScoredRun]]] = {}
-    for method, runs in methods.items():
-        for run in runs:
-            for name, scores in run.photographs.items():
-                group = groups.setdefault(scores.images, {})
-                group.setdefault(method, []).append(ScoredRun(run, name))
-    titled: dict[str, Scored] = {}
-    for group in groups.values():
-        title = _title_of(group)
-        if title in titled:
-            title = f"{title} ({len(titled) + 1})"
-        titled[title] = group
-    return titled
-
-
-def _title_of(group: Scored) -> str:
-    """Write a title for the images on which a group of networks was scored."""
-    members = [scored for scored_runs in group.values() for scored in scored_runs]
-    # The name of the sub-folder comes from a training run if there is one, because the user
-    # has chosen this name. Only a training run has epochs.
-    of_training = [scored for scored in members if scored.run.epochs]
-    first = of_training[0] if of_training else members[0]
-    auc = first.scores.overall.auc
-    if not auc.positives + auc.negatives:
-        return first.name
-    labels = first.scores.labels
-    title = (
-        f"{first.name}: {auc.positives:,} images of {' or '.join(labels)}, "
-        f"{auc.negatives:,} images of other objects"
-    )
-    if len(labels) > 1:
-        title += COUNTED_EACH
-    return f"{title}; {describe_intervals([auc])}" if auc.low is not None else title
-
-
-def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
-    """Make tables of the accuracy, the scores and the settings of runs."""
-    tables = [_accuracy_table(methods)]
-    tables += [score_table(title, group) for title, group in groups.items()]
-    settings = _settings_table(methods)
-    if settings.rows:
-        tables.append(settings)
-    return tables
-
-
-def _settings_table(methods: Methods) -> Table:
-    """Make a table of the settings in which methods differ."""
-    # The first run of each method. Networks without a run have no settings of a training.
-    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
-    varied = varied_settings([*heads.values()])
-    rows = []
-    if varied:
-        for method, head in heads.items():
-            rows.append([method, *(str(head.settings.get(key)) for key in varied)])
-    return Table("settings in which the methods differ", ["network", *varied.values()], rows)
-
-
-def _accuracy_table(methods: Methods) -> Table:
-    """Make a table of the accuracy of each run on the test images."""
-    lines: dict[str, list[Line]] = {}
-    test_images = []
-    for method, runs in methods.items():
-        for run in runs:
-            test_images.append(run.config.get("test_images", ""))
-            if runs[0].accuracy is not None:
-                last = run.scores.get("test/accuracy_last")
-                line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
-                lines.setdefault(method, []).append(line)
-    # A dictionary has each name once, in the order of the runs.
-    names = dict.fromkeys(name for name in test_images if name)
-    title = " or ".join(f"accuracy on {name}" for name in names)
-    every_run = [run for runs in methods.values() for run in runs]
-    return _run_table(title, [accuracy_title(every_run), "of the last epoch"], lines)
-
-
-def accuracy_title(runs: Sequence[RunSummary]) -> str:
-    """Return the title of the column with the accuracy of runs on their test images.
-
-    Images without labels are labeled with the predictions of the network before the training.
-    """
-    names = {run.config.get("data", {}).get("name") for run in runs if run.config}
-    return "agreement with the original" if names == {UNLABELED} else "test accuracy"
-
-
-def score_table(title: str, group: Scored) -> Table:
-    """Make a table of the metrics of runs on the same images."""
-    lines: dict[str, list[Line]] = {}
-    for method, scored_runs in group.items():
-        for scored in scored_runs:
-            metrics_of_row = {method: scored.scores.overall}
-            for label, metrics in scored.scores.by_label.items():
-                metrics_of_row[f"{method}, {label_title(label)}"] = metrics
-            for name, metrics in metrics_of_row.items():
-                line = (scored.run.seed, [*map(metrics.find, METRICS)])
-                lines.setdefault(name, []).append(line)
-    points = {scored.scores.operating_point for runs in group.values() for scored in runs}
-    chosen = " or ".join(sorted(points - {""}))
-    if chosen:
-        title += f"; threshold for {chosen}"
-    return _run_table(title, [metric_title(name) for name in METRICS], lines)
-
-
-def label_title(label: str) -> str:
-    """Return the title of the row of a positive class in tables, such as "label=orange"."""
-    return f"label={label}"
-
-
-def seconds_table(methods: Methods) -> Table:
-    """Make a table of the seconds that an epoch of the first run of each method takes, by phase."""
-    titles = {phase: phase.replace("_", " and ") for phase in PHASES}
-    titles["attack_classifier"] = "attack: in the classifier"
-    titles["operators"] = "operators, once"
-    rows = []
-    for method, (run, *_) in methods.items():
-        means = {phase: _mean_seconds(run, phase) for phase in titles}
-        if all(mean is None for mean in means.values()):
-            continue
-        total = sum(means[phase] or 0 for phase in PHASES)
-        rows.append([method, *(f"{mean or 0:.2f}" for mean in (total, *means.values()))])
-    return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
-
-
-def _mean_seconds(run: RunSummary, phase: str) -> float | None:
-    """Average the seconds that a phase of an epoch takes over the epochs of a run.
-
-    None if no epoch records the phase.
-    """
-    name = f"seconds/{phase}"
-    seconds = [line[name] for line in run.epochs if name in line]
-    return fmean(seconds) if seconds else None
-
-
-# A row of a table: the seed of a run, and the metric of each column.
-Line = tuple[int | None, Sequence[Estimate | None]]
-
-
-def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
-    """Make a table with a row for each run.
-
-    A line is a seed and the metrics in the order of `header`. Several seeds get a row of their mean
-    ± standard deviation.
-    """
-    rows = []
-    for method, runs in lines.items():
-        for seed, metrics in runs:
-            cells = map(format_interval, metrics)
-            rows.append([method, "" if seed is None else str(seed), *cells])
-        if len({seed for seed, _ in runs}) > 1:
-            # A column has the values of one metric in all runs of the method.
-            columns = zip(*(metrics for _, metrics in runs), strict=True)
-            rows.append([method, f"{len(runs)} seeds", *map(_format_spread, columns)])
-    return Table(title, ["network", "seed", *header], rows)
-
-
-def _format_spread(metrics: Sequence[Estimate | None]) -> str:
-    """Write the mean and standard deviation over runs: "0.912 ± 0.004", or "-" if unknown."""
-    values = [metric.value for metric in metrics if metric is not None and metric.value is not None]
-    if len(values) < len(metrics):
-        return "-"
-    return f"{fmean(values):.3f} ± {stdev(values):.3f}"
 
 
 class ExampleRow(NamedTuple):

@@ -11,16 +11,11 @@ import pytest
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.data.photo import Photograph
-from train.results.compare import (
-    class_table,
-    format_comparison,
-    format_short_comparison,
-    format_table,
-    read_evaluations,
-)
+from train.results.compare import class_table, read_evaluations
 from train.results.metrics import pool
 from train.results.page import write_report
 from train.results.predictions import Prediction, write_predictions
+from train.results.run_tables import format_comparison, format_short_comparison, format_table
 from train.results.store import ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
