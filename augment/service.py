@@ -17,11 +17,10 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import distributed
-from augment.attacks.attack import warn_of_changed_light
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import LogitNetwork
 from augment.losses import NO_CLASS, is_correct, label_loss, require_known

@@ -16,19 +16,17 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.eot import NOISE_DRAWS, preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.parameters.lights import environment_light
-from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.attacks.result import AttackResult
 from augment.classifier import Classifier, class_index, remembering
 from augment.network import compute_outputs
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
-from augment.scene.build import MAX_IRRADIANCE_ERROR, with_needed_degree
+from augment.scene.build import with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
-from renderer.light.harmonics import irradiance_error
 
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
@@ -234,26 +232,6 @@ def _count_queries(
         is_tested = criterion.reached_in_views(predicted).any(1)
         queries += NOISE_DRAWS * view_count * is_tested
     return queries
-
-
-def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) -> None:
-    """Warn if the removal of negative radiance changes the irradiance by more than 5 %.
-
-    The change is the rms error of the irradiance over all normals and channels,
-    divided by the rms irradiance of the given environment light. The largest
-    change of all examples counts.
-    """
-    if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
-        return
-    rows, harmonics = environment_light(given)
-    error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
-    if error > MAX_IRRADIANCE_ERROR:
-        message = (
-            "the light has negative radiance, and after its removal the irradiance is off by "
-            f"{error:.0%} (rms) in {harmonics}: give a higher degree, "
-            "or set allow_negative=True to keep the light as it is"
-        )
-        warnings.warn(message, stacklevel=stacklevel)
 
 
 def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:

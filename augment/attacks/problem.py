@@ -1,5 +1,6 @@
 """All parameters that an attack changes, as one vector of values."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
@@ -9,11 +10,13 @@ from torch import Tensor
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lights import Lighting, Skylight
+from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.progress import progress
+from augment.scene.build import MAX_IRRADIANCE_ERROR
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
+from renderer.light.harmonics import irradiance_error
 
 
 class Problem(Protocol):
@@ -168,3 +171,23 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
             options["nonnegative"] = not settings.allow_negative
         parameters.append(make_parameter(name, scene, steps, **options))
     return SceneProblem(scene, parameters)
+
+
+def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) -> None:
+    """Warn if the removal of negative radiance changes the irradiance by more than 5 %.
+
+    The change is the rms error of the irradiance over all normals and channels,
+    divided by the rms irradiance of the given environment light. The largest
+    change of all examples counts.
+    """
+    if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
+        return
+    rows, harmonics = environment_light(given)
+    error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
+    if error > MAX_IRRADIANCE_ERROR:
+        message = (
+            "the light has negative radiance, and after its removal the irradiance is off by "
+            f"{error:.0%} (rms) in {harmonics}: give a higher degree, "
+            "or set allow_negative=True to keep the light as it is"
+        )
+        warnings.warn(message, stacklevel=stacklevel)
