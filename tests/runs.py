@@ -21,9 +21,7 @@ def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None 
 
 
 def completed_run(
-    settings: ExperimentSettings,
-    folder: Path,
-    data: DataSet | None = None,
+    settings: ExperimentSettings, folder: Path, data: DataSet | None = None
 ) -> dict[str, float]:
     """Make, train and score a run, and return its scores."""
     return loaded_run(settings, folder, data).train()

@@ -100,11 +100,7 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
         torch.tensor([3, 1]),
         lambda x: (
             augment.AugmentationService(
-                augment.AugmentationSettings(),
-                SCENE,
-                x,
-                0,
-                Phases(),
+                augment.AugmentationSettings(), SCENE, x, 0, Phases()
             ).labels
         ),
     ),
@@ -117,9 +113,7 @@ def orbit_of(values: Any) -> list[Camera]:
 
 
 @pytest.mark.parametrize(
-    "convert",
-    [lambda x: x.numpy(), lambda x: x.tolist()],
-    ids=["array", "list"],
+    "convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"]
 )
 @pytest.mark.parametrize("name", CALLS)
 def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):

@@ -84,18 +84,12 @@ ALL_LEAVES = ("light", "vertices", "albedo")
 RENDERS = {
     "flat_linear": RenderCase("orange:0", ABOVE, "grace", {"normals": "flat", "samples": 1}),
     "smooth_srgb_perspective": RenderCase(
-        "apple:1",
-        NEAR,
-        "eucalyptus",
-        {"encoding": "srgb", "samples": 3},
+        "apple:1", NEAR, "eucalyptus", {"encoding": "srgb", "samples": 3}
     ),
     "compiled": RenderCase("lemon:2", RING, "st_peters", {"rasterizer": "numba"}),
     "shadows": RenderCase("pear:0", ASIDE, "environment", {"shadows": True}),
     "bounces": RenderCase(
-        "cup:0",
-        NEAR,
-        "uniform",
-        {"bounces": 2, "normals": "flat", "encoding": "srgb"},
+        "cup:0", NEAR, "uniform", {"bounces": 2, "normals": "flat", "encoding": "srgb"}
     ),
     "sky": RenderCase("mushroom:3", RING, "skylight", {"albedo_scale": 0.7, "background": 0.1}),
     "subdivided": RenderCase("table:0+2000", ABOVE, "lamp", {"normals": "flat", "samples": 3}),
@@ -120,9 +114,7 @@ class OperatorCase:
 OPERATORS = {
     "one_color": OperatorCase("ball:0", ABOVE, {"normals": "flat"}),
     "colors": OperatorCase(
-        "orange:3",
-        RING,
-        {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3},
+        "orange:3", RING, {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3}
     ),
     "shadows": OperatorCase("plate:0", NEAR, {"shadows": True}),
     "bounces": OperatorCase("cup:1", ASIDE, {"bounces": 2}),
@@ -131,25 +123,11 @@ LIGHTS_OF_OPERATORS = ("grace", "skylight", "environment")
 
 CUP = augment.PropSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
 LEMON = augment.PropSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
-AMONG_PROPS = augment.ObjectSettings(
-    "solid:pear:0",
-    "orange",
-    albedo_scale=0.9,
-    props=[CUP, LEMON],
-)
-PROJECTOR = augment.ProjectorSettings(
-    pixels=6,
-    polar=50.0,
-    azimuth=20.0,
-    power=2.0,
-    pattern=0.5,
-)
+AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", albedo_scale=0.9, props=[CUP, LEMON])
+PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
 LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
 DISCS = augment.LampsSettings(
-    [[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]],
-    power=8.0,
-    radius=0.4,
-    start=[[4, 3, 2], [1, 2, 3]],
+    [[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, radius=0.4, start=[[4, 3, 2], [1, 2, 3]]
 )
 
 
@@ -170,25 +148,17 @@ class SceneCase:
 
 SCENES = {
     "grid": SceneCase(
-        [("solid:orange:0", "orange"), ("solid:apple:0", "apple")],
-        2,
-        {"backgrounds": [0.2, 0.8]},
+        [("solid:orange:0", "orange"), ("solid:apple:0", "apple")], 2, {"backgrounds": [0.2, 0.8]}
     ),
     "props": SceneCase([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
     "projector": SceneCase(
-        [("solid:mushroom:0", "orange")],
-        1,
-        {"projector": PROJECTOR, "encoding": "srgb"},
+        [("solid:mushroom:0", "orange")], 1, {"projector": PROJECTOR, "encoding": "srgb"}
     ),
     "lamps": SceneCase(
-        [("solid:cup:2", "orange")],
-        2,
-        {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]},
+        [("solid:cup:2", "orange")], 2, {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]}
     ),
     "all_lights": SceneCase(
-        [AMONG_PROPS],
-        1,
-        {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True},
+        [AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}
     ),
 }
 
@@ -218,29 +188,19 @@ class AttackCase:
 
 ATTACKS = {
     "lighting_l2": AttackCase(
-        {"lighting": StepSettings("l2", 0.8, step_size=0.3)},
-        settings={"quantized": True},
+        {"lighting": StepSettings("l2", 0.8, step_size=0.3)}, settings={"quantized": True}
     ),
     "lighting_signed": AttackCase(
-        {"lighting": StepSettings(step_size=0.3)},
-        settings={"allow_negative": True, "margin": 0.0},
+        {"lighting": StepSettings(step_size=0.3)}, settings={"allow_negative": True, "margin": 0.0}
     ),
     "skylight": AttackCase(
-        {"skylight": augment.SkylightSettings(zenith=30.0, step_size=0.3)},
-        {"normals": "smooth"},
+        {"skylight": augment.SkylightSettings(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}
     ),
     "projector": AttackCase(
-        {"projector": StepSettings(step_size=1.0)},
-        {"projector": PROJECTOR, "encoding": "srgb"},
+        {"projector": StepSettings(step_size=1.0)}, {"projector": PROJECTOR, "encoding": "srgb"}
     ),
-    "lamps": AttackCase(
-        {"lamps": StepSettings(step_size=2.0)},
-        {"lamps": LAMPS, "shadows": True},
-    ),
-    "places": AttackCase(
-        {"positions": StepSettings("l2", 1.0, step_size=0.3)},
-        {"lamps": DISCS},
-    ),
+    "lamps": AttackCase({"lamps": StepSettings(step_size=2.0)}, {"lamps": LAMPS, "shadows": True}),
+    "places": AttackCase({"positions": StepSettings("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}),
     "geometry": AttackCase(
         {"geometry": StepSettings("linf", 0.02, "sign", 0.01)},
         {"normals": "smooth", "shadows": True},
@@ -251,8 +211,7 @@ ATTACKS = {
         {"shadows": True, "ground": [0.5, 0.4, 0.3]},
     ),
     "pixels": AttackCase(
-        {"pixels": StepSettings("linf", 0.03, "sign", 0.01)},
-        target="least_likely",
+        {"pixels": StepSettings("linf", 0.03, "sign", 0.01)}, target="least_likely"
     ),
     "shared_views": AttackCase(
         {
@@ -263,9 +222,7 @@ ATTACKS = {
         {"backtracking": True},
     ),
     "targeted": AttackCase(
-        {"lighting": StepSettings(step="raw", step_size=0.5)},
-        {"views": 2},
-        target="pear",
+        {"lighting": StepSettings(step="raw", step_size=0.5)}, {"views": 2}, target="pear"
     ),
     "expectation": AttackCase(
         {"lighting": StepSettings("linf", 0.1, "sign", 0.04)},
@@ -599,9 +556,7 @@ def classifier() -> augment.Classifier:
 
 def textured_tent() -> renderer.Mesh:
     """Make a roof of two rectangles with a texture of noise."""
-    vertices = np.array(
-        [[-1, -1, 0], [1, -1, 0], [1, 0, 0.8], [-1, 0, 0.8], [1, 1, 0], [-1, 1, 0]],
-    )
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 0, 0.8], [-1, 0, 0.8], [1, 1, 0], [-1, 1, 0]])
     plain = renderer.Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
     uvs = (vertices[plain.faces][..., :2] + 1) / 2
     texture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)

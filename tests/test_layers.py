@@ -66,12 +66,7 @@ def imported_modules() -> dict[str, set[str]]:
 def test_no_import_leads_back_to_its_module():
     # A circle raises CycleError, which names it.
     order = list(TopologicalSorter(imported_modules()).static_order())
-    path = [
-        "renderer.mesh",
-        "renderer.io.meshes",
-        "augment.scene.scene",
-        "train.training.run",
-    ]
+    path = ["renderer.mesh", "renderer.io.meshes", "augment.scene.scene", "train.training.run"]
     assert sorted(path, key=order.index) == path
 
 

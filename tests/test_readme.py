@@ -19,9 +19,7 @@ BLOCKS = {
     heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     for page in PAGES
     for heading, text in re.findall(
-        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)",
-        (ROOT / page).read_text(),
-        re.M | re.DOTALL,
+        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL
     )
     if "```python" in text
 }

@@ -118,9 +118,7 @@ def mesh_of(**changed: Any) -> renderer.Mesh:
 
 
 def calls_of(
-    name: str,
-    call: Callable[[Any], object],
-    *values: Any,
+    name: str, call: Callable[[Any], object], *values: Any
 ) -> list[tuple[str, str, Callable[[], object]]]:
     """List a name, a title and a call for each wrong value of an argument."""
     return [(name, f"{name}={_title(value)}", lambda value=value: call(value)) for value in values]
@@ -266,24 +264,10 @@ RENDERING = [
         [None],
     ),
     *calls_of(
-        "albedo_scale",
-        lambda x: render(albedo_scale=x),
-        "2",
-        None,
-        -1.0,
-        NAN,
-        1j,
-        [1.0, 2.0],
-        MESH,
+        "albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH
     ),
     *calls_of(
-        "gloss",
-        lambda x: render(gloss=x),
-        0.3,
-        (0.3, 0, 1),
-        "shiny",
-        MESH,
-        {"roughness": 0.3},
+        "gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}
     ),
     *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, 65),
     *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3, ["linear"]),
@@ -342,16 +326,7 @@ RENDERING = [
 
 CAMERAS = [
     *calls_of(
-        "views",
-        lambda x: renderer.orbit_cameras(x, 2.0),
-        0,
-        -1,
-        2.5,
-        "3",
-        True,
-        None,
-        NAN,
-        [3],
+        "views", lambda x: renderer.orbit_cameras(x, 2.0), 0, -1, 2.5, "3", True, None, NAN, [3]
     ),
     *calls_of(
         "width",
@@ -384,14 +359,7 @@ CAMERAS = [
         -721.0,
     ),
     *calls_of(
-        "fov",
-        lambda x: renderer.orbit_cameras(1, 2.0, fov=x),
-        173.0,
-        "30",
-        0,
-        -1.0,
-        NAN,
-        1j,
+        "fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, -1.0, NAN, 1j
     ),
     *calls_of(
         "polar",
@@ -404,12 +372,7 @@ CAMERAS = [
         1j,
     ),
     *calls_of(
-        "azimuth",
-        lambda x: renderer.OrthographicCamera(1.0, x, 2.0),
-        "east",
-        None,
-        NAN,
-        [1.0, 2.0],
+        "azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]
     ),
     *calls_of(
         "width",
@@ -452,16 +415,7 @@ CAMERAS = [
 
 LIGHTS = [
     *calls_of(
-        "light",
-        renderer.load_light,
-        None,
-        3,
-        LIGHT,
-        "sunset",
-        ".",
-        ["grace"],
-        True,
-        b"grace",
+        "light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"
     ),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
     *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41, "6", True, LIGHT),
@@ -475,11 +429,7 @@ LIGHTS = [
         COMPLEX,
     ),
     *calls_of(
-        "basis",
-        lambda x: renderer.save_light(Path("l.json"), LIGHT, x),
-        "harmonics",
-        None,
-        6,
+        "basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", None, 6
     ),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT, "light.png"),
     *calls_of("height", lambda x: renderer.save_light("l.exr", LIGHT, height=x), 0, 2.5, None),
@@ -494,14 +444,7 @@ LIGHTS = [
         1j,
     ),
     *calls_of(
-        "degree",
-        lambda x: harmonics.basis(torch.ones(2, 3), x),
-        -1,
-        2.5,
-        41,
-        "2",
-        None,
-        True,
+        "degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2", None, True
     ),
     *calls_of("light", harmonics.degree_of, "grace", None, torch.ones(49), torch.ones(3, 49), 6),
     *calls_of(
@@ -544,21 +487,10 @@ LIGHTS = [
         LAMP,
     ),
     *calls_of(
-        "azimuth",
-        lambda x: skylight.coefficients(0.5, x, 3.0),
-        "south",
-        None,
-        NAN,
-        [[1], [1, 2]],
+        "azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", None, NAN, [[1], [1, 2]]
     ),
     *calls_of(
-        "turbidity",
-        lambda x: skylight.coefficients(0.5, 0.0, x),
-        "clear",
-        None,
-        1.0,
-        11.0,
-        NAN,
+        "turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", None, 1.0, 11.0, NAN
     ),
     *calls_of(
         "positions",
@@ -586,15 +518,7 @@ MESHES = [
     *calls_of("mesh", renderer.normalize, "a.glb", None, TRIMESH, MESH.vertices, [MESH]),
     *calls_of("mesh", lambda x: renderer.subdivide(x, 10), "a.glb", None, TRIMESH),
     *calls_of(
-        "vertices",
-        lambda x: renderer.subdivide(MESH, x),
-        2.5,
-        -1,
-        "many",
-        None,
-        True,
-        10**8,
-        NAN,
+        "vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", None, True, 10**8, NAN
     ),
     *calls_of("mesh", lambda x: renderer.export_mesh(x, "a.glb"), "b.glb", None, TRIMESH),
     *calls_of("path", lambda x: renderer.export_mesh(MESH, x), None, 3, MESH),
@@ -684,12 +608,7 @@ MESHES = [
         "crease", lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, crease=x), -1, 181, "x"
     ),
     *calls_of(
-        "texture_ids",
-        lambda x: mesh_of(texture_ids=x),
-        None,
-        np.zeros(4, int),
-        np.zeros(4),
-        [0, 0],
+        "texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), np.zeros(4), [0, 0]
     ),
     *calls_of(
         "textures",
@@ -721,12 +640,7 @@ MESHES = [
         MESH,
     ),
     *calls_of(
-        "metallic",
-        lambda x: renderer.Gloss(0.3, x).on(MESH),
-        "gold",
-        None,
-        1.5,
-        np.ones((4, 3)),
+        "metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", None, 1.5, np.ones((4, 3))
     ),
     *calls_of("specular_factor", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", None, 1.5),
     *calls_of("mesh", renderer.Gloss(0.3).on, "a.glb", None, TRIMESH),
@@ -800,11 +714,7 @@ SCENES = [
     *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
     *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", None, 3),
     *calls_of(
-        "pixels",
-        lambda x: scene(projector=augment.ProjectorSettings(pixels=x)),
-        2.5,
-        0,
-        "16",
+        "pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"
     ),
     *calls_of(
         "pattern",
@@ -835,12 +745,7 @@ SCENES = [
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, "", MESH),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
     *calls_of(
-        "albedo_scale",
-        lambda x: augment.ObjectSettings("solid:cup", "cup", x),
-        "2",
-        None,
-        0,
-        NAN,
+        "albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", None, 0, NAN
     ),
     *calls_of(
         "color",
@@ -902,11 +807,7 @@ SCENES = [
     *calls_of("instances", lambda x: augment.VariationSettings(instances=x), "yes", None),
     *calls_of("fov", lambda x: augment.VariationSettings(fov=x), 30.0, None, [50, 60], "wide"),
     *calls_of(
-        "gloss",
-        lambda x: augment.VariationSettings(gloss=x),
-        0.3,
-        None,
-        renderer.Gloss(0.3),
+        "gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None, renderer.Gloss(0.3)
     ),
     *calls_of("camera", lambda x: augment.VariationSettings(camera=x), 0.3, None, CAMERA),
     *calls_of("noise", lambda x: augment.CameraEffectSettings(noise=x), 2.0, "much", None, NAN),
@@ -940,10 +841,7 @@ SCENES = [
     *calls_of("examples", lambda x: small_scene().changed(examples=x), [], None, [3], "all"),
     *calls_of("light", lambda x: renderer.light_sphere(x, 8), "grace", 96),
     *calls_of(
-        "photograph",
-        lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH),
-        "photo.jpg",
-        BYTES[0],
+        "photograph", lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH), "photo.jpg", BYTES[0]
     ),
     *calls_of("mask", lambda x: renderer.fit_scene(IMAGES[0], x, MESH), "mask.png", BYTES[0, 0]),
     *calls_of("seed", lambda x: scene([(f"solid:orange:{x}", "orange")]), "x"),
@@ -971,13 +869,7 @@ ATTACKS = [
     *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN, [0.1], True),
     *calls_of("step", lambda x: augment.StepSettings(step=x), "adam", None, 0.1),
     *calls_of(
-        "step_size",
-        lambda x: augment.StepSettings(step_size=x),
-        0,
-        -0.1,
-        "small",
-        None,
-        NAN,
+        "step_size", lambda x: augment.StepSettings(step_size=x), 0, -0.1, "small", None, NAN
     ),
     *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", None, NAN),
     *calls_of("roughness", lambda x: augment.MaterialSettings(roughness=x), 2, "rough", None),
@@ -993,16 +885,10 @@ ATTACKS = [
     ),
     *calls_of("pose", lambda x: augment.AttackSettings(pose=x), augment.StepSettings(), 10.0, True),
     *calls_of(
-        "material",
-        lambda x: augment.AttackSettings(material=x),
-        augment.StepSettings(),
-        0.3,
+        "material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3
     ),
     *calls_of(
-        "skylight",
-        lambda x: augment.AttackSettings(skylight=x),
-        augment.StepSettings(),
-        True,
+        "skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings(), True
     ),
     *calls_of(
         "max_steps",
@@ -1014,27 +900,13 @@ ATTACKS = [
         None,
     ),
     *calls_of(
-        "restarts",
-        lambda x: augment.AttackSettings(lighting=STEPS, restarts=x),
-        1.5,
-        "x",
-        -1,
-        None,
+        "restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1, None
     ),
     *calls_of(
-        "margin",
-        lambda x: augment.AttackSettings(lighting=STEPS, margin=x),
-        "x",
-        -1,
-        NAN,
-        None,
+        "margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN, None
     ),
     *calls_of(
-        "quantized",
-        lambda x: augment.AttackSettings(lighting=STEPS, quantized=x),
-        "yes",
-        None,
-        8,
+        "quantized", lambda x: augment.AttackSettings(lighting=STEPS, quantized=x), "yes", None, 8
     ),
     *calls_of(
         "allow_negative",
@@ -1055,23 +927,10 @@ ATTACKS = [
         None,
     ),
     *calls_of(
-        "classifier",
-        attack,
-        None,
-        LINEAR,
-        bright_or_dark,
-        "efficientnet_lite0",
-        small_scene,
+        "classifier", attack, None, LINEAR, bright_or_dark, "efficientnet_lite0", small_scene
     ),
     *calls_of(
-        "scene",
-        lambda x: attack(scene=x),
-        None,
-        "solid:orange",
-        [MESH],
-        MESH,
-        CLASSIFIER,
-        IMAGES,
+        "scene", lambda x: attack(scene=x), None, "solid:orange", [MESH], MESH, CLASSIFIER, IMAGES
     ),
     *calls_of(
         "target",
@@ -1087,12 +946,7 @@ ATTACKS = [
         {},
     ),
     *calls_of(
-        "settings",
-        lambda x: attack(settings=x),
-        {"lighting": STEPS},
-        STEPS,
-        "lighting",
-        True,
+        "settings", lambda x: attack(settings=x), {"lighting": STEPS}, STEPS, "lighting", True
     ),
     *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
     *calls_of("seed", lambda x: attack(seed=x, force=True), "x", 1.5, None, -1, True),
@@ -1189,9 +1043,7 @@ DIRECT = [
     *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes", None),
     *calls_of(
-        "classes",
-        lambda x: augment.Classifier(bright_or_dark, SIZE, x),
-        {"orange", "other"},
+        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
     ),
     *calls_of("degree", harmonics.quadrature, "x", 2.5, -1, None),
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, None, 4.5),
@@ -1222,12 +1074,7 @@ DIRECT = [
 
 CLASSIFIERS = [
     *calls_of(
-        "function",
-        lambda x: augment.Classifier(x, SIZE, CLASSES),
-        None,
-        "resnet50",
-        3,
-        IMAGES,
+        "function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES
     ),
     *calls_of(
         "size",
@@ -1279,9 +1126,7 @@ CLASSIFIERS = [
     *calls_of("float16", half_network(), IMAGES),
     *calls_of("float64", augment.Classifier(LINEAR, SIZE, CLASSES), IMAGES.double()),
     *calls_of(
-        "logits",
-        lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True),
-        probabilities,
+        "logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities
     ),
     *calls_of("float16", lambda x: attack(x, force=True), half_network()),
     *calls_of("label", CLASSIFIER.label, 3, None, ["orange"], 0.5),
@@ -1291,12 +1136,7 @@ CLASSIFIERS = [
     *calls_of("name", augment.load_classifier, None, 3, LINEAR, ["timm:resnet18"], Path("a.pth")),
     *calls_of("resnet50", augment.load_classifier, "resnet50"),
     *calls_of(
-        "weights",
-        lambda x: augment.load_classifier("torchvision:resnet18", x),
-        3,
-        ".",
-        LINEAR,
-        {},
+        "weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR, {}
     ),
     *calls_of("run", load_run, None, 3, LINEAR),
     *calls_of("missing", load_run, "missing"),
@@ -1329,27 +1169,17 @@ SERVICES = [
     ),
     *calls_of("label", small_service, "orange", 1.5, None, True, [0], NAN),
     *calls_of(
-        "size",
-        lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x),
-        16.5,
-        None,
-        0,
+        "size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0
     ),
     *calls_of("settings", lambda x: small_service(settings=x), {"mode": "random"}, STEPS, "random"),
     *calls_of("seed", lambda x: small_service(seed=x), "x", 1.5, None, -1),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2, 53),
     *calls_of("model", lambda x: small_service().regenerate(x, 0), None, "resnet", 3, IMAGES),
     *calls_of(
-        "model",
-        lambda x: small_service().regenerate(x, 0),
-        nn.Flatten(0),
-        nn.Linear(5, 2),
-        HALF,
+        "model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2), HALF
     ),
     *calls_of(
-        "logits",
-        lambda x: small_service().regenerate(x, 0),
-        nn.Sequential(LINEAR, nn.Softmax(1)),
+        "logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))
     ),
     *calls_of("number", lambda x: small_service().regenerate(LINEAR, x), "x", 1.5, None, -1, True),
     *calls_of(
@@ -1369,14 +1199,10 @@ SERVICES = [
         small_service(),
     ),
     *calls_of(
-        "state",
-        lambda x: x.load_state_dict(small_service(label=1).state_dict()),
-        small_service(),
+        "state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()
     ),
     *calls_of(
-        "state",
-        lambda x: x.load_state_dict(small_service(width=3.0).state_dict()),
-        small_service(),
+        "state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()
     ),
 ]
 
@@ -1471,24 +1297,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "folder.glb").mkdir()
     for name in ("orange", "other"):
         (here / "photos" / name).mkdir(parents=True)
-        Image.new(
-            "RGB",
-            (20, 20),
-            name.replace("other", "blue"),
-        ).save(here / "photos" / name / "0.png")
+        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
+            here / "photos" / name / "0.png"
+        )
     return here
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    ("name", "call"),
-    [pytest.param(name, call, id=title) for name, title, call in CALLS],
+    ("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS]
 )
 def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
-    folder,
-    monkeypatch,
-    name,
-    call,
+    folder, monkeypatch, name, call
 ):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError) as refused:
@@ -1520,10 +1340,7 @@ def test_ones_whole_floats_and_paths_pass_where_they_always_did():
     assert torch.equal(render(shadows=1), render(shadows=True))
     assert len(renderer.subdivide(MESH, 1e1).vertices) > 10
     assert scene(vertices=1e1).vertices.shape[1] > 10
-    augment.VariationSettings(
-        backgrounds=Path("photos"),
-        environments=[Path("a.hdr")],
-    )  # type: ignore[arg-type]
+    augment.VariationSettings(backgrounds=Path("photos"), environments=[Path("a.hdr")])  # type: ignore[arg-type]
     assert renderer.Mesh.plain(MESH.vertices, MESH.faces.astype(float)).faces.dtype == np.int64
     assert scene(ground=np.array([0.5, 0.5, 0.5]), backgrounds=torch.tensor([0.2, 0.4])).views == 1
     assert skylight.coefficients([15.0, 30.0], 30.0, 3.0).dtype == torch.float64

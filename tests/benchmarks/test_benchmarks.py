@@ -111,8 +111,7 @@ def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, c
         assert torch.equal(other.pixels, first.pixels)
         # Sums over all pixels are rounded to float32.
         whole_steps.require_close(
-            [other.radiance, other.gradient],
-            [first.radiance, first.gradient],
+            [other.radiance, other.gradient], [first.radiance, first.gradient]
         )
 
 
@@ -169,9 +168,7 @@ def test_training_is_timed_beside_a_plain_loop(tmp_path):
 def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, monkeypatch):
     # A process would take seconds to import torch.
     monkeypatch.setattr(
-        training,
-        "ProcessPoolExecutor",
-        lambda workers, context: ThreadPoolExecutor(workers),
+        training, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers)
     )
     path = tmp_path / "renders.csv"
     rows = training.main(["renders", "--numbers", "10", "--meshes", "1", "2", "--csv", str(path)])

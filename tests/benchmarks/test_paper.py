@@ -32,17 +32,11 @@ PNG_SIGNATURE = b"\x89PNG"
 # Pixels per side of the images.
 SIZE = 12
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-SUBJECT = SceneObject(
-    "orange",
-    Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)),
-    name="ball",
-)
+SUBJECT = SceneObject("orange", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)), name="ball")
 
 
 def classify_by_brightness(
-    gray: float = 0.2,
-    name: str = "source",
-    rows: slice = slice(4, 8),
+    gray: float = 0.2, name: str = "source", rows: slice = slice(4, 8)
 ) -> Classifier:
     """Make a classifier that predicts an orange if a square of an image is bright enough.
 
@@ -76,9 +70,7 @@ def small(monkeypatch, tmp_path) -> list[str]:
     monkeypatch.setattr(common, "VERTICES", 0)
     monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
     monkeypatch.setattr(
-        common,
-        "load_network",
-        lambda name, weights: classify_by_brightness(0.1, name),
+        common, "load_network", lambda name, weights: classify_by_brightness(0.1, name)
     )
     return ["--out", str(tmp_path / "records.jsonl"), "--meshes", str(tmp_path / "ball.ply")]
 
@@ -167,8 +159,7 @@ def test_the_change_of_light_is_a_mean_over_the_renders_that_are_attacked(tmp_pa
 
 @pytest.mark.parametrize(("fraction_of_radius", "success"), [(0.9, True), (1.1, False)])
 def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(
-    fraction_of_radius,
-    success,
+    fraction_of_radius, success
 ):
     radius = 0.02
     scene = make_scene(1)
@@ -211,10 +202,7 @@ def test_views_that_share_a_light_or_shape_have_the_sum_of_their_gradients(kind)
     assert largest > 0
     # The gradients of three views are summed in another order in float32.
     torch.testing.assert_close(
-        shared_values.grad[0],
-        values.grad.sum(0),
-        rtol=1e-5,
-        atol=1e-5 * largest,
+        shared_values.grad[0], values.grad.sum(0), rtol=1e-5, atol=1e-5 * largest
     )
 
 
@@ -244,9 +232,7 @@ def test_the_bootstrap_resamples_cameras_and_not_renders():
     ],
 )
 def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts(
-    network,
-    state,
-    outcomes,
+    network, state, outcomes
 ):
     source = {
         "before": ["orange", "orange", "orange", "orange"],

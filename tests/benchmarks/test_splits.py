@@ -119,9 +119,7 @@ def photographs_of(split: str) -> set[str]:
 
 @pytest.mark.slow  # Scoring takes bootstraps.
 def test_the_splits_share_no_image_object_or_light_and_evaluations_are_logged(
-    made_splits,
-    monkeypatch,
-    capsys,
+    made_splits, monkeypatch, capsys
 ):
     names = [TRAINING, names_of("validation"), names_of("test")]
     assert len(set.union(*names)) == sum(len(part) for part in names)

@@ -156,10 +156,7 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
 
 
 def vertex_gradient(
-    view: View,
-    upstream: np.ndarray,
-    light: np.ndarray,
-    vertex_count: int,
+    view: View, upstream: np.ndarray, light: np.ndarray, vertex_count: int
 ) -> np.ndarray:
     """Compute the gradient of Σ upstream × image by the shaded vertices.
 
@@ -333,11 +330,7 @@ def _legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
 
 
 def shadow(
-    view: View,
-    points: np.ndarray,
-    corners: np.ndarray,
-    directions: np.ndarray,
-    degree: int,
+    view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int
 ) -> np.ndarray:
     """Compute the radiance that shadows take from each pixel.
 

@@ -144,10 +144,7 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
 
 
 def coefficients_by_quadrature(
-    zenith: float,
-    azimuth: float,
-    turbidity: float,
-    nodes: int = 48,
+    zenith: float, azimuth: float, turbidity: float, nodes: int = 48
 ) -> np.ndarray:
     """Integrate the sky's radiance times harmonics over the upper hemisphere.
 

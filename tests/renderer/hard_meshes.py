@@ -21,11 +21,7 @@ class Chart(Rasterizer):
     description: str = "a chart of the faces"
 
     def rasterize(
-        self,
-        points: np.ndarray,
-        faces: np.ndarray,
-        resolution: int,
-        closed: bool = False,
+        self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False
     ) -> np.ndarray:
         ids = np.full((len(points), resolution**2), NO_FACE, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))
@@ -122,10 +118,7 @@ def heap() -> Mesh:
     """
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
     lifted_ball = painted(ball.vertices + np.array([0, 0, 0.4]), ball.faces)
-    plate = painted(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
-        [[0, 1, 2], [0, 2, 3]],
-    )
+    plate = painted([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     wall = painted([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]])
     return concatenate([lifted_ball, plate, wall])
 
@@ -140,13 +133,7 @@ def boards() -> Mesh:
 
 def non_manifold() -> Mesh:
     """Create three faces with a common edge, and two tetrahedra with a common corner."""
-    fan = [
-        [0, 0, -0.7],
-        [0, 0, 0.7],
-        [0.8, 0, 0],
-        [-0.4, 0.7, 0],
-        [-0.4, -0.7, 0],
-    ]
+    fan = [[0, 0, -0.7], [0, 0, 0.7], [0.8, 0, 0], [-0.4, 0.7, 0], [-0.4, -0.7, 0]]
     faces_on_edge = painted(fan, [[0, 1, 2], [0, 1, 3], [1, 0, 4]])
     tips = np.array([[0.3, 0, 0.1], [0, 0.3, 0.2], [0.2, 0.2, 0.5]])
     vertices = np.concatenate([np.zeros((1, 3)), tips, -tips])
@@ -154,12 +141,7 @@ def non_manifold() -> Mesh:
     # reversed order of its corners makes its faces point outward again.
     tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
     mirrored = np.where(tetrahedron == 0, 0, tetrahedron + len(tips))[:, ::-1]
-    return concatenate(
-        [
-            faces_on_edge,
-            painted(vertices, np.concatenate([tetrahedron, mirrored])),
-        ]
-    )
+    return concatenate([faces_on_edge, painted(vertices, np.concatenate([tetrahedron, mirrored]))])
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -65,8 +65,7 @@ def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarra
 
 
 def scipy_irradiance(
-    normals: np.ndarray | torch.Tensor,
-    light: np.ndarray | torch.Tensor,
+    normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor
 ) -> np.ndarray:
     """Compute the irradiance Σ A_l U_lm Y_lm(n), shape (N, 3).
 

@@ -142,9 +142,7 @@ def write(
 
 
 def _tree(
-    arrays: GltfArrays,
-    weights: np.ndarray | None,
-    joints: np.ndarray | None,
+    arrays: GltfArrays, weights: np.ndarray | None, joints: np.ndarray | None
 ) -> dict[str, Any]:
     """Build the JSON tree, and fill its arrays."""
     if weights is None:

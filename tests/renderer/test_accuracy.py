@@ -148,12 +148,7 @@ class Setup:
         """Rasterize the mesh for the renderer."""
         mesh = self.mesh
         [fragments] = build_fragments(
-            mesh.vertices,
-            mesh.faces,
-            [self.camera],
-            self.settings,
-            self.rasterizer,
-            mesh.closed,
+            mesh.vertices, mesh.faces, [self.camera], self.settings, self.rasterizer, mesh.closed
         )
         return fragments
 
@@ -357,10 +352,7 @@ def shadow_cases() -> Iterator[Case[Setup]]:
 
 
 def tables(
-    degree: int,
-    subdivisions: int,
-    size: int,
-    slivers: int,
+    degree: int, subdivisions: int, size: int, slivers: int
 ) -> dict[str, Iterator[Case[Any]]]:
     """Return the rows of each table by its title.
 
@@ -427,9 +419,7 @@ def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
 
 
 def operator_errors(
-    setup: Setup,
-    dtype: torch.dtype = torch.float32,
-    lost: np.ndarray | None = None,
+    setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarray | None = None
 ) -> Errors:
     """Measure the errors of an operator's image and of its gradient by the light.
 
@@ -531,10 +521,7 @@ def harmonics_errors(directions: Tensor, degrees: Sequence[int]) -> Errors:
         total = (values @ upstream.to(directions)).sum()
         (gradient,) = torch.autograd.grad(total, variable)
         by_direction = [units(*pair) for pair in zip(gradient, expected_gradient, strict=True)]
-        errors = {
-            "basis": units(values, wide_values[:, :count]),
-            "gradient": max(by_direction),
-        }
+        errors = {"basis": units(values, wide_values[:, :count]), "gradient": max(by_direction)}
         measured.append(errors)
     return largest_errors(measured)
 

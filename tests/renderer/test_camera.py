@@ -44,14 +44,8 @@ NO_NUMBA = find_spec("numba") is None
 NO_EGL = find_library("EGL") is None
 RASTERIZERS = [
     "numpy",
-    pytest.param(
-        "numba",
-        marks=pytest.mark.skipif(NO_NUMBA, reason="numba is not installed"),
-    ),
-    pytest.param(
-        "opengl",
-        marks=pytest.mark.skipif(NO_EGL, reason="no EGL on this machine"),
-    ),
+    pytest.param("numba", marks=pytest.mark.skipif(NO_NUMBA, reason="numba is not installed")),
+    pytest.param("opengl", marks=pytest.mark.skipif(NO_EGL, reason="no EGL on this machine")),
 ]
 
 
@@ -71,9 +65,7 @@ def test_the_world_z_axis_points_up_in_the_image(camera):
 
 
 @pytest.mark.parametrize("camera", ORTHOGRAPHIC)
-def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_it(
-    camera,
-):
+def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_it(camera):
     back = camera.axes()[2]
     near, far = camera.project(np.stack([back, -back]))
     assert near[2] < 0 < far[2]
@@ -92,26 +84,10 @@ def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_i
             [[0.5, (math.sqrt(3) - 1) / 4], [-0.125, -0.125], [0, 0]],
         ),
         # Each direction is to the right for the camera on one side.
-        (
-            OrthographicCamera(90.0, 0, 2.0),
-            [[0, 1, 0]],
-            [[1, 0]],
-        ),
-        (
-            OrthographicCamera(90.0, 90.0, 2.0),
-            [[-1, 0, 0]],
-            [[1, 0]],
-        ),
-        (
-            OrthographicCamera(90.0, 180.0, 2.0),
-            [[0, -1, 0]],
-            [[1, 0]],
-        ),
-        (
-            OrthographicCamera(90.0, -90.0, 2.0),
-            [[1, 0, 0]],
-            [[1, 0]],
-        ),
+        (OrthographicCamera(90.0, 0, 2.0), [[0, 1, 0]], [[1, 0]]),
+        (OrthographicCamera(90.0, 90.0, 2.0), [[-1, 0, 0]], [[1, 0]]),
+        (OrthographicCamera(90.0, 180.0, 2.0), [[0, -1, 0]], [[1, 0]]),
+        (OrthographicCamera(90.0, -90.0, 2.0), [[1, 0, 0]], [[1, 0]]),
         (
             OrthographicCamera(90.0, 0, 2, 0.5, -0.25),
             [[0, 0, 0], [9, 0.5, 1]],
@@ -121,12 +97,7 @@ def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_i
         # 1 in front of the origin is twice as large, and 2 behind half as large.
         (
             PerspectiveCamera(90.0, 0, 4.0, right=0.5, distance=2.0),
-            [
-                [0.0, 1.0, 1.0],
-                [1.0, 1.0, 1.0],
-                [-2.0, 1.0, -1.0],
-                [0.0, -0.5, 0.0],
-            ],
+            [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [-2.0, 1.0, -1.0], [0.0, -0.5, 0.0]],
             [[0.75, 0.5], [1.5, 1], [0.375, -0.25], [0, 0]],
         ),
     ],
@@ -157,9 +128,7 @@ def test_nearness_is_linear_in_the_image_of_a_plane(camera):
 
 
 @pytest.mark.parametrize("camera", PERSPECTIVE)
-def test_perspective_depth_grows_from_the_near_plane_to_the_far_plane(
-    camera,
-):
+def test_perspective_depth_grows_from_the_near_plane_to_the_far_plane(camera):
     distances = np.linspace(camera.near, camera.far, 9)
     back = camera.axes()[2]
     points = (camera.distance - distances)[:, None] * back
@@ -232,20 +201,12 @@ def first_hits(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def view_of_torus(mesh: Mesh, rasterizer: str) -> Fragments:
     """Rasterize a mesh for CAMERA with 64 × 64 samples."""
     settings = ImageSettings(64, 1)
-    [view] = build_fragments(
-        mesh.vertices,
-        mesh.faces,
-        [CAMERA],
-        settings,
-        choose(rasterizer),
-    )
+    [view] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose(rasterizer))
     return view
 
 
 @pytest.mark.parametrize("name", RASTERIZERS)
-def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(
-    name,
-):
+def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(name):
     """A few samples near edges differ, because corners are rounded by up to 1/512 of a sample."""
     mesh = open_torus()
     view = view_of_torus(mesh, name)
@@ -289,14 +250,7 @@ def homography_of(positions: np.ndarray, uvs: np.ndarray) -> np.ndarray:
 
 
 def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
-    corners = np.array(
-        [
-            [-0.9, -0.8, -0.7],
-            [0.9, -0.6, 0.1],
-            [0.8, 0.9, 0.9],
-            [0, 0, 0],
-        ]
-    )
+    corners = np.array([[-0.9, -0.8, -0.7], [0.9, -0.6, 0.1], [0.8, 0.9, 0.9], [0, 0, 0]])
     # The fourth corner lies in the plane of the others.
     corners[3] = corners[0] + corners[2] - corners[1]
     uvs = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

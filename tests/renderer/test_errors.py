@@ -20,10 +20,7 @@ from renderer.surface.shading import irradiance, normals_in_sight, radiance
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizer import choose
 
-MESH = Mesh.plain(
-    [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
-    [[0, 1, 2], [0, 2, 3]],
-)
+MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
 CAMERA = OrthographicCamera(0, 0, 2.0)
 SETTINGS = ImageSettings(2, 2)
 RASTERIZER = choose("numpy")
@@ -49,11 +46,7 @@ def shade(name: str, values: Tensor, smooth: bool = False) -> Tensor:
 
 def corner_albedo(corner_colors: Tensor) -> Tensor:
     """Compute the albedo of the mesh with other corner colors."""
-    return surface_albedo(
-        replace(MESH, corner_colors=corner_colors.numpy()),
-        FRAGMENTS,
-        "srgb",
-    )
+    return surface_albedo(replace(MESH, corner_colors=corner_colors.numpy()), FRAGMENTS, "srgb")
 
 
 def texture_albedo(texture: Tensor) -> Tensor:
@@ -76,62 +69,30 @@ def rasterize(vertices: Tensor) -> object:
 FINITE = [
     ("directions", torch.ones(2, 3), lambda x: basis(x, 6)),
     ("radiance", torch.ones(4, 8, 3), lambda x: project(x, 2)),
-    (
-        "radiance",
-        torch.ones(28, 3),
-        lambda x: project(lambda _: x, 2, quadrature_degree=6),
-    ),
-    (
-        "coefficients",
-        torch.ones(9, 3),
-        lambda x: rotate(x, torch.eye(3)),
-    ),
+    ("radiance", torch.ones(28, 3), lambda x: project(lambda _: x, 2, quadrature_degree=6)),
+    ("coefficients", torch.ones(9, 3), lambda x: rotate(x, torch.eye(3))),
     ("rotation", torch.eye(3), lambda x: rotate(torch.ones(9, 3), x)),
     ("vertices", torch.ones(4, 3), lambda x: face_normals(x, FACES)),
     ("vertices", torch.ones(4, 3), lambda x: vertex_normals(x, FACES)),
     ("vertices", torch.ones(4, 3), rasterize),
     ("vertices", GOOD["vertices"], lambda x: shade("vertices", x)),
-    (
-        "vertices",
-        GOOD["vertices"],
-        lambda x: shade("vertices", x, smooth=True),
-    ),
+    ("vertices", GOOD["vertices"], lambda x: shade("vertices", x, smooth=True)),
 ]
 # Values that are multiplied by each other must also be of limited size.
 BOUNDED = [
     ("texture", torch.ones(2, 2, 3), texture_albedo),
     ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
     ("corner_colors", torch.ones(2, 3, 3), corner_albedo),
-    (
-        "light",
-        torch.ones(9, 3),
-        lambda x: irradiance(torch.ones(3, 2), x, x.dtype),
-    ),
+    ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(3, 2), x, x.dtype)),
     ("light", GOOD["light"], lambda x: shade("light", x)),
     ("albedo", GOOD["albedo"], lambda x: shade("albedo", x)),
-    (
-        "albedo",
-        GOOD["albedo"],
-        lambda x: shade("albedo", x, smooth=True),
-    ),
+    ("albedo", GOOD["albedo"], lambda x: shade("albedo", x, smooth=True)),
     ("albedo_scale", torch.ones(1), operators),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
-    (
-        "radiance",
-        torch.ones(3, 4),
-        lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1)),
-    ),
-    (
-        "coverage",
-        torch.ones(1, 4),
-        lambda x: tonemap(torch.ones(3, 4), x, torch.ones(3, 1)),
-    ),
-    (
-        "background",
-        torch.ones(3, 1),
-        lambda x: tonemap(torch.ones(3, 4), torch.ones(1, 4), x),
-    ),
+    ("radiance", torch.ones(3, 4), lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1))),
+    ("coverage", torch.ones(1, 4), lambda x: tonemap(torch.ones(3, 4), x, torch.ones(3, 1))),
+    ("background", torch.ones(3, 1), lambda x: tonemap(torch.ones(3, 4), torch.ones(1, 4), x)),
 ]
 
 

@@ -53,10 +53,7 @@ def require_same_camera(found: Camera, expected: Camera) -> None:
 
 
 def irradiance_error(
-    found: FittedScene,
-    mesh: renderer.Mesh,
-    camera: Camera,
-    light: Tensor,
+    found: FittedScene, mesh: renderer.Mesh, camera: Camera, light: Tensor
 ) -> float:
     """Compare the irradiance of the visible surface under the light found and the true light."""
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)

@@ -54,13 +54,7 @@ def test_the_background_is_unchanged_if_nothing_covers_it(encoding):
 
 
 def test_encoding_and_decoding_are_the_srgb_standards():
-    values = [
-        *np.linspace(0, 1, 1001),
-        0.0031308,
-        0.00313081,
-        0.04045,
-        0.04046,
-    ]
+    values = [*np.linspace(0, 1, 1001), 0.0031308, 0.00313081, 0.04045, 0.04046]
     inputs = torch.tensor(values, dtype=torch.float64)
     encoded = encode(inputs, "srgb")
     decoded = decode(inputs, "srgb")
@@ -71,13 +65,9 @@ def test_encoding_and_decoding_are_the_srgb_standards():
     assert decoded[500] == pytest.approx(0.214041140482232)
 
 
-@pytest.mark.parametrize(
-    ("function", "slope_at_black"),
-    [(encode, 12.92), (decode, 1 / 12.92)],
-)
+@pytest.mark.parametrize(("function", "slope_at_black"), [(encode, 12.92), (decode, 1 / 12.92)])
 def test_the_gradient_of_an_srgb_curve_is_its_derivative_and_finite_at_black(
-    function,
-    slope_at_black,
+    function, slope_at_black
 ):
     values = [1e-4, 0.003, 0.0032, 0.04, 0.041, 0.5, 0.99]
     inputs = torch.tensor(values, dtype=torch.float64, requires_grad=True)
@@ -88,9 +78,7 @@ def test_the_gradient_of_an_srgb_curve_is_its_derivative_and_finite_at_black(
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_gradients_by_radiance_coverage_and_background_are_central_differences(
-    encoding,
-):
+def test_gradients_by_radiance_coverage_and_background_are_central_differences(encoding):
     """Values lie below, within and above [0, 1], and not near the kinks of clamp and curve."""
     draws = torch.Generator().manual_seed(0)
     radiance = torch.rand(2, 3, 20, generator=draws, dtype=torch.float64) * 3 - 1
@@ -107,16 +95,11 @@ def test_gradients_by_radiance_coverage_and_background_are_central_differences(
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize(
-    ("coverage", "background"),
-    [(1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 1.0)],
+    ("coverage", "background"), [(1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 1.0)]
 )
 def test_only_values_outside_the_range_have_no_gradient(encoding, coverage, background):
     """Black and white themselves have a gradient, so that a light of zero can grow."""
-    radiance = torch.tensor(
-        [[-0.3, 0, 0.2, 1, 1.4]],
-        dtype=torch.float64,
-        requires_grad=True,
-    )
+    radiance = torch.tensor([[-0.3, 0, 0.2, 1, 1.4]], dtype=torch.float64, requires_grad=True)
     linear = radiance + background_term(one(coverage), one(background), encoding)
     is_outside = (linear < 0) | (linear > 1)
     image = tonemap(radiance, one(coverage), one(background), encoding)

@@ -155,8 +155,7 @@ every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 @pytest.mark.parametrize(("min_count", "expected_count"), [(0, 12), (11, 12), (12, 42), (42, 162)])
 def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(
-    min_count,
-    expected_count,
+    min_count, expected_count
 ):
     mesh = subdivide(mesh_of(trimesh.creation.icosahedron()), min_count)
     assert len(mesh.vertices) == expected_count
@@ -216,9 +215,7 @@ def test_subdivided_faces_keep_their_textures():
 
 # One face of area 8 in the plane z = 0, and one of area 2.
 CORNER = Mesh.plain(
-    [[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]],
-    [[0, 1, 2], [0, 3, 1]],
-    np.eye(4)[:, :3],
+    [[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]], [[0, 1, 2], [0, 3, 1]], np.eye(4)[:, :3]
 )
 
 

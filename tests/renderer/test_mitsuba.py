@@ -148,11 +148,7 @@ class NoisyImage(NamedTuple):
 
 
 def mitsuba_image(
-    folder: Path,
-    mesh: Mesh,
-    camera: Camera,
-    settings: ImageSettings,
-    ray_count: int,
+    folder: Path, mesh: Mesh, camera: Camera, settings: ImageSettings, ray_count: int
 ) -> NoisyImage:
     """Render the files of a scene with Mitsuba.
 
@@ -188,23 +184,14 @@ def mean_square(values: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("make_mesh", "view"),
-    [
-        (ball, "near the pole"),
-        (colored_cube, "from below"),
-        (textured_hull, "from close by"),
-    ],
+    [(ball, "near the pole"), (colored_cube, "from below"), (textured_hull, "from close by")],
 )
 @pytest.mark.parametrize(
     ("size", "samples", "ray_count"),
     [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)],
 )
 def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
-    tmp_path,
-    make_mesh,
-    view,
-    size,
-    samples,
-    ray_count,
+    tmp_path, make_mesh, view, size, samples, ray_count
 ):
     """Errors in units of Mitsuba's standard errors have a mean of 0 and a mean square of about 1.
 
@@ -267,12 +254,7 @@ def slow_bounces() -> list[object]:
     ],
 )
 def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
-    tmp_path,
-    make_mesh,
-    view,
-    bounces,
-    normals,
-    monkeypatch,
+    tmp_path, make_mesh, view, bounces, normals, monkeypatch
 ):
     """The rays are enough for errors of 0.5 % of the brightest value, and 0.1 % on average.
 

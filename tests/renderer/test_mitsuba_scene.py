@@ -54,11 +54,7 @@ def ball() -> Mesh:
     """Return a ball with a texture times one color above, and corner colors below."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     draws = np.random.default_rng(0)
-    mesh = Mesh.plain(
-        sphere.vertices,
-        sphere.faces,
-        draws.uniform(0.2, 1, sphere.vertices.shape),
-    )
+    mesh = Mesh.plain(sphere.vertices, sphere.faces, draws.uniform(0.2, 1, sphere.vertices.shape))
     is_above = sphere.vertices[sphere.faces].mean(axis=1)[:, 2] > 0
     colors = np.where(is_above[:, None, None], [0.9, 0.8, 0.6], mesh.corner_colors)
     uvs = (sphere.vertices[:, :2] / 2 + 0.5)[sphere.faces]
@@ -117,14 +113,7 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
     mesh = normalize(make_mesh())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8, encoding, normals)
-    write_mitsuba_scene(
-        tmp_path / "mitsuba",
-        mesh,
-        2.0,
-        CAMERAS,
-        settings,
-        "../light.exr",
-    )
+    write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
     write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
     expected_views = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS)).double()
     operators = build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0)
@@ -149,10 +138,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     light = load_light("st_peters")
     settings = ImageSettings(24, 8)
     gloss_texture = np.random.default_rng(0).integers(100, 255, (9, 6, 2), dtype=np.uint8)
-    metal = replace(
-        Gloss(0.6, metallic=1.0).on(textured),
-        gloss_textures=(gloss_texture,),
-    )
+    metal = replace(Gloss(0.6, metallic=1.0).on(textured), gloss_textures=(gloss_texture,))
     varnished = Gloss(0.4).on(textured)
     # The strength of the dielectric part does not matter for a metal.
     metal_of_no_strength = Gloss(0.4, metallic=1.0, specular_factor=0.0).on(textured)
@@ -168,14 +154,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
         ("metal of no strength", metal_of_no_strength, 0.05),
         ("varnish", varnished, 0.1),
     ):
-        write_mitsuba_scene(
-            tmp_path / name,
-            mesh,
-            1.0,
-            CAMERAS[:1],
-            settings,
-            "../light.exr",
-        )
+        write_mitsuba_scene(tmp_path / name, mesh, 1.0, CAMERAS[:1], settings, "../light.exr")
         [rendered] = render_mitsuba_scene(tmp_path / name / SCENE, 1).double()
         expected = rendered[:3]
         error = (render(mesh) - expected).norm() / expected.norm()

@@ -44,11 +44,7 @@ def test_derivatives_on_a_mesh_are_central_differences(function, shape):
 
 def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:
     """Compute the cross product of two vectors."""
-    return [
-        u[1] * v[2] - u[2] * v[1],
-        u[2] * v[0] - u[0] * v[2],
-        u[0] * v[1] - u[1] * v[0],
-    ]
+    return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
 
 
 def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -112,11 +108,7 @@ def require_exact(corners: torch.Tensor, tolerance: float) -> None:
         assert error <= 2 * tolerance * np.linalg.norm(expected_slopes[:, corner])
 
 
-@given(
-    log_height=st.floats(-12, 0),
-    log_edge=st.floats(-6, 0),
-    seed=st.integers(0, 2**20),
-)
+@given(log_height=st.floats(-12, 0), log_edge=st.floats(-6, 0), seed=st.integers(0, 2**20))
 @example(log_height=-9.220229640656948, log_edge=-5.520005482948768, seed=579921)
 def test_slivers_have_exact_normals_and_derivatives_up_to_rounding(log_height, log_edge, seed):
     """Plain float64 would be off by 1e-4 at a relative height of 1e-12.
@@ -132,10 +124,7 @@ def test_slivers_have_exact_normals_and_derivatives_up_to_rounding(log_height, l
     require_exact(corners.float(), 4 * EPS32)
 
 
-POINTS = torch.tensor(
-    [[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 1, 0]],
-    dtype=torch.float64,
-)
+POINTS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 1, 0]], dtype=torch.float64)
 # Faces with one point, two points, and three points on a line.
 FACES_WITHOUT_AREA = torch.tensor([[0, 0, 0], [1, 1, 2], [0, 1, 2]])
 FACE_WITH_AREA = torch.tensor([[0, 1, 3]])
@@ -150,9 +139,7 @@ def test_faces_without_area_have_no_normal_and_no_gradient():
 
 
 @both_functions
-def test_faces_without_area_do_not_change_the_normals_of_a_face_beside_them(
-    function,
-):
+def test_faces_without_area_do_not_change_the_normals_of_a_face_beside_them(function):
     vertices = POINTS.clone().requires_grad_()
     faces = torch.cat([FACES_WITHOUT_AREA, FACE_WITH_AREA])
     expected = function(vertices, FACE_WITH_AREA)
@@ -186,9 +173,7 @@ def test_vertex_normals_are_means_of_face_normals_weighted_by_area():
 
 
 @pytest.mark.parametrize("back", [[0, 2, 1], [2, 1, 0], [1, 0, 2]])
-def test_vertices_of_opposite_faces_and_of_no_face_have_no_normal_and_no_gradient(
-    back,
-):
+def test_vertices_of_opposite_faces_and_of_no_face_have_no_normal_and_no_gradient(back):
     """The rounding error of a sum that should be zero has no meaningful direction."""
     vertices = draw(4, 3).requires_grad_()
     normals = vertex_normals(vertices, torch.tensor([[0, 1, 2], back]))

@@ -43,12 +43,7 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
         distance=distance,
     )
     expected = renderer.render(
-        mesh,
-        turned,
-        renderer.load_light("grace").double(),
-        size,
-        0.0,
-        samples=8,
+        mesh, turned, renderer.load_light("grace").double(), size, 0.0, samples=8
     )
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
     assert error(window.cut(pixels, size), expected) < 0.04

@@ -221,10 +221,7 @@ BACKDROPS = draw_uniform(3, 3, 9, 9)
     ids=["gray", "color", "image", "image per view"],
 )
 def test_backgrounds_are_grays_colors_and_images_of_one_view_or_all(
-    stone,
-    light,
-    background,
-    expected,
+    stone, light, background, expected
 ):
     beside_the_image = replace(stone, vertices=stone.vertices + 10)
     found = renderer.render(beside_the_image, CAMERAS, light, background=background, **SMALL)

@@ -31,10 +31,7 @@ def shells(mesh: Mesh) -> list[np.ndarray]:
     rows = np.concatenate([a, b])
     columns = np.concatenate([b, c])
     vertex_count = len(mesh.vertices)
-    links = coo_array(
-        (np.ones(len(rows)), (rows, columns)),
-        shape=(vertex_count, vertex_count),
-    )
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(vertex_count, vertex_count))
     count, shell_of_vertex = connected_components(links, directed=False)
     return [mesh.faces[shell_of_vertex[a] == shell] for shell in range(count)]
 

@@ -302,10 +302,7 @@ def require_finite(result: Any) -> None:
     ],
 )
 def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
-    corpus,
-    outcome,
-    file,
-    examples,
+    corpus, outcome, file, examples
 ):
     good = (corpus / file).read_bytes()
     damaged = given(content=damages(file, good))
@@ -338,8 +335,7 @@ def zip_bomb(path: Path) -> None:
     """Write a small file whose headers announce arrays of 10 TB."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
-        header,
-        {"descr": "|u1", "fortran_order": False, "shape": (10**13,)},
+        header, {"descr": "|u1", "fortran_order": False, "shape": (10**13,)}
     )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("train_images", "train_labels", "test_images", "test_labels", "classes"):
@@ -386,18 +382,7 @@ YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
     f"{letter}: &{letter} [{', '.join(9 * [f'*{before}'])}]\n"
     for before, letter in zip("abcdefgh", "bcdefghi", strict=True)
 )
-FORGED: list[
-    tuple[
-        str,
-        str,
-        str
-        | bytes
-        | Callable[
-            [Path],
-            object,
-        ],
-    ]
-] = [
+FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [
     ("mesh.obj", "vertex 10¹²", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n"),
     ("mesh.ply", "10¹² vertices", PLY.format(10**12, "0 0 0")),
     ("mesh.ply", "a negative vertex", PLY.format(3, "0 0 0\n1 0 0\n0 1 0\n3 0 1 -2")),
@@ -455,10 +440,7 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 def test_a_forged_file_is_refused(outcome, file, content):
     content = content.encode() if isinstance(content, str) else content
     assert (
-        outcome(
-            file,
-            content if callable(content) else partial(Path.write_bytes, data=content),
-        )
+        outcome(file, content if callable(content) else partial(Path.write_bytes, data=content))
         is not None
     )
 
@@ -466,8 +448,7 @@ def test_a_forged_file_is_refused(outcome, file, content):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("instead", INSTEAD)
 @pytest.mark.parametrize(
-    "file",
-    ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"],
+    "file", ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"]
 )
 def test_what_is_no_file_is_refused(outcome, file, instead):
     assert outcome(file, lambda path: (path.unlink(), INSTEAD[instead](path))) is not None

@@ -96,10 +96,7 @@ def assert_resumed(data, uninterrupted, capfd) -> Callable[[Path], str]:
 
 
 def interrupt(
-    data: Path,
-    run: Path,
-    signals: tuple[signal.Signals, ...],
-    rng: np.random.Generator,
+    data: Path, run: Path, signals: tuple[signal.Signals, ...], rng: np.random.Generator
 ) -> None:
     """Continue a run up to a random epoch, send it signals, and check how it ends."""
     done_before = epochs_done(run)
@@ -148,10 +145,7 @@ def test_a_run_that_is_interrupted_three_times_is_resumed_to_the_same_end(
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux limits another process")
 @pytest.mark.parametrize("epoch", [1, 3, 6])
 def test_a_full_disk_is_an_error_in_one_sentence_and_the_run_is_resumed_later(
-    data,
-    tmp_path,
-    assert_resumed,
-    epoch,
+    data, tmp_path, assert_resumed, epoch
 ):
     process = start(data, tmp_path / "run", epoch)
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))

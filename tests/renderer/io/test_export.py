@@ -142,9 +142,7 @@ def test_a_glb_holds_linear_colors_and_texture_coordinates(painted_box, parts):
         assert_allclose(uvs, painted_box.corner_uvs[mask], rtol=0, atol=2 * EPS32)
 
 
-def test_a_glb_has_diffuse_materials_that_are_seen_from_both_sides(
-    parts,
-):
+def test_a_glb_has_diffuse_materials_that_are_seen_from_both_sides(parts):
     for part, _ in parts:
         material = part.visual.material
         assert material.doubleSided
@@ -176,13 +174,7 @@ def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
 
 def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
     """The matrices of the file project points with y up to where `project` puts them."""
-    view = {
-        "polar": 114.6,
-        "azimuth": 57.3,
-        "width": 2.5,
-        "right": 0.3,
-        "up": -0.2,
-    }
+    view = {"polar": 114.6, "azimuth": 57.3, "width": 2.5, "right": 0.3, "up": -0.2}
     cameras = [
         *orbit_cameras(2, 3.0, 57.3, 22.9),
         OrthographicCamera(**view),
@@ -238,14 +230,9 @@ def gltf_projection(lens: dict) -> np.ndarray:
     return matrix
 
 
-def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(
-    tmp_path,
-):
+def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path):
     # Faces have the textures 0 and 2 in turn.
-    mesh = replace(
-        painted(box(), 3),
-        texture_ids=np.arange(12, dtype=np.int32) % 2 * 2,
-    )
+    mesh = replace(painted(box(), 3), texture_ids=np.arange(12, dtype=np.int32) % 2 * 2)
     export_mesh(mesh, tmp_path / "mesh.glb")
     loaded = load_mesh(tmp_path / "mesh.glb")
     order = [0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]
@@ -296,9 +283,7 @@ def test_a_glb_with_gloss_is_loaded_as_matte_by_default(tmp_path):
     assert loaded.gloss_textures == ()
 
 
-def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(
-    tmp_path,
-):
+def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
     """A material without factors is a rough metal. Green is roughness, and blue is metallic."""
     texels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False)

@@ -206,10 +206,7 @@ def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
     assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [np.int8, np.uint8, np.int16, np.uint16, np.float32],
-)
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16, np.float32])
 def test_quantized_positions_are_the_integers_of_the_file(tmp_path, dtype):
     gltf = Gltf()
     gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
@@ -241,9 +238,7 @@ def test_vertex_colors_of_every_type_are_multiplied_by_the_material(
     colors = np.array([[0.5, 0.25, 0.1, 0.3]] * 3)[:, :channels]
     stored = (np.rint(colors * largest) if largest > 1 else colors).astype(dtype)
     gltf = Gltf()
-    primitive = gltf.mesh(
-        {"POSITION": POINTS[:3], "COLOR_0": gltf.array(stored, largest > 1)},
-    )
+    primitive = gltf.mesh({"POSITION": POINTS[:3], "COLOR_0": gltf.array(stored, largest > 1)})
     factor = np.array([1.0, 1, 1])
     if has_material:
         factor = np.array([0.123456, 0.5, 0.7])

@@ -134,17 +134,8 @@ def load_square_obj(folder: Path, uvs: list[tuple[float, float]]) -> Mesh:
     return load_mesh(write(folder / "square.obj", "\n".join(lines)))
 
 
-def test_the_corners_of_an_obj_at_a_seam_have_their_own_texture_coordinates(
-    tmp_path,
-):
-    uvs = [
-        (0.1, 0.2),
-        (0.9, 0.2),
-        (0.9, 0.8),
-        (0.3, 0.4),
-        (0.6, 0.7),
-        (0.2, 0.9),
-    ]
+def test_the_corners_of_an_obj_at_a_seam_have_their_own_texture_coordinates(tmp_path):
+    uvs = [(0.1, 0.2), (0.9, 0.2), (0.9, 0.8), (0.3, 0.4), (0.6, 0.7), (0.2, 0.9)]
     mesh = load_square_obj(tmp_path, uvs)
     assert len(mesh.vertices) == 4
     lower_face = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
@@ -181,9 +172,7 @@ def test_an_obj_without_texture_has_its_diffuse_color_or_white(tmp_path, materia
 
 
 SQUARE = trimesh.Trimesh(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
-    [[0, 1, 2], [0, 2, 3]],
-    process=False,
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
 )
 
 
@@ -242,10 +231,7 @@ def fruit_mesh(tmp_path) -> Mesh:
 def test_the_parts_of_a_glb_scene_are_placed_with_z_up(fruit_mesh):
     """A point (x, y, z) of the file becomes (x, -z, y)."""
     is_fruit = fruit_mesh.texture_ids == 0
-    boxes = [
-        (is_fruit, [0, 0, 0], [2, 1, 1]),
-        (~is_fruit, [1, -3, 2], [0.2, 0.6, 0.4]),
-    ]
+    boxes = [(is_fruit, [0, 0, 0], [2, 1, 1]), (~is_fruit, [1, -3, 2], [0.2, 0.6, 0.4])]
     for mask, center, size in boxes:
         corners = corners_of(fruit_mesh)[mask]
         assert len(corners) == 12
@@ -279,9 +265,7 @@ def test_the_vertex_colors_of_a_glb_are_linear(tmp_path):
     assert_close(load_mesh(tmp_path / "box.glb").corner_colors, COLOR)
 
 
-def test_the_vertex_colors_of_a_glb_are_multiplied_by_the_color_of_the_material(
-    tmp_path,
-):
+def test_the_vertex_colors_of_a_glb_are_multiplied_by_the_color_of_the_material(tmp_path):
     box = trimesh.creation.box()
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[102, 255, 51, 255]))
     colors = np.tile(np.array(COLOR_BYTES, dtype=np.uint8), (8, 1))
@@ -332,10 +316,7 @@ def test_unused_vertices_are_removed_and_both_zeros_are_one_position(tmp_path):
     ],
 )
 def test_the_texture_of_an_obj_is_found_by_the_names_that_any_system_writes(
-    tmp_path,
-    texture,
-    library,
-    location,
+    tmp_path, texture, library, location
 ):
     folder = tmp_path / "mesh"
     path = write_obj(folder, texture, library)
@@ -416,11 +397,7 @@ def test_a_material_that_is_missing_or_has_no_color_is_refused(tmp_path, content
 
 
 @pytest.mark.parametrize(
-    "image",
-    [
-        {"uri": "data:image/png;base64,AAAA"},
-        {"bufferView": 0, "mimeType": "image/ktx2"},
-    ],
+    "image", [{"uri": "data:image/png;base64,AAAA"}, {"bufferView": 0, "mimeType": "image/ktx2"}]
 )
 def test_a_damaged_or_unknown_image_inside_of_a_gltf_is_refused(tmp_path, image):
     require_refusal(write_gltf(tmp_path, image))
@@ -484,8 +461,7 @@ def use_huge_scale(tree: dict[str, Any]) -> None:
     ],
 )
 def test_a_gltf_that_cannot_be_read_correctly_is_refused(
-    tmp_path,
-    change: Callable[[dict[str, Any]], None],
+    tmp_path, change: Callable[[dict[str, Any]], None]
 ):
     path = write_gltf(tmp_path)
     write(tmp_path / "peel.png", png())

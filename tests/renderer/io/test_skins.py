@@ -53,13 +53,7 @@ def remove_weights(tree: dict) -> None:
         (lambda tree: tree["skins"][0].update(joints=[1, 2, 70]), {}),
         (lambda tree: tree["skins"].clear(), {}),
     ],
-    ids=[
-        "no weights",
-        "half weights",
-        "joint out of range",
-        "missing node",
-        "no skin",
-    ],
+    ids=["no weights", "half weights", "joint out of range", "missing node", "no skin"],
 )
 def test_a_damaged_skin_is_refused_by_the_name_of_the_file(tmp_path, change, arrays):
     path = skinned_arm.write(tmp_path / "arm.glb", change, **arrays)

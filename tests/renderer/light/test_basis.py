@@ -21,10 +21,7 @@ SKY = Harmonics(2)
 LAMPS = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0)))
 PROJECTOR = Projector(3)
 # Each order of the lights, with the first coefficient of each light.
-ORDERS = [
-    ([SKY, LAMPS, PROJECTOR], [0, 9, 11]),
-    ([LAMPS, SKY, PROJECTOR], [0, 2, 11]),
-]
+ORDERS = [([SKY, LAMPS, PROJECTOR], [0, 9, 11]), ([LAMPS, SKY, PROJECTOR], [0, 2, 11])]
 
 
 def numbered_coefficients() -> torch.Tensor:
@@ -63,33 +60,16 @@ def test_a_sum_has_one_environment_light_at_most():
 def test_only_lamps_are_moved():
     positions = torch.tensor([[0.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
     moved = SumBasis((SKY, PROJECTOR, LAMPS)).moved(positions)
-    assert moved.parts == (
-        SKY,
-        PROJECTOR,
-        Lamps(((0.0, 0.0, 3.0), (1.0, 0.0, 3.0))),
-    )
+    assert moved.parts == (SKY, PROJECTOR, Lamps(((0.0, 0.0, 3.0), (1.0, 0.0, 3.0))))
 
 
-def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(
-    tmp_path,
-):
+def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):
     dark_pattern = torch.full((4, 3), 0.25)
     bright_pattern = torch.full((4, 3), 0.5)
-    lights = [
-        (Projector(2), dark_pattern),
-        (Projector(2), bright_pattern),
-    ]
+    lights = [(Projector(2), dark_pattern), (Projector(2), bright_pattern)]
     ball = Mesh.plain(*sphere(1))
     camera = OrthographicCamera(57.3, 0.0, 2.0)
-    write_mitsuba_scene(
-        tmp_path,
-        ball,
-        1.0,
-        [camera],
-        ImageSettings(4),
-        "light.exr",
-        lights,
-    )
+    write_mitsuba_scene(tmp_path, ball, 1.0, [camera], ImageSettings(4), "light.exr", lights)
     emitters = xml.parse(tmp_path / SCENE).findall("emitter[@type='projector']")
     files = [emitter.find(".//string[@name='filename']").get("value") for emitter in emitters]
     shown_values = [read_map(tmp_path / file).unique().tolist() for file in files]

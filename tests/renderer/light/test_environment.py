@@ -47,12 +47,7 @@ def test_a_light_comes_back_from_its_map_within_the_quadrature_error(degree, hei
 
 @pytest.mark.parametrize(
     ("above", "below", "fraction"),
-    [
-        (3.0, -1.0, 0.25),
-        (1.0, 0.5, 0.0),
-        (-1.0, -1.0, 1.0),
-        (0.0, 0.0, 0.0),
-    ],
+    [(3.0, -1.0, 0.25), (1.0, 0.5, 0.0), (-1.0, -1.0, 1.0), (0.0, 0.0, 0.0)],
 )
 def test_the_negative_fraction_is_a_share_of_the_magnitude_over_the_sphere(above, below, fraction):
     radiance = torch.full((10, 7, 3), below)
@@ -143,10 +138,7 @@ def numbered_texels(channels: int) -> np.ndarray:
         ("Y", [0, 0, 0]),
         ("sky.R sky.G sky.B sky.A", [0, 1, 2]),
         ("spec.R spec.G spec.B R G B", [3, 4, 5]),
-        (
-            "View.Depth.Z View.Combined.R View.Combined.G View.Combined.B",
-            [1, 2, 3],
-        ),
+        ("View.Depth.Z View.Combined.R View.Combined.G View.Combined.B", [1, 2, 3]),
     ],
 )
 def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, expected_channels):
@@ -287,9 +279,7 @@ def test_an_array_that_is_not_a_map_is_refused(tmp_path, values):
 
 
 @pytest.mark.parametrize(
-    "attributes",
-    [{"x": 1, "full_width": 8}, {"Orientation": 4}],
-    ids=["cropped", "turned"],
+    "attributes", [{"x": 1, "full_width": 8}, {"Orientation": 4}], ids=["cropped", "turned"]
 )
 def test_a_cropped_or_turned_exr_file_is_refused(tmp_path, attributes):
     write_exr(tmp_path / "map.exr", numbered_texels(3), ("R", "G", "B"), **attributes)

@@ -26,12 +26,7 @@ from renderer.surface.shading import irradiance
 EPS = np.finfo(np.float64).eps
 every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
 # Directions with both signs of zero, for which polar angles are special.
-POLES = [
-    [0.0, 0.0, 1.0],
-    [-0.0, 0.0, 1.0],
-    [0.0, -0.0, -1.0],
-    [-0.0, -0.0, -1.0],
-]
+POLES = [[0.0, 0.0, 1.0], [-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, -0.0, -1.0]]
 EQUATOR = [
     [1.0, 0.0, 0.0],
     [-1.0, 0.0, -0.0],
@@ -51,32 +46,20 @@ def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
 
 
 @pytest.mark.parametrize("degree", [1, 6, MAX_DEGREE])
-def test_gradients_are_finite_differences_at_and_near_the_poles_and_off_the_sphere(
-    degree,
-):
+def test_gradients_are_finite_differences_at_and_near_the_poles_and_off_the_sphere(degree):
     """Derivatives in polar angles would not be finite at the poles."""
     near_the_pole = [1e-4, 0, 1]
     short = [3e-2, -5e-2, 4e-2]
-    special = torch.tensor(
-        [*POLES, near_the_pole, *EQUATOR[:2], short],
-        dtype=torch.float64,
-    )
+    special = torch.tensor([*POLES, near_the_pole, *EQUATOR[:2], short], dtype=torch.float64)
     directions = torch.cat([special, 7 * random_directions(2)]).requires_grad_(True)
     assert torch.autograd.gradcheck(
-        lambda values: basis(values, degree),
-        directions,
-        fast_mode=degree > 1,
+        lambda values: basis(values, degree), directions, fast_mode=degree > 1
     )
 
 
 def clamped_cosine_factor(l: int) -> float:
     """Integrate the Legendre polynomial of band l times the clamped cosine over the sphere."""
-    integral, _ = quad(
-        lambda cosine: cosine * eval_legendre(l, cosine),
-        0,
-        1,
-        epsabs=1e-13,
-    )
+    integral, _ = quad(lambda cosine: cosine * eval_legendre(l, cosine), 0, 1, epsabs=1e-13)
     return 2 * math.pi * integral
 
 
@@ -129,9 +112,7 @@ def test_the_projection_of_an_exponential_has_its_closed_form():
 
 
 @every_degree
-def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(
-    degree,
-):
+def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(degree):
     """Errors are relative to the norm of the light, which is about 1.7 (degree + 1)."""
     light = draw((degree + 1) ** 2, 3)
     directions = random_directions(20)

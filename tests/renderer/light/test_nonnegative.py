@@ -309,11 +309,7 @@ def test_scipy_finds_no_light_of_the_same_mean_with_a_closer_irradiance(degree):
         physical.numpy(),
         jac=lambda values: 2 * factors**2 * (values - target),
         constraints=[
-            {
-                "type": "ineq",
-                "fun": lambda values: grid @ values,
-                "jac": lambda values: grid,
-            },
+            {"type": "ineq", "fun": lambda values: grid @ values, "jac": lambda values: grid},
             {
                 "type": "eq",
                 "fun": lambda values: values[:1] - target[0],

@@ -110,9 +110,7 @@ def smooth_map(height: int = 128, width: int = 256) -> np.ndarray:
     return (1 + 0.5 * z + 0.3 * y)[..., None] * [0.7, 1.0, 1.3]
 
 
-def test_the_coefficients_of_a_map_are_those_of_its_formula_up_to_a_factor(
-    tmp_path,
-):
+def test_the_coefficients_of_a_map_are_those_of_its_formula_up_to_a_factor(tmp_path):
     """A row misses (π/128)²/24 of the curvature of radiance times harmonics.
 
     The curvature is at most 6 · 7 at degree 6. The tolerance is three times
@@ -153,9 +151,7 @@ def test_a_map_without_physical_light_is_refused_by_name(tmp_path, factor, texel
         load_light(str(path))
 
 
-def test_a_map_with_one_texel_of_a_million_times_the_others_is_light_from_there(
-    tmp_path,
-):
+def test_a_map_with_one_texel_of_a_million_times_the_others_is_light_from_there(tmp_path):
     radiance = torch.full((64, 128, 3), 1e-3)
     radiance[20, 30] = 1e3
     # Relative to the brightest texel, this value counts as zero.
@@ -190,9 +186,7 @@ def test_directional_light_is_the_clamped_cosine_within_the_error_of_degree_6():
 
 
 @pytest.mark.parametrize("amplitude", [0.01, 100.0])
-def test_perturbations_with_a_radius_have_this_norm_on_the_nonzero_coefficients(
-    amplitude,
-):
+def test_perturbations_with_a_radius_have_this_norm_on_the_nonzero_coefficients(amplitude):
     draws = torch.Generator().manual_seed(0)
     offsets = perturb(torch.zeros(49, 3), 50, amplitude, 1.5, draws)
     expected_norms = torch.full((50,), 1.5)

@@ -19,16 +19,7 @@ from renderer.light.ringing import (
 
 # Error of the irradiance of a point source, relative to its root mean square,
 # by degree. It follows from the closed form of the clamped cosine.
-ERRORS = {
-    1: 0.59,
-    2: 0.412,
-    4: 0.249,
-    6: 0.168,
-    8: 0.1214,
-    12: 0.0733,
-    19: 0.0394,
-    20: 0.0366,
-}
+ERRORS = {1: 0.59, 2: 0.412, 4: 0.249, 6: 0.168, 8: 0.1214, 12: 0.0733, 19: 0.0394, 20: 0.0366}
 
 
 def test_light_whose_narrower_highlights_do_not_ring_keeps_its_coefficients():
@@ -86,9 +77,7 @@ def test_the_kernel_is_nowhere_negative_and_keeps_the_mean(degree):
 
 
 @pytest.mark.parametrize("degree", ERRORS)
-def test_the_irradiance_of_a_point_source_has_the_documented_error(
-    degree,
-):
+def test_the_irradiance_of_a_point_source_has_the_documented_error(degree):
     assert irradiance_error(band_factors(degree)) == pytest.approx(ERRORS[degree], rel=5e-3)
 
 

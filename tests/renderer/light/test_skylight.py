@@ -25,19 +25,10 @@ HORIZON = math.pi / 2
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 # Matrix of IEC 61966-2-1.
 RGB_TO_XYZ = np.array(
-    [
-        [0.4124, 0.3576, 0.1805],
-        [0.2126, 0.7152, 0.0722],
-        [0.0193, 0.1192, 0.9505],
-    ]
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 )
 # Zenith angle of the sun and its azimuth in radians, and the turbidity.
-SKIES = [
-    (0.0, 0.0, 2.0),
-    (0.9, -2.0, 3.0),
-    (1.5, 100.0, 4.0),
-    (HORIZON, 0.7, 10.0),
-]
+SKIES = [(0.0, 0.0, 2.0), (0.9, -2.0, 3.0), (1.5, 100.0, 4.0), (HORIZON, 0.7, 10.0)]
 by_quadrature = fit_skylight.coefficients_by_quadrature
 
 
@@ -68,10 +59,7 @@ def chromaticity(rows: list[list[float]], sun_zenith: float, t: float) -> float:
 
 
 def published_sky(
-    directions: np.ndarray,
-    sun_zenith: float,
-    sun_azimuth: float,
-    t: float,
+    directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float
 ) -> np.ndarray:
     """Evaluate the formulas of Preetham et al., appendix A.2, as they are printed, in angles.
 
@@ -252,14 +240,7 @@ def test_the_sky_is_brighter_at_the_sun_than_opposite(azimuth):
     assert at_sun > 1.5 * opposite
 
 
-@pytest.mark.parametrize(
-    "sky",
-    [
-        (1e-4, 0.0, 2.5),
-        (0.7, 0.0, 3.0),
-        (HORIZON - 1e-4, 0.0, 4.0),
-    ],
-)
+@pytest.mark.parametrize("sky", [(1e-4, 0.0, 2.5), (0.7, 0.0, 3.0), (HORIZON - 1e-4, 0.0, 4.0)])
 def test_gradients_are_finite_differences(sky):
     """A projection of unit length has the error bounds of the norm of the coefficients."""
     weights = torch.from_numpy(np.random.default_rng(0).normal(size=(49, 3)))

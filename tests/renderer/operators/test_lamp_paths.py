@@ -52,18 +52,13 @@ def ball_on_a_table() -> Mesh:
     shape = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
     shape.apply_translation([0, 0, 0.45])
     table = Mesh.plain(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
-        [[0, 1, 2], [0, 2, 3]],
-        BLUE,
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], BLUE
     )
     return concatenate([mesh_of(shape, ORANGE), table])
 
 
 def operator_of(
-    mesh: Mesh,
-    basis: Basis,
-    size: int = SIZE,
-    samples: int = SAMPLES,
+    mesh: Mesh, basis: Basis, size: int = SIZE, samples: int = SAMPLES
 ) -> TransferOperator:
     """Build the float64 operator of the camera."""
     [operator] = build_operators(
@@ -109,11 +104,7 @@ def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) ->
 
 @pytest.mark.parametrize(
     ("make_mesh", "basis", "sample_count"),
-    [
-        (ball, PROJECTOR, 256),
-        (ball_on_a_table, LAMPS, 256),
-        (ball_on_a_table, TWO_DISCS, 1024),
-    ],
+    [(ball, PROJECTOR, 256), (ball_on_a_table, LAMPS, 256), (ball_on_a_table, TWO_DISCS, 1024)],
     ids=["projector", "lamps", "discs"],
 )
 def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypatch):
@@ -167,12 +158,7 @@ class MovedLamps:
     def __init__(self, mesh: Mesh, basis: Lamps, size: int, samples: int) -> None:
         settings = ImageSettings(size, samples)
         [view] = build_fragments(
-            mesh.vertices,
-            mesh.faces,
-            [CAMERA],
-            settings,
-            choose("numpy"),
-            closed=mesh.closed,
+            mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed
         )
         self.basis = basis
         self.rays = Rays(mesh)
@@ -183,20 +169,13 @@ class MovedLamps:
         """Return the radiance (3, P) under lamps at positions (L, 3) with powers (L, 3)."""
         surface = self.surface
         paths = unoccluded(
-            self.rays,
-            self.basis,
-            surface.points,
-            surface.normals,
-            surface.planes,
-            positions,
+            self.rays, self.basis, surface.points, surface.normals, surface.planes, positions
         )
         return local_radiance(surface, self.albedo, paths, powers)
 
 
 @lamps_and_discs
-def test_moved_lamps_give_the_radiance_and_shadows_of_lamps_at_these_positions(
-    basis,
-):
+def test_moved_lamps_give_the_radiance_and_shadows_of_lamps_at_these_positions(basis):
     positions = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
     powers = draw_uniform(2, 3)
     moved = MovedLamps(ball_on_a_table(), basis, SIZE, 4)
@@ -209,9 +188,7 @@ def test_moved_lamps_give_the_radiance_and_shadows_of_lamps_at_these_positions(
 
 
 @lamps_and_discs
-def test_derivatives_by_positions_and_powers_are_finite_differences_without_shadows(
-    basis,
-):
+def test_derivatives_by_positions_and_powers_are_finite_differences_without_shadows(basis):
     positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
     powers = draw_uniform(3, 3).requires_grad_()
     image = MovedLamps(ball(1), basis, 6, 2)
@@ -244,13 +221,7 @@ class LitSurface:
 
     def __call__(self, vertices: Tensor, albedo: Tensor) -> Tensor:
         surface = Surface(self.mesh, self.view, self.settings, vertices)
-        paths = unoccluded(
-            self.rays,
-            self.basis,
-            surface.points,
-            surface.normals,
-            surface.planes,
-        )
+        paths = unoccluded(self.rays, self.basis, surface.points, surface.normals, surface.planes)
         return local_radiance(surface, albedo, paths, self.light)
 
 
@@ -268,10 +239,7 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normal
 
 
 def irradiance_of_lamp(
-    position: list[float],
-    radius: float,
-    points: Tensor,
-    normals: Tensor,
+    position: list[float], radius: float, points: Tensor, normals: Tensor
 ) -> Tensor:
     """Compute the irradiance (N,) of a lamp of power 1 without occlusion."""
     paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
@@ -325,9 +293,7 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
 @pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
 @pytest.mark.parametrize("make_mesh", [ball, ball_on_a_table], ids=["one color", "two colors"])
 def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
-    monkeypatch,
-    batch,
-    make_mesh,
+    monkeypatch, batch, make_mesh
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
@@ -347,9 +313,7 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
     torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(
-    monkeypatch,
-):
+def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(monkeypatch):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(ball(), basis, samples=2)

@@ -41,13 +41,7 @@ def operators_of(
     """Build the operators of all cameras."""
     settings = ImageSettings(size, 2, encoding)
     operators = build_operators(
-        mesh,
-        CAMERAS,
-        settings,
-        choose("numpy"),
-        basis=basis,
-        dtype=dtype,
-        gloss=gloss,
+        mesh, CAMERAS, settings, choose("numpy"), basis=basis, dtype=dtype, gloss=gloss
     )
     return TransferOperators(operators)
 
@@ -119,12 +113,7 @@ def test_all_views_in_one_call_are_the_single_views(scene, call):
     single = lights.clone().requires_grad_()
     light_of_view = single if call.per_view else single.expand(VIEW_COUNT, *single.shape)
     images = []
-    for operator, light, behind in zip(
-        operators,
-        light_of_view,
-        background_of_view,
-        strict=True,
-    ):
+    for operator, light, behind in zip(operators, light_of_view, background_of_view, strict=True):
         images.append(operator.image(light, behind))
     expected = torch.stack(images)
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
@@ -205,8 +194,7 @@ def test_views_without_the_mesh_show_the_background_and_have_no_gradient():
 
 
 @pytest.mark.parametrize(
-    ("shape", "per_view"),
-    [((9, 3), False), ((49, 3), True), ((3, 49, 3), True)],
+    ("shape", "per_view"), [((9, 3), False), ((49, 3), True), ((3, 49, 3), True)]
 )
 def test_lights_of_another_shape_are_refused(shape, per_view):
     with pytest.raises(InputError, match=r"^lights"):

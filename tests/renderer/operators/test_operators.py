@@ -27,10 +27,7 @@ SIZE = 6
 
 
 def operator_of(
-    mesh: Mesh,
-    camera: Camera,
-    settings: ImageSettings,
-    dtype: torch.dtype = torch.float32,
+    mesh: Mesh, camera: Camera, settings: ImageSettings, dtype: torch.dtype = torch.float32
 ) -> TransferOperator:
     """Build the operator of one view."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
@@ -88,11 +85,7 @@ all_layouts = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 @all_layouts
 def test_the_transfer_has_one_channel_if_each_pixel_has_one_albedo(layout):
     operator = layout.operator()
-    assert operator.transfer.shape == (
-        layout.channels,
-        31,
-        len(operator.pixels),
-    )
+    assert operator.transfer.shape == (layout.channels, 31, len(operator.pixels))
     assert operator.transfer.dtype == torch.float64
 
 

@@ -47,13 +47,7 @@ def operator_of(
     normals: str = "flat",
 ) -> TransferOperator:
     """Build the float64 operator of one view."""
-    settings = ImageSettings(
-        size,
-        samples,
-        normals=normals,
-        shadows=shadows,
-        bounces=bounces,
-    )
+    settings = ImageSettings(size, samples, normals=normals, shadows=shadows, bounces=bounces)
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=torch.float64)
     return operator
 
@@ -96,8 +90,7 @@ CONVEX = {
     "a ball": mesh_of(trimesh.creation.icosphere(subdivisions=2)),
     "a cube": mesh_of(trimesh.creation.box()),
     "an open square": Mesh.plain(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
-        [[0, 1, 2], [0, 2, 3]],
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
     ),
 }
 
@@ -143,8 +136,7 @@ def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("bounces", [0, 2])
 def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive(
-    bounces,
-    monkeypatch,
+    bounces, monkeypatch
 ):
     """The smooth normal of the octahedron at a point p is p / |p|.
 
@@ -169,9 +161,7 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
     np.testing.assert_allclose(all_rows(operator)[0].T, expected, atol=4e-3)
 
 
-def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(
-    monkeypatch,
-):
+def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
     monkeypatch.setattr(rays, "MAX_COMPARISONS", 0)
     convex = operator_of(CONVEX["a ball"])
     assert torch.equal(convex.nonzero, nonzero_coefficients(6))
@@ -196,9 +186,7 @@ def test_a_face_without_area_leaves_the_transfer_finite(bounces, monkeypatch):
 
 
 @pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
-def test_the_sky_over_the_center_of_a_pit_has_the_configuration_factor_of_a_square(
-    depth,
-):
+def test_the_sky_over_the_center_of_a_pit_has_the_configuration_factor_of_a_square(depth):
     """Howell's catalog, B-3, has a square that is parallel to a surface, over its center."""
     half_side = 0.5 / depth
     hypotenuse = math.hypot(1, half_side)
@@ -289,12 +277,7 @@ def test_shadows_without_embree_are_refused(monkeypatch):
 def test_render_shows_the_shadows_of_the_operators_of_moved_vertices(degree):
     cameras = orbit_cameras(2, 2.2)
     light = load_light("grace").double()[: (degree + 1) ** 2]
-    options = {
-        "size": 12,
-        "normals": "flat",
-        "shadows": True,
-        "rasterizer": "numpy",
-    }
+    options = {"size": 12, "normals": "flat", "shadows": True, "rasterizer": "numpy"}
     stretched = replace(dented(), vertices=dented().vertices * [1.0, 0.5, 1.0])
     vertices = torch.from_numpy(stretched.vertices)
     images = render(dented(), cameras, light, vertices=vertices, **options)

@@ -32,12 +32,7 @@ SQUARE_FACES = [[0, 1, 2], [0, 2, 3]]
 UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
-def view(
-    mesh: Mesh,
-    size: int,
-    samples: int = 1,
-    camera: OrthographicCamera = ABOVE,
-) -> Fragments:
+def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
     """Rasterize a mesh for one camera."""
     settings = ImageSettings(size, samples)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
@@ -71,9 +66,7 @@ def decoded(colors: np.ndarray, encoding: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repeats(
-    encoding,
-):
+def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repeats(encoding):
     height = 5
     width = 7
     texture = random_texture(height, width)
@@ -150,9 +143,7 @@ def mid_tone_sphere() -> Mesh:
 
 
 @pytest.mark.parametrize("albedo_scale", [1.0, 0.5, 1.2])
-def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(
-    albedo_scale,
-):
+def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(albedo_scale):
     mesh = mid_tone_sphere()
     fragments = view(mesh, 16, 2)
     added = 0.1 * (draw_uniform(len(mesh.faces), 3) - 0.5)
@@ -163,9 +154,7 @@ def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped
 
 
 @pytest.mark.parametrize("albedo_scale", [1.0, 3.0])
-def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(
-    albedo_scale,
-):
+def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale):
     mesh = patchwork_sphere()
     fragments = view(mesh, 16, 2)
     large = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
@@ -192,15 +181,11 @@ def with_even_colors_on_textures(mesh: Mesh) -> Mesh:
     """Give all corners of each textured face the color of its first corner."""
     first_colors = mesh.corner_colors[:, :1].repeat(3, axis=1)
     has_texture = (mesh.texture_ids >= 0)[:, None, None]
-    return replace(
-        mesh,
-        corner_colors=np.where(has_texture, first_colors, mesh.corner_colors),
-    )
+    return replace(mesh, corner_colors=np.where(has_texture, first_colors, mesh.corner_colors))
 
 
 @pytest.mark.parametrize(
-    ("encoding", "albedo_scale"),
-    [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)],
+    ("encoding", "albedo_scale"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)]
 )
 @pytest.mark.parametrize("angle", [17.0, 86.0, 160.0])
 def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle):
@@ -229,10 +214,7 @@ def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle
 def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
     """A white texture gets the interpolated colors of the corners, rounded to 8 bits."""
     white = np.full((64, 64, 3), 255, np.uint8)
-    mesh = poster(
-        white,
-        color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3]),
-    )
+    mesh = poster(white, color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3]))
     fragments = view(mesh, 32)
     painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "linear")
     assert (painted.corner_colors == 1).all()

@@ -346,9 +346,7 @@ def test_a_direction_below_the_surface_passes_the_coat_like_one_at_its_horizon()
 
 
 @pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.3, 0.6])
-def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(
-    roughness,
-):
+def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(roughness):
     amplitudes = zonal_amplitudes(roughness, 45, rings=120)
     relative = amplitudes / amplitudes[0]
     degree = required_degree(roughness)
@@ -436,28 +434,16 @@ class WhiteSurface:
 
 # A white floor that fills the image from every side above it.
 FLOOR = Mesh.plain(
-    [[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]],
-    [[0, 1, 2], [0, 2, 3]],
-    np.ones(3),
+    [[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]], np.ones(3)
 )
 
 
 def operators_of(
-    mesh: Mesh,
-    cameras: Sequence[Camera],
-    settings: ImageSettings,
-    light_basis: Basis,
-    gloss: Gloss,
+    mesh: Mesh, cameras: Sequence[Camera], settings: ImageSettings, light_basis: Basis, gloss: Gloss
 ) -> list[TransferOperator]:
     """Build the float64 operators of views with gloss."""
     return build_operators(
-        mesh,
-        cameras,
-        settings,
-        choose("numpy"),
-        basis=light_basis,
-        dtype=DOUBLE,
-        gloss=gloss,
+        mesh, cameras, settings, choose("numpy"), basis=light_basis, dtype=DOUBLE, gloss=gloss
     )
 
 
@@ -591,9 +577,7 @@ def test_environment_light_is_reflected_with_no_more_than_its_energy(
 
 
 @pytest.mark.parametrize("specular_factor", [0.5, 1.0])
-def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
-    specular_factor,
-):
+def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(specular_factor):
     """At the foot of a very high wall, half of an even sky is hidden."""
     wall = Mesh.plain(
         [[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]],
@@ -816,11 +800,7 @@ class GlossyView:
         self.settings = ImageSettings(12, 2, normals=normals)
         self.rays = Rays(self.mesh)
         [self.view] = build_fragments(
-            self.mesh.vertices,
-            self.mesh.faces,
-            [camera],
-            self.settings,
-            choose("numpy"),
+            self.mesh.vertices, self.mesh.faces, [camera], self.settings, choose("numpy")
         )
         self.upstream = 0.3 + 0.5 * draw_uniform(3, len(self.view.pixels), seed=9)
 
@@ -839,11 +819,7 @@ class GlossyView:
         for seed, (name, size) in enumerate(shapes.items()):
             uniform[name] = 0.3 + 0.5 * draw_uniform(*size, seed=seed)
         vertices = torch.from_numpy(self.mesh.vertices)
-        return {
-            "environment": positive_light(6),
-            "vertices": vertices,
-            **uniform,
-        }
+        return {"environment": positive_light(6), "vertices": vertices, **uniform}
 
     def total(self, values: dict[str, Tensor]) -> Tensor:
         """Return the weighted sum of the radiance at fixed visibility."""
@@ -882,9 +858,7 @@ def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}],
-    ids=str,
+    "options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str
 )
 def test_an_operator_gives_the_images_of_render(options):
     mesh = normalize(solid("cup"))

@@ -75,9 +75,7 @@ def test_derivatives_of_irradiance_are_central_differences(degree):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_short_and_zero_normals_have_finite_irradiance_and_no_gradient_that_is_nan(
-    dtype,
-):
+def test_short_and_zero_normals_have_finite_irradiance_and_no_gradient_that_is_nan(dtype):
     """A gradient is of the order of 1 / length, so it may overflow. That of zero is zero."""
     tiny = torch.finfo(dtype).smallest_normal
     lengths = torch.tensor([1, 64, 1 / 16, 0]).repeat_interleave(len(SPECIAL))[:, None]
@@ -134,11 +132,7 @@ class Scene:
     def fragments(self) -> Fragments:
         settings = ImageSettings(self.size, self.samples)
         [fragments] = build_fragments(
-            self.mesh.vertices,
-            self.mesh.faces,
-            [self.camera],
-            settings,
-            choose("numpy"),
+            self.mesh.vertices, self.mesh.faces, [self.camera], settings, choose("numpy")
         )
         return fragments
 
@@ -252,9 +246,7 @@ def test_derivatives_of_images_are_central_differences(scene):
 
 
 @all_scenes
-def test_the_gradient_by_the_light_is_zero_in_the_bands_that_no_diffuse_surface_reflects(
-    scene,
-):
+def test_the_gradient_by_the_light_is_zero_in_the_bands_that_no_diffuse_surface_reflects(scene):
     image = Image(scene, "srgb")
     inputs = image.inputs()
     upstream = draw(3, scene.size**2)
@@ -266,9 +258,7 @@ def test_the_gradient_by_the_light_is_zero_in_the_bands_that_no_diffuse_surface_
 
 
 @all_scenes
-def test_the_gradient_by_a_vertex_is_zero_if_no_visible_face_depends_on_it(
-    scene,
-):
+def test_the_gradient_by_a_vertex_is_zero_if_no_visible_face_depends_on_it(scene):
     """Smooth normals also depend on the neighbors of a face."""
     image = Image(scene, "srgb")
     inputs = image.inputs()

@@ -93,9 +93,7 @@ def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_seen_faces_have_their_corners_and_the_side_that_the_camera_sees(
-    camera,
-):
+def test_seen_faces_have_their_corners_and_the_side_that_the_camera_sees(camera):
     vertices, faces = open_shell()
     fragments = fragments_of((vertices, faces), ImageSettings(9, 3), camera)
     points = camera.project(vertices)
@@ -112,9 +110,7 @@ def test_seen_faces_have_their_corners_and_the_side_that_the_camera_sees(
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.05])
-def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
-    shift,
-):
+def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(shift):
     """The rasterizer rounds corners, so that a sample may lie just outside of its face.
 
     With shifted corners, some samples lie well outside.
@@ -123,10 +119,7 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
     fragments = replace(fragments, outlines=fragments.outlines + shift)
     outside_count = 0
     samples = zip(
-        fragments.barycentric,
-        fragments.sample_to_seen_face,
-        fragments.positions(),
-        strict=True,
+        fragments.barycentric, fragments.sample_to_seen_face, fragments.positions(), strict=True
     )
     for weight, face, position in samples:
         corners = np.vstack([fragments.outlines[face].T, np.ones(3)])
@@ -145,15 +138,9 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
         lambda corners: corners[:, :1].expand(-1, 3, -1),
         lambda corners: corners[..., :1] * 1e-9,
     ],
-    ids=[
-        "all at the center",
-        "all at the first corner",
-        "on a short line",
-    ],
+    ids=["all at the center", "all at the first corner", "on a short line"],
 )
-def test_a_face_without_area_in_the_image_has_finite_barycentric_weights(
-    flatten,
-):
+def test_a_face_without_area_in_the_image_has_finite_barycentric_weights(flatten):
     fragments = fragments_of(open_shell(), ImageSettings(4, 1))
     outlines = flatten(fragments.outlines).expand(-1, -1, 2)
     weights = replace(fragments, outlines=outlines).barycentric
@@ -163,9 +150,7 @@ def test_a_face_without_area_in_the_image_has_finite_barycentric_weights(
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(
-    camera,
-):
+def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
     settings = ImageSettings(16, 4)
     whole = fragments_of(dented_sphere(), settings, camera)
     culled = fragments_of(dented_sphere(), settings, camera, closed=True)

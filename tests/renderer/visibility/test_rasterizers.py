@@ -249,12 +249,7 @@ def test_row_0_is_the_top_and_x_grows_to_the_right(rasterizer):
     [ids] = rasterizer.rasterize(points, faces, 4)
     assert ids.dtype == np.int32
     rectangle_of_sample = np.where(ids < 0, NO_FACE, ids // 2)
-    expected = [
-        [0, 0, 1, 1],
-        [0, 0, 1, 1],
-        [-1, -1, 1, 1],
-        [-1, -1, 1, 1],
-    ]
+    expected = [[0, 0, 1, 1], [0, 0, 1, 1], [-1, -1, 1, 1], [-1, -1, 1, 1]]
     np.testing.assert_array_equal(rectangle_of_sample, expected)
 
 
@@ -262,11 +257,7 @@ def test_row_0_is_the_top_and_x_grows_to_the_right(rasterizer):
 @pytest.mark.parametrize(("order", "is_turned_away"), [([0, 1, 2], False), ([0, 2, 1], True)])
 @pytest.mark.parametrize("size", [1, 2, 100, 1e4])
 def test_a_face_fills_the_image_unless_it_turns_away_on_a_closed_mesh(
-    rasterizer,
-    size,
-    order,
-    is_turned_away,
-    closed,
+    rasterizer, size, order, is_turned_away, closed
 ):
     points, _ = scene_of([-size, -size, 0], [3 * size, -size, 0], [-size, 3 * size, 0])
     ids = rasterizer.rasterize(points, np.array([order]), 16, closed)
@@ -349,15 +340,7 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides():
     closed=st.booleans(),
 )
 def test_numba_equals_numpy_to_the_bit(
-    seed,
-    view_count,
-    vertex_count,
-    face_count,
-    resolution,
-    lattice,
-    scales,
-    order,
-    closed,
+    seed, view_count, vertex_count, face_count, resolution, lattice, scales, order, closed
 ):
     """Triangles are huge, thin, without area, at samples, out of range, and at equal depths."""
     rng = np.random.default_rng(seed)

@@ -41,11 +41,7 @@ ChangedImage = Callable[[Tensor, int], Tensor]
 
 
 def rendered(
-    mesh: renderer.Mesh,
-    camera: Camera,
-    size: int,
-    samples: int | None,
-    **options,
+    mesh: renderer.Mesh, camera: Camera, size: int, samples: int | None, **options
 ) -> Tensor:
     """Render an image (3, size, size) whose gradients see outlines move."""
     choices = {"light": LIGHT, "background": 0.3, "albedo_scale": 0.8, "silhouettes": True}
@@ -286,13 +282,7 @@ def test_a_growing_pyramid_on_the_ground_gains_its_perimeter_times_the_jump_of_r
     mesh = concatenate([pyramid, ground])
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     image = rendered(
-        mesh,
-        FROM_ABOVE,
-        32,
-        8,
-        light=soft_front_light(0.6),
-        vertices=vertices,
-        albedo_scale=1.0,
+        mesh, FROM_ABOVE, 32, 8, light=soft_front_light(0.6), vertices=vertices, albedo_scale=1.0
     )
     (gradient,) = torch.autograd.grad(image[0].sum(), vertices)
     outward = vertices.detach()[:4, :2].sign()
@@ -486,10 +476,7 @@ def table() -> list[renderer.Mesh]:
 
 PARTS = {
     "cup": [angular_cup()],
-    "boxes": [
-        box([-0.8, -0.7, -0.6], [0.2, 0.1, 0.3]),
-        box([-0.3, 0.15, -0.5], [0.5, 0.9, 0.6]),
-    ],
+    "boxes": [box([-0.8, -0.7, -0.6], [0.2, 0.1, 0.3]), box([-0.3, 0.15, -0.5], [0.5, 0.9, 0.6])],
     "table": table(),
 }
 # Samples per row of a pixel, and the largest relative error.
