@@ -91,20 +91,15 @@ def test_a_target_is_one_class_for_all_views_or_one_for_each(attacked, target, l
     assert result.conditions.light.shape == (2, 49, 3)
 
 
-def test_without_a_target_any_error_is_a_success(attacked):
-    assert attacked("lighting", SHARED, max_steps=1).criterion.target is None
-
-
 def test_the_least_likely_class_of_each_view_is_a_target(attacked):
     scene = SHARED | TWO_BACKGROUNDS
     result = attacked("lighting", scene, target="least_likely", max_steps=1)
     assert torch.equal(result.criterion.target, result.logits_before.argmin(2))
 
 
-@pytest.mark.parametrize("parameter", ["lighting", "geometry"])
-def test_the_same_seed_gives_the_same_result(attacked, parameter):
+def test_the_same_seed_gives_the_same_result(attacked):
     """Nothing reaches the target, so that a restart is drawn."""
-    steps = {parameter: augment.StepSettings("linf", 0.02)}
+    steps = {"lighting": augment.StepSettings("linf", 0.02)}
     options = {"target": "sky", "restarts": 1, "max_steps": 2}
     first = attacked(steps, **options).minimum
     second = attacked(steps, **options).minimum
