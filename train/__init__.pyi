@@ -1,6 +1,6 @@
 import logging
 
-from train.auditing.report import AuditReport as AuditReport
+from train.auditing.network import AuditReport as AuditReport
 from train.checkpoints import load_run as load_run
 from train.command_settings import AuditSettings as AuditSettings
 from train.command_settings import EvaluateSettings as EvaluateSettings

@@ -1,6 +1,6 @@
-"""What an audit measured about one network, read from its files once, and whether it is safe."""
+"""Results of an audit for one network: read once, judged, and as `nb.audit` returns them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -8,8 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from renderer.errors import as_path
+from renderer.io.files import atomic_write
+from renderer.short_repr import ShortRepr
 from train.auditing.lights import KINDS, RANDOM
 from train.results.intervals import Units, leave_out, weighted_means
+from train.results.metrics import METRICS
 from train.results.predictions import Prediction
 from train.results.store import RunSummary, ScoredRun, read_summaries
 from train.results.tables import Estimate, join_words
@@ -31,6 +35,102 @@ MIN_VIEWS = 6
 # A network is called safe only if it classifies at least this fraction of the images
 # correctly, both of the tested class and of other objects.
 PASS_THRESHOLD = 0.9
+
+
+@dataclass(frozen=True)
+class AttackCounts:
+    """Numbers of views that become misclassified by an attack on one kind of lighting.
+
+    Attributes:
+        unit: Unit of the radii in words.
+        radii: Radii of the L∞ norm-balls, in ascending order.
+        views: Number of views.
+        correct: Number of views that are classified correctly before the
+            attack.
+        adversarial: For each radius, the number of correct views that an attack
+            or random draws make misclassified, even with the noise of a camera.
+        random: For each radius, the same number for random draws alone.
+    """
+
+    unit: str
+    radii: tuple[float, ...]
+    views: int
+    correct: int
+    adversarial: tuple[int, ...]
+    random: tuple[int, ...]
+
+
+@dataclass(frozen=True, repr=False)
+class NetworkReport(ShortRepr):
+    """Results of an audit for one network.
+
+    Attributes:
+        name: Name of the network.
+        answer: Sentence that says whether the network is safe in unusual
+            lighting, and why it is not.
+        recognized: For the name of each environment light, the fraction of the
+            views that the network recognizes. Names of random lights begin with
+            "random".
+        attacks: Numbers of misclassified views for each kind of lighting:
+            "lighting" (environment lighting), "skylight", "projector" and
+            "lamps".
+        scores: Metrics such as "recall" and "false_positive_rate" on each set
+            of test images: "laboratory" (path-traced renders) and
+            "photographs".
+        transfers: For each kind of lighting, how often an attack on this
+            network also fools the other network. See `transfer_success` of
+            `train.auditing.lights`. Empty with one network.
+    """
+
+    name: str
+    answer: str
+    recognized: Mapping[str, float]
+    attacks: Mapping[str, AttackCounts]
+    scores: Mapping[str, Mapping[str, Estimate]]
+    transfers: Mapping[str, Any]
+
+
+@dataclass(frozen=True, repr=False)
+class AuditReport(ShortRepr):
+    """Report of an audit.
+
+    Attributes:
+        label: Class whose objects were tested.
+        network: Results for the audited network.
+        hardened: Results for the hardened network. None without one.
+        recommendation: Sentence that recommends normalized light, hardening,
+            both or neither, by the recall at 10% false positives. Empty if
+            there are no test images.
+        page: Report as a single HTML page, which loads no other files.
+    """
+
+    label: str
+    network: NetworkReport
+    hardened: NetworkReport | None
+    recommendation: str
+    page: str
+
+    def save(self, path: str | Path) -> Path:
+        """Write the report to an HTML file.
+
+        Args:
+            path: File to write, such as "audit.html".
+
+        Returns:
+            Path of the file.
+        """
+        file = as_path("path", path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(file, self.page)
+        return file
+
+    def __str__(self) -> str:
+        """Return one line about each network, and the recommendation."""
+        networks = [self.network] if self.hardened is None else [self.network, self.hardened]
+        lines = [network.answer for network in networks]
+        if self.recommendation:
+            lines.append(self.recommendation)
+        return "\n".join(lines)
 
 
 class _Finding(NamedTuple):
@@ -215,3 +315,28 @@ class AuditedNetwork:
         correct = self.counts[kind]["correct"]
         for count in (0, *self.counts[kind][method]):
             yield correct - count, correct
+
+    def report(self) -> NetworkReport:
+        """Collect the results as `nb.audit` returns them."""
+        scores = {}
+        for images, stored in self.run.photographs.items():
+            metrics = {name: stored.overall.find(name) for name in METRICS}
+            scores[images] = {name: item for name, item in metrics.items() if item is not None}
+        attacks = {}
+        for kind, counts in self.counts.items():
+            attacks[kind] = AttackCounts(
+                unit=KINDS[kind].unit,
+                radii=KINDS[kind].radii,
+                views=counts["n"],
+                correct=counts["correct"],
+                adversarial=tuple(counts["adversarial"]),
+                random=tuple(counts["random"]),
+            )
+        return NetworkReport(
+            name=self.name,
+            answer=self.answer,
+            recognized={light: sum(views) / len(views) for light, views in self.recognized.items()},
+            attacks=attacks,
+            scores=scores,
+            transfers=self.transfers,
+        )

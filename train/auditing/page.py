@@ -15,10 +15,11 @@ from PIL import Image
 
 from renderer.io.images import read_square
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS, PlainViews
-from train.auditing.network import IN_WORDS, PHOTOGRAPHS, PLAIN, AuditedNetwork
+from train.auditing.network import IN_WORDS, PHOTOGRAPHS, PLAIN, AuditedNetwork, AuditReport
 from train.auditing.relit import relit_sections
 from train.auditing.remedies import (
     CLASSIFIER,
+    HARDENED,
     HARDENING,
     NEXT_HARDENING,
     NORMALIZED,
@@ -78,6 +79,18 @@ class Audited(NamedTuple):
     label: str
     networks: Mapping[str, AuditedNetwork]
     recommendation: Recommendation | None
+
+    def report(self) -> AuditReport:
+        """Collect the numbers of the audit."""
+        networks = {key: network.report() for key, network in self.networks.items()}
+        recommended = self.recommendation
+        return AuditReport(
+            label=self.label,
+            network=networks[CLASSIFIER],
+            hardened=networks.get(HARDENED),
+            recommendation="" if recommended is None else recommended.sentence,
+            page=self.path.read_text(encoding="utf-8"),
+        )
 
 
 def write_audit_page(

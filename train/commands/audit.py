@@ -17,8 +17,8 @@ from augment.plain_networks import (
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_list
 from train.auditing.audit import run_audit
+from train.auditing.network import AuditReport
 from train.auditing.remedies import CLASSIFIER, HARDENED
-from train.auditing.report import AuditReport, read_audit
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.commands.arguments import (
     MeshItem,
@@ -151,4 +151,4 @@ def audit(
                 out=str(folder),
                 overwrite=overwrite,
             )
-            return read_audit(run_audit(settings, networks))
+            return run_audit(settings, networks).report()
