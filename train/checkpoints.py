@@ -27,11 +27,10 @@ from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, as_path, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
-from train.command_settings import ClassifierSettings
 from train.data.cache import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
-from train.settings import published
+from train.settings import NetworkSettings, published
 from train.user_errors import keyed
 
 # Key in a checkpoint. Its value is the hash of the other entries.
@@ -173,7 +172,7 @@ def _find_run(path: Path) -> Path | None:
     return folder if (folder / BEST).is_file() else None
 
 
-def load_chosen(settings: ClassifierSettings) -> Classifier:
+def load_chosen(settings: NetworkSettings) -> Classifier:
     """Load the classifier that the settings of a command choose."""
     return load_network(
         str(settings.network),

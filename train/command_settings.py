@@ -27,11 +27,10 @@ from train.settings import (
     MAX_IMAGES,
     MAX_SEED,
     MESHES,
+    NETWORKS,
     TIME_FOLDER,
     NetworkSettings,
-    class_texts,
     label_names,
-    normalized_light_values,
 )
 
 # Default environment maps of an audit.
@@ -55,40 +54,6 @@ LAB_MESHES = [
     *("solid:lemon:101", "solid:lemon:102", "solid:peach:101", "solid:peach:102"),
     *("solid:ball:101", "solid:ball:103"),
 ]
-CLASSIFIERS = (
-    "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, run:FOLDER, squeezenet_caffe or "
-    "python:package.module:function, or a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
-)
-
-
-@dataclass(kw_only=True)
-class ClassifierSettings(Settings):
-    """Settings that choose a classifier, and describe it if it is a network of the user."""
-
-    network: str | None = setting(None, f"The network: {CLASSIFIERS}.")
-    weights: str | None = setting_like(NetworkSettings, "weights", None)
-    classes: Any = setting_like(NetworkSettings, "classes", None)
-    normalization: Any = setting_like(NetworkSettings, "normalization", None)
-    normalize_light: Any = setting(
-        None,
-        "Normalize the light of each image before the network sees it: true, or "
-        "{white_balance, percentile, level, gamma}. null: as the network does. This is not "
-        "`normalization`.",
-    )
-    size: int | None = setting(
-        None,
-        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
-        "records none.",
-        minimum=1,
-        maximum=MAX_SIZE,
-    )
-    trust: bool = setting_like(NetworkSettings, "trust", False)
-
-    def __post_init__(self) -> None:
-        """Check all values, and convert those that YAML reads as another type."""
-        super().__post_init__()
-        self.classes = class_texts(self.classes)
-        self.normalize_light = normalized_light_values(self.normalize_light)
 
 
 @dataclass
@@ -172,7 +137,7 @@ class TransferSettings(Settings):
 
 
 @dataclass
-class AttackExperimentSettings(ClassifierSettings):
+class AttackExperimentSettings(NetworkSettings):
     """Settings of the command pnb-attack, which attacks one classifier.
 
     If the attack needs a projector or lamps and the scene has none, the scene gets them with
@@ -180,7 +145,7 @@ class AttackExperimentSettings(ClassifierSettings):
     gradient needs the silhouettes of objects.
     """
 
-    network: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
+    network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
     label: Any = setting(
         None,
         "Class of the meshes, by its name or index. null: the class that the name of each mesh's "
@@ -399,14 +364,14 @@ class LabSettings(Settings):
 
 
 @dataclass
-class AuditSettings(ClassifierSettings):
+class AuditSettings(NetworkSettings):
     """Settings of the command pnb-audit, which measures how safe a network is in unusual lighting.
 
     A mesh is a file, "solid:NAME:SEED" for a generated object, or a mapping with the fields of
     `ObjectSettings`.
     """
 
-    network: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
+    network: str = setting(REQUIRED, f"The audited network: {NETWORKS}.")
     hardened: str | None = setting(
         None, "Another classifier to show beside it, such as run:runs/harden."
     )
@@ -472,7 +437,7 @@ class AuditSettings(ClassifierSettings):
 
 
 @dataclass
-class EvaluateSettings(ClassifierSettings):
+class EvaluateSettings(NetworkSettings):
     """Settings of the command pnb-evaluate, which scores a network on photographs."""
 
     photos: str = setting(

@@ -55,6 +55,11 @@ MESHES = (
     "albedo_scale, color, gloss: [roughness, metallic, specular factor] or file, "
     "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}."
 )
+# Values of the setting `network`.
+NETWORKS = (
+    "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, run:FOLDER, squeezenet_caffe or "
+    "python:package.module:function, or a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
+)
 # Default name of an output folder: the time at which the command starts. Hydra
 # replaces "${now:...}".
 TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
@@ -156,8 +161,16 @@ class EvaluationSettings(Settings):
 
 @dataclass(kw_only=True)
 class NetworkSettings(Settings):
-    """Settings that describe a network of the user: its weights, classes and normalization."""
+    """Settings that choose a network, and describe it if it is a network of the user."""
 
+    network: str | None = setting(None, f"The network: {NETWORKS}.")
+    size: int | None = setting(
+        None,
+        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
+        "records none.",
+        minimum=1,
+        maximum=MAX_SIZE,
+    )
     weights: str | None = setting(
         None,
         "File of the classifier's weights: a state dict or a checkpoint, with any number of "
