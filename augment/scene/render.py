@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
@@ -423,9 +423,15 @@ class DirectRenderer:
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
             # are not kept. `fixed` returns the same camera if no field is a tensor.
             is_kept = camera is fixed_camera
-            indirect = _IndirectLight(
-                self, example, object_index, fixed_camera, fragments, positions, is_kept
-            ).radiance
+            indirect = partial(
+                self._indirect_radiance,
+                example,
+                object_index,
+                fixed_camera,
+                fragments,
+                positions,
+                is_kept,
+            )
         shares_normals = not is_moved and self.settings.normals == "smooth"
         shown = ShadedView(
             mesh=item.mesh,
@@ -454,7 +460,29 @@ class DirectRenderer:
         """Return the normals at the corners of an unmoved object, shape (F, 3, 3)."""
         return torch.from_numpy(self.objects[object_index].mesh.corner_normals).to(self.like.device)
 
-    def transport_near(
+    def _indirect_radiance(
+        self,
+        example: int,
+        object_index: int,
+        camera: Camera,
+        fragments: Fragments,
+        positions: Float[np.ndarray, "V 3"],
+        is_kept: bool,
+        albedo: Float[Tensor, "S 3"],
+        light: Float[Tensor, "K 3"],
+    ) -> Float[Tensor, "3 P"]:
+        """Compute the radiance that shadows and bounces of environment light add to a view.
+
+        The S samples in P pixels are those of a shape with the given positions of its vertices.
+        Unless `is_kept`, the view is not needed again, and is removed to save memory.
+        """
+        frozen = self._transport_near(example, object_index, camera, positions)
+        added = frozen.radiance(camera, fragments, albedo, light)
+        if not is_kept:
+            del frozen.views[camera]
+        return added
+
+    def _transport_near(
         self, example: int, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
     ) -> FrozenTransport:
         """Return the shadows and bounces of a shape, or of a kept shape that is close to it.
@@ -499,39 +527,3 @@ class DirectRenderer:
         fragments = fragments.to(self.like.device)
         albedo = surface_albedo(item.mesh, fragments, self.settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)
-
-
-@dataclass(frozen=True, eq=False)
-class _IndirectLight:
-    """Shadows and bounces of environment light in one view of a shape.
-
-    Attributes:
-        renderer: Renderer that keeps the shadows and bounces of shapes.
-        example: Index of the example that has the shape.
-        object_index: Index of the object.
-        camera: The camera.
-        fragments: The S samples of the shape that the camera sees, in P pixels.
-        positions: Vertices of the shape.
-        is_kept: Whether the view of this camera is kept for further calls.
-    """
-
-    renderer: DirectRenderer
-    example: int
-    object_index: int
-    camera: Camera
-    fragments: Fragments
-    positions: Float[np.ndarray, "V 3"]
-    is_kept: bool
-
-    def radiance(
-        self, albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]
-    ) -> Float[Tensor, "3 P"]:
-        """Compute the radiance that shadows and bounces add to the P pixels of the view."""
-        frozen = self.renderer.transport_near(
-            self.example, self.object_index, self.camera, self.positions
-        )
-        added = frozen.radiance(self.camera, self.fragments, albedo, light)
-        # A view that is not needed again is removed, which saves memory.
-        if not self.is_kept:
-            del frozen.views[self.camera]
-        return added
