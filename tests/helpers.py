@@ -16,15 +16,9 @@ def bright_or_dark(images: Tensor) -> Tensor:
 
 
 def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -> np.ndarray:
-    """Draw noise images in which the channel with the number of the label is brighter.
+    """Draw noise images (N, 3, 16, 16) in which the channel of the label's number is brighter.
 
-    Args:
-        labels: Labels in 0, 1, 2, shape (N,).
-        rng: Random generator.
-        contrast: Brightness that is added to the channel, in 8-bit levels up to 55.
-
-    Returns:
-        Images, uint8, shape (N, 3, 16, 16).
+    The contrast is in 8-bit levels up to 55.
     """
     images = rng.integers(0, 200, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += contrast

@@ -63,15 +63,7 @@ VARNISHED_METAL = renderer.Gloss(roughness=0.4, metallic=0.3, specular_factor=0.
 
 @dataclass(frozen=True)
 class RenderCase:
-    """A call of `render`.
-
-    Attributes:
-        mesh: Name of the mesh, see `mesh_named`.
-        cameras: One camera or several.
-        light: Name of the light, see `light_named`.
-        options: Additional arguments.
-        differentiated: Names of the arguments whose gradients are recorded.
-    """
+    """A call of `render`, with the names of the arguments whose gradients are recorded."""
 
     mesh: str
     cameras: Any
@@ -133,13 +125,7 @@ DISCS = augment.LampsSettings(
 
 @dataclass(frozen=True)
 class SceneCase:
-    """A call of `build_scene`.
-
-    Attributes:
-        meshes: Meshes with their labels.
-        views: Number of views of each mesh.
-        options: Additional arguments.
-    """
+    """A call of `build_scene`."""
 
     meshes: list[Any]
     views: int
@@ -171,14 +157,7 @@ StepSettings = augment.StepSettings
 
 @dataclass(frozen=True)
 class AttackCase:
-    """A call of `attack` on two oranges.
-
-    Attributes:
-        attacked: Settings of the attacked parameters, by name.
-        scene: Arguments of `build_scene` that replace `SCENE_OPTIONS`.
-        settings: Arguments of `AttackSettings` that replace `ATTACK_SETTINGS`.
-        target: Target class, or None for an attack without a target.
-    """
+    """A call of `attack` on two oranges, with arguments that replace those of all."""
 
     attacked: dict[str, Any]
     scene: dict[str, Any] = field(default_factory=dict)

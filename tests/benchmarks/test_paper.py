@@ -38,13 +38,7 @@ SUBJECT = SceneObject("orange", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4,
 def classify_by_brightness(
     gray: float = 0.2, name: str = "source", rows: slice = slice(4, 8)
 ) -> Classifier:
-    """Make a classifier that predicts an orange if a square of an image is bright enough.
-
-    Args:
-        gray: Mean value above which the prediction is an orange.
-        name: Name of the classifier.
-        rows: Rows of the square, and its columns.
-    """
+    """Make a classifier that predicts an orange if a square of an image is brighter than `gray`."""
 
     def logits(images: Tensor) -> Tensor:
         brightness = images[:, :, rows, rows].mean((1, 2, 3))

@@ -54,20 +54,11 @@ def is_exact(values: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class View:
-    """Samples of the covered pixels of an image, and the faces that they show.
+    """S samples of the P covered pixels of an image, and the G faces that they show.
 
-    S is the number of samples, P that of covered pixels and G that of faces seen.
-
-    Attributes:
-        first: Edge from the first to the second corner of each face, shape (3, G).
-        second: Edge from the first to the third corner of each face, shape (3, G).
-        side: Side of each face that is seen, 1 (counter-clockwise) or -1, shape (G,).
-        albedo: Albedo of each face, shape (G, 3).
-        corners: Vertex indices of each face, shape (G, 3).
-        pixel: Index of each sample's pixel among the covered ones, shape (S,).
-        face: Index of each sample's face among those seen, shape (S,).
-        pixels: Row-major indices of the covered pixels in the image, shape (P,).
-        samples: Samples of a pixel, covered or not.
+    Edges have the shape (3, G) and lead from the first corner of a face. `side` is 1 if it is
+    seen counter-clockwise, or -1. `pixel` and `face` are the indices of each sample's pixel and
+    face among the `pixels` and faces here. `pixels` are row-major indices in the image.
     """
 
     first: np.ndarray
@@ -91,20 +82,9 @@ def view(
     towards: np.ndarray,
     lift: Callable[[np.ndarray], np.ndarray],
 ) -> View:
-    """Create a view from a rasterized image.
+    """Create a view from the index of the face at each sample, or a negative number, (R, R).
 
-    Args:
-        ids: Index of the face at each sample, or a negative number, shape (R, R).
-        samples: Samples per row of a pixel.
-        placed: Vertices as the camera sees them, shape (V, 3).
-        vertices: Vertices as they are shaded, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        albedo: Albedo of the faces, shape (F, 3).
-        towards: Direction to the camera, shape (3,).
-        lift: `extended` or `exact`.
-
-    Returns:
-        The view, whose edges have the numbers of `lift`.
+    The camera sees the vertices `placed`, and `vertices` are shaded.
     """
     size = len(ids) // samples
     row, column = np.nonzero(ids >= 0)
@@ -138,16 +118,7 @@ def image(view: View, light: np.ndarray) -> np.ndarray:
 
 
 def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
-    """Compute the gradient of Σ upstream × image by the light.
-
-    Args:
-        view: The view.
-        upstream: Factors of the image's values, shape (P, 3).
-        degree: Degree of the light.
-
-    Returns:
-        The gradient, shape ((degree + 1)², 3).
-    """
+    """Compute the gradient of Σ upstream × image by the light, with factors (P, 3)."""
     weight = _face_weight(view, upstream)
     gradient = np.zeros(((degree + 1) ** 2, 3), dtype=weight.dtype)
     for index, value in reflected(normals_of(view), degree).items():
@@ -158,18 +129,9 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
 def vertex_gradient(
     view: View, upstream: np.ndarray, light: np.ndarray, vertex_count: int
 ) -> np.ndarray:
-    """Compute the gradient of Σ upstream × image by the shaded vertices.
+    """Compute the gradient (V, 3) of Σ upstream × image by the shaded vertices.
 
     Faces without area do not contribute.
-
-    Args:
-        view: The view.
-        upstream: Factors of the image's values, shape (P, 3).
-        light: Coefficients of the light, shape ((degree + 1)², 3).
-        vertex_count: Number V of vertices.
-
-    Returns:
-        The gradient, shape (V, 3).
     """
     weight = _face_weight(view, upstream)
     by_first = []
@@ -249,16 +211,9 @@ def basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def harmonics(directions: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndarray]:
-    """Compute harmonics at unit vectors as √(…) dᵐP_l/dzᵐ times Re or Im of (x + iy)ᵐ.
+    """Compute harmonics as √(…) dᵐP_l/dzᵐ times Re or Im of (x + iy)ᵐ, by the index l² + l + m.
 
-    There is no Condon-Shortley sign.
-
-    Args:
-        directions: Unit vectors, shape (3, N).
-        bands: The bands l.
-
-    Returns:
-        The values (N,) of each harmonic by its index l² + l + m.
+    There is no Condon-Shortley sign. Directions are unit vectors (3, N).
     """
     x, y, z = directions
     one = 1 + 0 * z
@@ -332,21 +287,10 @@ def _legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
 def shadow(
     view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int
 ) -> np.ndarray:
-    """Compute the radiance that shadows take from each pixel.
+    """Compute the radiance (P, (degree + 1)², 3) that shadows take from each pixel.
 
-    The rays and their origins are those of the renderer. Which rays are blocked,
-    and all sums, are computed here.
-
-    Args:
-        view: The view.
-        points: Origin of the rays of each sample, shape (S, 3).
-        corners: Corners of the faces that block rays, shape (F, 3 corners, 3).
-        directions: Directions of the rays, which share the sphere equally,
-            shape (D, 3).
-        degree: Degree of the light.
-
-    Returns:
-        Radiance per unit of each coefficient, shape (P, (degree + 1)², 3).
+    The rays and their origins (S, 3) are those of the renderer. Which rays are blocked,
+    and all sums, are computed here. The directions (D, 3) share the sphere equally.
     """
     sky = basis(directions.T, degree)
     normals = normals_of(view).T[view.face]
@@ -362,18 +306,7 @@ def shadow(
 
 
 def is_blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Find which rays from a point meet a face.
-
-    A ray meets a face if it passes all edges on the side on which the face lies.
-
-    Args:
-        point: Origin of the rays, shape (3,).
-        directions: Directions of the rays, shape (D, 3).
-        corners: Corners of the faces, shape (F, 3 corners, 3).
-
-    Returns:
-        Mask of the rays, shape (D,).
-    """
+    """Find which rays (D, 3) from a point meet a face: they pass all edges on the face's side."""
     a = corners[:, 0] - point
     b = corners[:, 1] - point
     c = corners[:, 2] - point

@@ -77,11 +77,7 @@ MIN_COSINE = 1e-3
 
 
 def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
-    """Fit the sky, write the fit, and print its error.
-
-    Args:
-        out: File to write. The default is the file that the renderer reads.
-    """
+    """Fit the sky, write the fit, and print its error."""
     fit = fit_polynomials(*DEGREES).float()
     save_file({"fit": fit}, out)
     error = fit_error(fit, 50, np.random.default_rng(0))
@@ -89,7 +85,7 @@ def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
 
 
 def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) -> torch.Tensor:
-    """Fit the coefficients of skies whose sun is at azimuth 0.
+    """Fit Chebyshev coefficients (zeniths, turbidities, 28, 3) of skies with the sun at azimuth 0.
 
     The fit is a least-squares fit to quadratures at Chebyshev points, with
     twice as many points as polynomials in each variable. Coefficients with
@@ -98,15 +94,6 @@ def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) 
     The model has a pole at a turbidity of 1.65. Polynomials of the paper's
     degrees 13 and 7 in turbidity are therefore off by up to 4%, and polynomials
     in its inverse by 0.15%. Monomials would lose digits of float32.
-
-    Args:
-        zenith_degree: Degree in the zenith angle of the sun.
-        turbidity_degree: Degree in the inverse of turbidity.
-        nodes: Number of nodes of the quadratures.
-
-    Returns:
-        Chebyshev coefficients, float64, shape
-        (zenith_degree + 1, turbidity_degree + 1, 28, 3).
     """
     zenith_points = chebpts1(2 * (zenith_degree + 1))
     turbidity_points = chebpts1(2 * (turbidity_degree + 1))
@@ -146,7 +133,7 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
 def coefficients_by_quadrature(
     zenith: float, azimuth: float, turbidity: float, nodes: int = 48
 ) -> np.ndarray:
-    """Integrate the sky's radiance times harmonics over the upper hemisphere.
+    """Integrate the sky's radiance times harmonics over the upper hemisphere, shape (49, 3).
 
     The quadrature has 4 · nodes² directions in polar coordinates around the
     sun, so that the cusp there is an end of the integration. Circles around the
@@ -157,16 +144,6 @@ def coefficients_by_quadrature(
     With 48 nodes the error is mostly 1e-9 of the norm of the coefficients, and
     up to 2e-8 in the clearest air with the sun overhead. With 24 nodes it is up
     to 1e-5.
-
-    Args:
-        zenith: Zenith angle of the sun in radians.
-        azimuth: Azimuth of the sun in radians.
-        turbidity: Turbidity of the air.
-        nodes: Number of nodes in the angle to the sun, for the circles and for
-            the arcs.
-
-    Returns:
-        Coefficients, shape (49, 3).
     """
     # A sun overhead has no arcs, and the ratio of the tangents would be 0/0.
     tilt = max(zenith, 1e-8)
@@ -200,19 +177,10 @@ def _unit_interval_quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: float) -> np.ndarray:
-    """Evaluate the sky's radiance.
+    """Evaluate the sky's radiance (N, 3) in kcd/m² by cosines to the zenith, and angles to the sun.
 
     Saturated skies leave the gamut and are not clamped. Around a clear sunset,
     blue falls to -2.6% of the largest value.
-
-    Args:
-        cosine: Cosines of the zenith angles of directions, shape (N,).
-        angle: Angles between the directions and the sun in radians, shape (N,).
-        zenith: Zenith angle of the sun in radians.
-        turbidity: Turbidity of the air.
-
-    Returns:
-        Radiance, linear RGB in kcd/m², shape (N, 3).
     """
     chi = (4 / 9 - turbidity / 120) * (math.pi - 2 * zenith)
     luminance_overhead = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192

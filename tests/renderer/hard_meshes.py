@@ -39,12 +39,7 @@ def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) ->
 
 
 def sphere(subdivisions: int = 2, lowest: float = 0.8) -> Mesh:
-    """Create a dented sphere.
-
-    Args:
-        subdivisions: The sphere has 20 · 4^subdivisions faces.
-        lowest: The smallest radius. The largest is 1.
-    """
+    """Create a dented sphere of 20 · 4^subdivisions faces, with radii from `lowest` to 1."""
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     radii = np.random.default_rng(1).uniform(lowest, 1, (len(shape.vertices), 1))
     return painted(shape.vertices * radii, shape.faces)
@@ -54,13 +49,8 @@ def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
     """Create thin triangles whose longest edges have a length of about 1.
 
     The third corner of a needle is beside the second corner. The third corner
-    of a flat cap is between the first two.
-
-    Args:
-        height: Height of the triangles.
-        count: Number of needles, and of caps. Each occurs in all three orders
-            of corners.
-        towards: Direction that the triangles roughly face, shape (3,).
+    of a flat cap is between the first two. Each of the `count` needles and caps
+    occurs in all three orders of corners.
     """
     rng = np.random.default_rng(2)
     shape = (2 * count, 3)

@@ -39,13 +39,9 @@ def random_directions(count: int, seed: int = 0) -> torch.Tensor:
 
 
 def real_harmonics(complex_values: np.ndarray) -> np.ndarray:
-    """Combine SciPy's complex harmonics into real ones without the Condon-Shortley sign.
+    """Combine SciPy's complex harmonics (L, M, ...) into real ones (L², ...), index l² + l + m.
 
-    Args:
-        complex_values: Values by band and order, shape (L, M, ...).
-
-    Returns:
-        Real values, shape (L², ...), with index l² + l + m.
+    They have no Condon-Shortley sign.
     """
     rows = []
     for l in range(len(complex_values)):

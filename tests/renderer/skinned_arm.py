@@ -115,17 +115,9 @@ def write(
     weights: np.ndarray | None = None,
     joints: np.ndarray | None = None,
 ) -> Path:
-    """Write the file.
+    """Write the file as .glb or .gltf, and return its path.
 
-    Args:
-        path: Path of the file. Its suffix, .glb or .gltf, selects the format.
-        change: Function that changes the JSON tree before it is written.
-        weights: Weights of the joints from 0 to 255, shape (V, 3). Default:
-            `WEIGHTS`.
-        joints: Indices of the joints at each vertex, shape (V, 4).
-
-    Returns:
-        The path.
+    `change` changes the JSON tree before. Weights (V, 3) are from 0 to 255.
     """
     arrays = GltfArrays()
     tree = _tree(arrays, weights, joints)

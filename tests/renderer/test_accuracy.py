@@ -57,14 +57,7 @@ Subject = TypeVar("Subject")
 
 @dataclass(frozen=True)
 class Case(Generic[Subject]):
-    """Row of a table.
-
-    Attributes:
-        name: The condition.
-        bound: The largest error allowed, in units of ε.
-        measure: Function that returns the errors for one subject.
-        subjects: Setups or directions. The largest errors of all count.
-    """
+    """Row of a table: the largest errors of all subjects, and a bound on them in units of ε."""
 
     name: str
     bound: float
@@ -90,17 +83,9 @@ def random_light(degree: int = 6) -> Tensor:
 class Setup:
     """Scene that is rendered, and computed by the reference.
 
-    Attributes:
-        mesh: The mesh, with a color for each face.
-        light: Coefficients of the light, shape ((degree + 1)², 3).
-        vertices: Vertices that are shaded, shape (V, 3), if they are not those of
-            the mesh.
-        camera: The camera.
-        settings: Settings of the image.
-        rasterizer: The rasterizer.
-        dtype: Type of the vertices and the light that the renderer takes. The
-            reference takes them as this type rounds them.
-        lift: Numbers of the reference, `extended` or `exact`.
+    The mesh has a color for each face. The vertices are those that are shaded, by default the
+    mesh's. The renderer takes vertices and light in `dtype`, and the reference takes them as
+    this type rounds them.
     """
 
     mesh: Mesh
@@ -354,14 +339,7 @@ def shadow_cases() -> Iterator[Case[Setup]]:
 def tables(
     degree: int, subdivisions: int, size: int, slivers: int
 ) -> dict[str, Iterator[Case[Any]]]:
-    """Return the rows of each table by its title.
-
-    Args:
-        degree: The largest degree of harmonics.
-        subdivisions: Subdivisions of the largest sphere.
-        size: Width and height of the largest image in pixels.
-        slivers: Number of thin triangles of each kind.
-    """
+    """Return the rows of each table by its title. `slivers` thin triangles are of each kind."""
     return {
         "Spherical harmonics": harmonics_cases(degree),
         "Meshes": mesh_cases(subdivisions),
@@ -423,11 +401,7 @@ def operator_errors(
 ) -> Errors:
     """Measure the errors of an operator's image and of its gradient by the light.
 
-    Args:
-        setup: The scene.
-        dtype: Number type of the operator.
-        lost: Radiance that shadows take from each pixel, per unit of each
-            coefficient, shape (P, (degree + 1)², 3).
+    Shadows take the radiance `lost` (P, (degree + 1)², 3) from each pixel.
     """
     [operator] = build_operators(
         setup.mesh,
@@ -501,10 +475,6 @@ def harmonics_errors(directions: Tensor, degrees: Sequence[int]) -> Errors:
 
     An error of a gradient is relative to the gradient at the same direction, because
     gradients fall with the length of a direction.
-
-    Args:
-        directions: Directions, shape (N, 3).
-        degrees: Degrees of the harmonics.
     """
     wide_directions = exact(directions.double().numpy()).T
     wide_values = wide.basis(wide_directions, max(degrees))
@@ -569,11 +539,7 @@ def markdown_row(cells: Iterable[str]) -> str:
 
 
 def print_table(title: str, cases: Sequence[Case[Any]]) -> bool:
-    """Print a table, with errors beyond their bounds in bold.
-
-    Returns:
-        Whether all errors are within their bounds.
-    """
+    """Print a table, and return whether all errors are within their bounds. Others are bold."""
     errors_of_cases = [case.errors() for case in cases]
     # A dictionary keeps the order.
     quantities = list(dict.fromkeys(name for errors in errors_of_cases for name in errors))

@@ -175,12 +175,9 @@ def rays(size: int) -> np.ndarray:
 
 
 def first_hits(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first face on each of N rays from CAMERA, and the point on it.
+    """Find the first face (N,) on each ray from CAMERA, or -1, and the points (N, 3) on them.
 
     A ray meets a face at a + u (b - a) + v (c - a) = POSITION + t direction.
-
-    Returns:
-        A tuple of faces, or -1, shape (N,), and points, shape (N, 3).
     """
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     systems = np.empty((len(directions), len(a), 3, 3))

@@ -24,11 +24,7 @@ NEAR = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
 
 
 def positive_light(name: str) -> Tensor:
-    """Dim a preset until no value of an image is clipped, and remove its negative radiance.
-
-    Returns:
-        Coefficients, float64, shape (49, 3).
-    """
+    """Dim a preset until no value of an image is clipped, and remove its negative radiance."""
     light = 0.2 * load_light(name).double()
     lowest_radiance = mitsuba_map(light, 96).amin((0, 1)).clamp(max=0)
     light[0] -= lowest_radiance * math.sqrt(4 * math.pi)
@@ -65,12 +61,7 @@ def irradiance_error(
 
 @dataclass
 class NearbyFit:
-    """A fit of a small render that starts 3° from its camera.
-
-    Attributes:
-        found: What is found.
-        error: Error of the irradiance of the visible surface.
-    """
+    """A fit of a small render that starts 3° from its camera, and the error of its irradiance."""
 
     found: FittedScene
     error: float
@@ -156,13 +147,7 @@ def test_the_polar_angle_of_the_camera_is_found_from_an_image_of_a_round_object(
 
 
 class QuadraticProgram:
-    """A random convex function ½ uᵀ S u - wᵀ u of a light u, for each of three channels.
-
-    Attributes:
-        squares: The matrices S, shape (3, 49, 49).
-        wanted: The vectors w, shape (3, 49).
-        light: The light that the renderer finds, shape (49, 3).
-    """
+    """A random convex function ½ uᵀ S u - wᵀ u of a light u (49, 3), for each of three channels."""
 
     def __init__(self) -> None:
         factors = draw(3, 49, 60)

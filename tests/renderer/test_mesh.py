@@ -117,11 +117,7 @@ def test_a_surface_of_zero_area_cannot_be_normalized():
 
 
 def height_field(cells: int = 3) -> Mesh:
-    """Create a rough surface over [-1, 1]² with colors and texture coordinates that have seams.
-
-    Args:
-        cells: Number of cells per side. Each cell has two faces.
-    """
+    """Create a rough surface over [-1, 1]² with two faces per cell, colors and uvs with seams."""
     rng = np.random.default_rng(0)
     ticks = np.linspace(-1, 1, cells + 1)
     x, y = np.meshgrid(ticks, ticks, indexing="ij")

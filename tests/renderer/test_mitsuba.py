@@ -136,12 +136,7 @@ def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray
 
 
 class NoisyImage(NamedTuple):
-    """Mean of several images of Mitsuba.
-
-    Attributes:
-        mean: Radiance and coverage, shape (size, size, 4).
-        noise: Standard error of the mean, shape (size, size, 4).
-    """
+    """Mean of several images of Mitsuba, radiance and coverage, and its standard error."""
 
     mean: np.ndarray
     noise: np.ndarray
@@ -150,15 +145,7 @@ class NoisyImage(NamedTuple):
 def mitsuba_image(
     folder: Path, mesh: Mesh, camera: Camera, settings: ImageSettings, ray_count: int
 ) -> NoisyImage:
-    """Render the files of a scene with Mitsuba.
-
-    Args:
-        folder: Folder to which the files are written.
-        mesh: The mesh.
-        camera: The camera.
-        settings: Settings of the image.
-        ray_count: Rays per pixel of each of the images.
-    """
+    """Render the files of a scene with Mitsuba, several times with `ray_count` rays per pixel."""
     write_map(folder / "light.exr", mitsuba_map(LIGHT, MAP_ROWS))
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
     scene_path = folder / SCENE

@@ -48,19 +48,12 @@ def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:
 
 
 def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the normal of a triangle and its derivative in exact arithmetic.
+    """Compute the normal of a triangle and its derivative (3, 3 corners, 3) in exact arithmetic.
 
     If a corner moves by dv, the cross product of the edges moves by e × dv, with
     the opposite edge e. The normal moves by the part of it that is tangential,
-    divided by the length of the cross product.
-
-    Args:
-        corners: Corners of a triangle, shape (3, 3).
-
-    Returns:
-        Normal, shape (3,), and its derivative by the corners, shape
-        (3, 3 corners, 3). Both are rounded to float64 at the end. Without an
-        area, both are zero.
+    divided by the length of the cross product. Both are rounded to float64 at the end. Without an
+    area, both are zero.
     """
     a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
     opposite_edges = [
@@ -86,10 +79,7 @@ def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
 def sliver(height: float, edge: float, seed: int) -> torch.Tensor:
     """Return a rotated triangle with coordinates of order 1, so that differences are rounded.
 
-    Args:
-        height: Height of the triangle relative to its longest edge.
-        edge: Length of the longest edge, up to a factor of 1.3.
-        seed: Seed of the rotation and the position.
+    Its height is relative to its longest edge, whose length is `edge` up to a factor of 1.3.
     """
     corners = edge * np.array([[-0.6, 0, 0], [0.7, 0, 0], [0.1, height, 0]])
     rng = np.random.default_rng(seed)

@@ -294,15 +294,7 @@ def test_lamps_and_projectors_are_rendered_as_by_operators(sky, samples):
 
 
 def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
-    """Compute the normals of a ball of radius 1, seen from above with +y on the right.
-
-    Args:
-        size: Width and height of the image, which the ball fills, in pixels.
-
-    Returns:
-        A tuple of the normals, shape (size, size, 3), and the mask of the
-        pixels well inside the ball, shape (size, size).
-    """
+    """Compute normals (size, size, 3) of a ball from above, +y right, and a mask of its inside."""
     centers = (torch.arange(size).double() + 0.5) * 2 / size - 1
     y = centers.expand(size, -1)
     # The top of the image lies at -x.

@@ -127,11 +127,7 @@ def start_command(
 ) -> Process:
     """Start `python` with these arguments in a process of its own, in a folder.
 
-    Args:
-        arguments: Arguments of `python`.
-        folder: Working folder.
-        limit: Function that the process calls before Python starts.
-        environment: Additional environment variables.
+    The process calls `limit` before Python starts.
     """
     defaults = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(

@@ -36,11 +36,7 @@ def write_colmap(
 ) -> None:
     """Write the text files of a model with two images of one camera.
 
-    Args:
-        folder: Folder of the files.
-        model: Camera model of COLMAP.
-        parameters: Its parameters.
-        points_of_images: Second line of each image. None leaves the line out.
+    `points_of_images` is the second line of each image. None leaves the line out.
     """
     values = " ".join(map(str, parameters))
     camera = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {model} {WIDTH} {HEIGHT} {values}\n"

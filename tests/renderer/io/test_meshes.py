@@ -84,12 +84,7 @@ def textured_material() -> PBRMaterial:
 
 
 def write_gltf(folder: Path, image: dict[str, Any] | None = None) -> Path:
-    """Write a textured triangle as .gltf that contains its buffers.
-
-    Args:
-        folder: Folder of the file.
-        image: Entry of the image. Default: the file peel.png beside the mesh.
-    """
+    """Write a textured triangle as .gltf that contains its buffers, by default beside peel.png."""
     triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False)
     triangle.visual = TextureVisuals(uv=np.eye(3)[:, :2], material=textured_material())
     files = triangle.scene().export(file_type="gltf")

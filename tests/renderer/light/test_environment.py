@@ -100,14 +100,7 @@ def test_a_hdr_file_that_was_written_byte_by_byte_is_read(tmp_path):
 
 
 def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], **attributes) -> None:
-    """Write half floats to an .exr file by OpenImageIO.
-
-    Args:
-        path: File to write.
-        texels: Values, shape (H, W, C).
-        names: Names of the C channels.
-        **attributes: Attributes of the image.
-    """
+    """Write half floats (H, W, C) to an .exr file by OpenImageIO."""
     height, width, channels = texels.shape
     spec = OpenImageIO.ImageSpec(width, height, channels, "half")
     spec.channelnames = names

@@ -241,11 +241,7 @@ def concentrated_light(name: str, degree: int) -> Tensor:
 
 @cache
 def irradiance_at_normals(degree: int) -> Tensor:
-    """Compute the irradiance of each harmonic by quadrature of the clamped cosine.
-
-    Returns:
-        Irradiance, shape (N, K), at the N nodes of `quadrature(20)`.
-    """
+    """Integrate each harmonic times the clamped cosine at the nodes of `quadrature(20)`: (N, K)."""
     normals, _ = quadrature(20)
     directions, weights = quadrature(160)
     cosine = (normals @ directions.T).clamp(min=0)

@@ -39,13 +39,7 @@ def coefficients(zenith: Any, azimuth: Any, turbidity: Any) -> torch.Tensor:
 
 
 def perez(theta: ArrayLike, gamma: ArrayLike, parameters: list[float]) -> np.ndarray:
-    """Evaluate Perez's formula.
-
-    Args:
-        theta: Zenith angle of the direction.
-        gamma: Angle between the direction and the sun.
-        parameters: The parameters A to E.
-    """
+    """Evaluate Perez's formula at an angle from the zenith and one from the sun."""
     a, b, c, d, e = parameters
     gradation = 1 + a * np.exp(b / np.cos(theta))
     indicatrix = 1 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2
@@ -61,17 +55,7 @@ def chromaticity(rows: list[list[float]], sun_zenith: float, t: float) -> float:
 def published_sky(
     directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float
 ) -> np.ndarray:
-    """Evaluate the formulas of Preetham et al., appendix A.2, as they are printed, in angles.
-
-    Args:
-        directions: Unit vectors, shape (N, 3).
-        sun_zenith: Zenith angle of the sun in radians.
-        sun_azimuth: Azimuth of the sun in radians.
-        t: Turbidity.
-
-    Returns:
-        Radiance in XYZ, in kcd/m², shape (N, 3).
-    """
+    """Evaluate the formulas of Preetham et al., appendix A.2, as printed: XYZ in kcd/m², (N, 3)."""
     theta = np.arccos(directions[:, 2])
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     horizontal = np.sin(theta) * np.sin(sun_zenith) * np.cos(azimuth - sun_azimuth)

@@ -64,13 +64,9 @@ def scene_operators(scene: str) -> TransferOperators:
 
 @dataclass(frozen=True)
 class Call:
-    """Arguments of `TransferOperators.image`.
+    """Arguments of `TransferOperators.image`, of which `batch` precedes the coefficients.
 
-    Attributes:
-        batch: Shape of the lights before the coefficients.
-        per_view: Whether the first axis of the lights is that of the views.
-        background: Kind of the background: "gray", "image", "image of view" or
-            "all images".
+    The background is "gray", "image", "image of view" or "all images".
     """
 
     batch: tuple[int, ...]

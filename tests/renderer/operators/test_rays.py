@@ -21,11 +21,9 @@ SAMPLES = 8
 
 
 def starts_of_rays(sample_count: int) -> Tensor:
-    """Cast rays from a floor beside a higher square, with some samples in each pixel.
+    """Return the sample of its pixel (pixels, DIRECTIONS) from which each ray starts.
 
-    Returns:
-        The sample of its pixel from which each ray starts, counted from 0, shape
-        (pixels, DIRECTIONS).
+    The rays are cast from a floor beside a higher square, with some samples in each pixel.
     """
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     faces = [[0, 1, 2], [0, 2, 3]]

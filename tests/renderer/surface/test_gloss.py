@@ -91,11 +91,8 @@ def dielectric_fresnel(cosine: np.ndarray) -> np.ndarray:
 class Lobe:
     """A microfacet lobe by the appendix of glTF 2.0.
 
-    Attributes:
-        roughness: Roughness of the surface.
-        f0: Fresnel term at normal incidence. None for a dielectric with a
-            refractive index of 1.5, by Fresnel's equations.
-        f90: Fresnel term at grazing incidence.
+    f0 and f90 are Fresnel terms at normal and grazing incidence. Without f0 it is a dielectric
+    with a refractive index of 1.5, by Fresnel's equations.
     """
 
     roughness: float
@@ -103,15 +100,7 @@ class Lobe:
     f90: float = 1.0
 
     def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
-        """Evaluate the reflectance for light from unit directions.
-
-        Args:
-            cosine: Cosine of the angle between the normal +z and the camera.
-            light: Directions to the light, shape (N, 3).
-
-        Returns:
-            Reflectances, shape (N,).
-        """
+        """Evaluate the reflectance (N,) for light (N, 3), and a camera at a cosine from +z."""
         view = toward(cosine)[0].numpy()
         alpha = self.roughness**2
         half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
@@ -134,13 +123,9 @@ class Lobe:
 
 
 def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a quadrature over the directions above z = 0.
+    """Return directions (N, 3) above z = 0, and their solid angles (N,) in a quadrature.
 
-    Args:
-        rings: Number of Gauss-Legendre nodes in z.
-
-    Returns:
-        Directions, shape (N, 3), and their solid angles, shape (N,).
+    z has `rings` Gauss-Legendre nodes.
     """
     node, weight = legendre.leggauss(rings)
     z = (node[:, None] + 1) / 2
@@ -159,13 +144,10 @@ def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 
 
 def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
-    """Return a quadrature for functions that are symmetric in y.
+    """Return directions with y > 0, and twice their solid angles, for functions symmetric in y.
 
     The directions are closest together towards +x and the horizon, where the
     lobes of grazing light are narrow.
-
-    Returns:
-        Directions with y > 0, shape (N, 3), and twice their solid angles.
     """
     node, weight = legendre.leggauss(100)
     around, step = legendre.leggauss(50)
@@ -529,12 +511,9 @@ def test_a_beam_is_reflected_with_no_more_than_its_energy_and_by_varnish_with_al
 
 
 class FloorUnderSky:
-    """Zonal transfer of the floor, seen from the nodes of a quadrature over the hemisphere.
+    """Zonal transfer (views, 7) of the floor, seen from nodes of a quadrature over the hemisphere.
 
-    Attributes:
-        transfer: Radiance per unit of each zonal coefficient, shape (views, 7).
-        measure: Share of each view in the irradiance of a hemisphere, (views,).
-        harmonics: Zonal harmonics of the directions of the views, (views, 7).
+    `measure` is the share of each view in the irradiance of a hemisphere.
     """
 
     ZONAL = tuple(l * (l + 1) for l in range(7))
@@ -621,19 +600,7 @@ def mitsuba_image(
     size: int,
     emitter_samples: int,
 ) -> Tensor:
-    """Render a mesh with interpolated normals by Mitsuba, in our units.
-
-    Args:
-        mesh: The mesh.
-        surface: Mitsuba's entry of the material.
-        lights: Mitsuba's entries of the lights.
-        sample_count: Samples per pixel.
-        size: Pixels per side.
-        emitter_samples: Number of rays from a surface to lights in the scene.
-
-    Returns:
-        Image, shape (3, size, size).
-    """
+    """Render a mesh with interpolated normals by Mitsuba, in our units, shape (3, size, size)."""
     with mitsuba() as module:
         sampler = {"type": "multijitter", "sample_count": sample_count}
         sensor = sensor_of(CAMERA, size) | {"sampler": sampler}

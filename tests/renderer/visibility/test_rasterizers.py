@@ -49,12 +49,7 @@ def rasterizer(request) -> Rasterizer:
 
 
 class Scene(NamedTuple):
-    """Projected triangles.
-
-    Attributes:
-        points: Vertices as N views project them, shape (N, V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-    """
+    """Triangles (F, 3) of vertices as N views project them, shape (N, V, 3)."""
 
     points: np.ndarray
     faces: np.ndarray
@@ -118,9 +113,7 @@ def doubled_area(a: Point, b: Point, c: Point) -> int:
 class ReferenceFace:
     """Face of the reference, which computes coverage in Python's integers.
 
-    Args:
-        corners: Positions of the corners, in ascending order of their indices.
-        depths: Depths of the corners, from 0 to `FAR`.
+    Its corners are in ascending order of their indices, and depths are from 0 to `FAR`.
     """
 
     def __init__(self, corners: list[Point], depths: list[float]) -> None:
@@ -163,17 +156,7 @@ class ReferenceFace:
 
 
 def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Rasterize one view as the contract says, one sample of one face after another.
-
-    Args:
-        points: Projected vertices, shape (V, 3).
-        faces: Vertex indices of the faces, shape (F, 3).
-        resolution: Number R of samples per side.
-        closed: Whether faces that are clockwise in the image are left out.
-
-    Returns:
-        Index of the face at each sample, or -1, shape (R, R).
-    """
+    """Rasterize one view as the contract says, one sample of one face after another."""
     points = np.clip(points, -SPAN / resolution, SPAN / resolution)
     positions = []
     for x, y, _ in points.tolist():

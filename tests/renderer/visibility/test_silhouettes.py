@@ -75,16 +75,7 @@ def smooth_sums(image: Tensor) -> Tensor:
 
 
 def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor:
-    """Compute derivatives of the sums from gradients.
-
-    Args:
-        image: The image after a change.
-        directions: Changes, shape (D, ...).
-        samples: Samples per row of a pixel.
-
-    Returns:
-        Derivative of each sum along each direction, shape (D, 3).
-    """
+    """Compute the derivative of each sum along each direction from gradients, shape (D, 3)."""
     change = torch.zeros_like(directions[0]).requires_grad_()
     columns = []
     for value in smooth_sums(image(change, samples)):
@@ -293,11 +284,7 @@ def test_a_growing_pyramid_on_the_ground_gains_its_perimeter_times_the_jump_of_r
 
 
 def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
-    """Create a square of cells² cells with displaced corners, and two triangles for each cell.
-
-    Returns:
-        A tuple of the mesh and the albedo of its triangles, shape (2 cells², 3).
-    """
+    """Create cells² displaced squares, and the albedo (2 cells², 3) of their triangles."""
     # The turned square fits into the image of `FROM_ABOVE`.
     along = torch.linspace(-0.7, 0.7, cells + 1, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(along, along, indexing="ij"), dim=2)
