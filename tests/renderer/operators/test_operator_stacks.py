@@ -166,12 +166,6 @@ def test_operators_are_a_sequence():
     assert operators + others == [*operators, *others]
 
 
-def test_a_stack_of_one_operator_gives_its_image():
-    [first, *_] = scene_operators("float32")
-    light = renderer.load_light("grace")
-    assert torch.equal(TransferOperators([first]).image(light)[0], first.image(light))
-
-
 def test_operators_are_moved_to_a_device():
     operators = scene_operators("float32").to("cpu")
     images = operators.image(renderer.load_light("grace"))
@@ -189,27 +183,9 @@ def test_views_without_the_mesh_show_the_background_and_have_no_gradient():
     assert not gradient.any()
 
 
-@pytest.mark.parametrize(
-    ("shape", "per_view"), [((9, 3), False), ((49, 3), True), ((3, 49, 3), True)]
-)
-def test_lights_of_another_shape_are_refused(shape, per_view):
-    with pytest.raises(InputError, match=r"^lights"):
-        scene_operators("colors").image(draw(*shape), light_per_view=per_view)
-
-
-def test_lights_with_nan_are_refused():
-    with pytest.raises(InputError, match=r"^lights"):
-        scene_operators("colors").image(draw(49, 3) * torch.nan)
-
-
 def test_a_background_of_another_shape_is_refused():
     with pytest.raises(InputError, match=r"^background"):
         scene_operators("colors").image(draw(49, 3), torch.zeros(4, 3, SIZE, SIZE))
-
-
-def test_a_gradient_of_another_shape_is_refused():
-    with pytest.raises(InputError, match=r"^loss_gradient"):
-        scene_operators("colors").image_and_gradient(draw(49, 3), lambda images: images[0])
 
 
 def test_no_operators_and_operators_of_different_sizes_are_refused():

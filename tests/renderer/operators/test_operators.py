@@ -253,16 +253,6 @@ def test_a_change_of_an_image_does_not_change_the_next_one():
     assert operator.image(DARK, 0.25)[0, 0, 0] == 0.25
 
 
-def test_the_gradient_of_a_loss_without_autograd_is_that_of_autograd():
-    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
-    light = (0.1 * draw(49, 3).float()).requires_grad_()
-    target = torch.full((3, 4, 4), 0.4)
-    image = operator.image(light)
-    [expected] = torch.autograd.grad((image - target).square().sum(), light)
-    _, gradient = operator.image_and_gradient(light, lambda shown: 2 * (shown - target))
-    assert torch.equal(gradient, expected)
-
-
 @pytest.mark.parametrize(
     ("loss_gradient", "argument"),
     [

@@ -497,18 +497,3 @@ def test_gradients_by_single_vertices_are_differences_if_a_part_hides_another(na
         if samples * size <= FINEST:
             found = derivatives(image, directions, samples)
             assert relative_error(found, expected) < bound
-
-
-# ---------------------------------------------------------------------------- samples
-
-
-def test_outlines_take_the_samples_of_their_documented_accuracy_by_default():
-    mesh = named_mesh("pear")
-    default = rendered(mesh, FAR, 16, None)
-    assert torch.equal(default, rendered(mesh, FAR, 16, 8, silhouettes=False))
-
-
-def test_outlines_take_the_samples_that_are_given():
-    mesh = named_mesh("pear")
-    few = rendered(mesh, FAR, 16, 2)
-    assert torch.equal(few, rendered(mesh, FAR, 16, None, silhouettes=False))
