@@ -200,7 +200,7 @@ def fit_scene(
             "[0, 1], 1 where the object is"
         )
     # Arguments of `render` and `precompute_transfer` for all images that are compared.
-    options = {
+    options: dict[str, Any] = {
         "albedo_scale": albedo_scale,
         "encoding": encoding,
         "normals": normals,

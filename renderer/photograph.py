@@ -277,8 +277,8 @@ def fit_photograph(
         linear_image = window.cut(photograph, size, encoding)
         # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(mask[..., None], size, beyond=0)[0]
-        fixed = {"fov": fov, "encoding": encoding, "start": start}
-        return fit_scene(linear_image, coverage, mesh, **fixed, **options)
+        camera_options = {**options, "fov": fov, "encoding": encoding, "start": start}
+        return fit_scene(linear_image, coverage, mesh, **camera_options)
 
     # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
     # right, up and back. For the first fit, this direction is guessed.
