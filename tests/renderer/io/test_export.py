@@ -276,13 +276,6 @@ def test_a_glb_gives_back_the_gloss_if_it_is_asked_for(tmp_path, textures):
             assert_array_equal(gloss_texture, mesh.gloss_textures[texture_id])
 
 
-def test_a_glb_with_gloss_is_loaded_as_matte_by_default(tmp_path):
-    export_mesh(glossy(painted(box(), 2)), tmp_path / "mesh.glb")
-    loaded = load_mesh(tmp_path / "mesh.glb")
-    assert loaded.gloss is None
-    assert loaded.gloss_textures == ()
-
-
 def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
     """A material without factors is a rough metal. Green is roughness, and blue is metallic."""
     texels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
@@ -294,22 +287,3 @@ def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
     assert mesh.gloss.tolist() == [[1, 1, 1]]
     assert mesh.textures[0].tolist() == [[[255, 255, 255]]]
     assert_array_equal(mesh.gloss_textures[0], texels[..., 1:])
-
-
-def with_specular_texture(material: dict) -> None:
-    """Replace the specular factor of a material by a texture."""
-    material["extensions"]["KHR_materials_specular"] = {"specularTexture": {}}
-
-
-def test_a_texture_of_specular_factors_is_refused(tmp_path):
-    path = tmp_path / "mesh.glb"
-    export_mesh(glossy(box()), path)
-    content = path.read_bytes()
-    [length] = struct.unpack_from("<I", content, 12)
-    tree = read_tree(path)
-    for material in tree["materials"]:
-        with_specular_texture(material)
-    text = json.dumps(tree, separators=(",", ":")).encode().ljust(length)
-    path.write_bytes(content[:20] + text + content[20 + length :])
-    with pytest.raises(InputError, match="specular"):
-        load_mesh(path, gloss=True)

@@ -897,6 +897,7 @@ REFUSED = {
     "specular color": plain(
         extensions={"KHR_materials_specular": {"specularColorFactor": [1, 0, 0]}}
     ),
+    "color or texture": plain(extensions={"KHR_materials_specular": {"specularTexture": {}}}),
 }
 
 
