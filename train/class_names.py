@@ -1,13 +1,15 @@
 """Classes as users name them: by name, by index, or by the name of a mesh."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from augment.classifier import class_index, nearest
+from augment.classifier import Classifier, class_index, nearest
+from augment.scene.objects import name_mesh
 from augment.settings import ObjectSettings
-from renderer.errors import InputError
+from renderer.errors import InputError, as_list, describe
+from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.settings import (
     OTHER,
@@ -16,6 +18,15 @@ from train.settings import (
     label_names,
     simplified,
     solid_name,
+)
+
+# File of a mesh, solid:NAME, or the mesh itself.
+MeshSource = str | Path | Mesh
+# A mesh as an argument: alone, in a pair with its class, or as settings.
+MeshItem = MeshSource | tuple[MeshSource, str | int] | ObjectSettings
+EXPECTED = (
+    "a list of files, of solids such as 'solid:orange', of nb.Mesh, of pairs of these and a class "
+    "such as ('orange.glb', 'orange'), or of nb.ObjectSettings"
 )
 
 
@@ -164,3 +175,59 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         meshes=meshes,
         hard_negatives=negatives,
     )
+
+
+def as_mappings(
+    name: str, meshes: Sequence[MeshItem], classifier: Classifier
+) -> list[dict[str, Any]]:
+    """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
+
+    A mapping has a "label" if the class is given.
+    """
+    kinds = MeshSource | tuple | list | ObjectSettings
+    mappings = []
+    for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
+        mapping: dict[str, Any]
+        if isinstance(item, ObjectSettings):
+            mapping = asdict(item)
+        elif isinstance(item, MeshSource):
+            mapping = {"mesh": _name(item)}
+        elif len(item) == 2 and isinstance(item[0], MeshSource):
+            source, label = item
+            mapping = {"mesh": _name(source), "label": label}
+        else:
+            raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
+        if mapping.get("label", "") != "":
+            mapping["label"] = classifier.classes[classifier.label(mapping["label"])]
+        mappings.append(mapping)
+    return mappings
+
+
+def _name(source: MeshSource) -> str:
+    """Return the text that names a mesh in settings: its file, its solid, or a name in memory."""
+    return name_mesh(source) if isinstance(source, Mesh) else str(source)
+
+
+def find_positive_classes(
+    label: str | int | None,
+    meshes: Sequence[MeshItem],
+    mappings: Sequence[dict[str, Any]],
+    classifier: Classifier,
+) -> list[str]:
+    """Return the names of the classes that the meshes of a caller show.
+
+    Without a label, each class of the meshes is listed once, in their order. `mappings` come from
+    `as_mappings`.
+    """
+    if label is not None:
+        return [classifier.classes[classifier.label(label)]]
+    for index, item in enumerate(meshes):
+        if isinstance(item, Mesh):
+            name = classifier.classes[0]
+            raise InputError(
+                f"meshes[{index}] is an nb.Mesh without a class: give it in a pair, such as "
+                f"(mesh, {name!r}), or give label={name!r}"
+            )
+    names = classes_of_meshes(mappings, classifier.classes, "meshes")
+    # A dictionary has each name once, in the order of the meshes.
+    return list(dict.fromkeys(names))

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, as_folder, single_line
 from renderer.io.files import remove_unfinished
 
 # Name of the file in a folder that a process locks while it writes to the folder.
@@ -162,3 +163,16 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
     if before == 1:
         return None
     return (diagnostics[f"{prefix}attack_success"] - before) / (1 - before)
+
+
+@contextmanager
+def folder_or_temporary(out: str | Path | None) -> Iterator[Path]:
+    """Yield a folder for files: the folder of the caller, or a temporary folder.
+
+    A temporary folder is removed at the end of the block.
+    """
+    if out is not None:
+        yield as_folder("out", out)
+        return
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        yield Path(folder)

@@ -19,14 +19,10 @@ from renderer.errors import InputError, as_list
 from train.auditing.audit import run_audit
 from train.auditing.network import AuditReport
 from train.auditing.remedies import CLASSIFIER, HARDENED
+from train.class_names import MeshItem, as_mappings, find_positive_classes
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.commands.arguments import (
-    MeshItem,
-    as_mappings,
-    find_positive_classes,
-    folder_or_temporary,
-)
 from train.results.overwrite import require_replaceable
+from train.run_folder import folder_or_temporary
 
 
 def run(settings: AuditSettings) -> None:

@@ -26,17 +26,17 @@ from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings
 from train import console
 from train.__main__ import main
-from train.class_names import require_others, with_class_names
-from train.cli import read_settings
-from train.commands.arguments import (
+from train.class_names import (
     MeshItem,
     as_mappings,
     find_positive_classes,
-    folder_or_temporary,
+    require_others,
+    with_class_names,
 )
+from train.cli import read_settings
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
-from train.run_folder import sole_writer
+from train.run_folder import folder_or_temporary, sole_writer
 from train.settings import (
     OTHER,
     DataSettings,
