@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 
 from augment.projected_light import (
@@ -13,8 +12,7 @@ from augment.projected_light import (
     relight_photographs,
 )
 from augment.random_streams import generator
-from augment.scene.patterns import draw_cells, draw_slides
-from renderer.errors import InputError
+from augment.scene.patterns import draw_cells
 from renderer.image import LUMINANCE, encode
 
 SIZE = 12
@@ -103,14 +101,6 @@ def test_shading_is_the_cosine_between_normal_and_light():
     assert math.cos(math.radians(60)) < float(shading.mean()) < 1
 
 
-def test_slides_are_light_between_black_and_white():
-    slides = draw_slides(40, SIZE, generator(0), random_photographs())
-    assert slides.shape == (40, 3, SIZE, SIZE)
-    assert slides.min() >= 0
-    assert slides.max() <= 1
-    assert len({tuple(slide.flatten().tolist()) for slide in slides}) == 40
-
-
 def test_each_pixel_of_a_slide_of_cells_has_the_color_of_the_nearest_point():
     from scipy.spatial import cKDTree
 
@@ -135,12 +125,3 @@ def test_relit_photographs_repeat_with_their_seed():
     assert first.dtype == torch.uint8
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-
-
-@pytest.mark.parametrize(
-    "photographs",
-    [torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 9, dtype=torch.uint8), [1]],
-)
-def test_photographs_of_another_kind_are_an_error(photographs):
-    with pytest.raises(InputError, match="photographs"):
-        relight_photographs(photographs)

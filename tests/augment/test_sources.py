@@ -10,27 +10,23 @@ from urllib.error import URLError
 import numpy as np
 import pytest
 import torch
-import torchvision
 from PIL import Image, ImageOps
 from torch import nn
 from torchvision.models import (
     get_model,
     get_model_weights,
-    list_models,
     squeezenet1_0,
     squeezenet1_1,
 )
 
 from augment.classifier import Classifier
-from augment.sources import imagenet_classes, load_classifier, published_weights
+from augment.sources import imagenet_classes, load_classifier
 from renderer.errors import InputError
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 CLASSES = imagenet_classes()
-EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps
 LITE_SIZES = {0: 224, 2: 260}
-COLORS = ("red", "green", "blue")
 
 
 def random_images(size: int, count: int = 2) -> torch.Tensor:
@@ -181,35 +177,6 @@ def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_downloa
         torch.testing.assert_close(logits, expected, rtol=0, atol=rounding)
         assert classifier.name == name
         assert classifier.classes == CLASSES
-
-
-MODELS = list_models(module=torchvision.models)
-
-
-def test_every_published_set_of_weights_is_found_by_its_files_name():
-    """Weights for detectors have no classes, and are replaced by the default."""
-    assert len(MODELS) >= 80
-    for model in MODELS:
-        default = get_model_weights(model).DEFAULT
-        for weights in get_model_weights(model):
-            chosen = published_weights(model, Path("folder") / file_name(weights))
-            has_classes = weights.meta["categories"] is not None
-            assert chosen is (weights if has_classes else default)
-            assert tuple(chosen.meta["categories"]) == CLASSES
-            assert len(chosen.transforms().crop_size) == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("resnet18", "name=resnet18"),
-        ("torchvision:resnet102", "such as resnet1"),
-        ("squeezenet_caffe", "weights=FILE"),
-    ],
-)
-def test_an_unknown_classifier_is_refused(name, message):
-    with pytest.raises(InputError, match=re.escape(message)):
-        load_classifier(name)
 
 
 class Harmful:

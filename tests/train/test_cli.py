@@ -23,7 +23,7 @@ from train.commands.experiment import logged_to
 from train.data.cache import content_hash
 from train.run_folder import LAST, locked
 from train.system import take_flag
-from train.user_errors import user_message, writable_folder
+from train.user_errors import writable_folder
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -262,20 +262,6 @@ def test_a_warning_of_a_library_is_one_line_of_a_command():
     assert ended.stderr == "warning: clamped\n"
 
 
-def test_a_current_folder_that_was_deleted_is_one_line_of_a_command(tmp_path):
-    code = "import os, scripts.compare as c; os.mkdir(name := os.environ['GONE']); os.chdir(name)"
-    code += "; os.rmdir(name); c.main()"
-    ended = run_python(f"import os; os.environ['GONE'] = {str(tmp_path / 'gone')!r}; {code}")
-    assert ended.returncode == USER_ERROR
-    assert ended.stderr.startswith("error: the current folder cannot be used")
-    assert ended.stderr.count("\n") == 1
-
-
-def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), COMPARE.handle_errors():
-        raise ZeroDivisionError
-
-
 def interrupt() -> None:
     raise KeyboardInterrupt
 
@@ -329,31 +315,6 @@ def test_a_closed_output_pipe_ends_a_command_silently(capsys, monkeypatch):
         assert stop.value.code == 128 + signal.SIGPIPE
         print("text that Python writes at its end", flush=True)
     assert capsys.readouterr().err == ""
-
-
-FULL_DISK = OSError(28, "No space left on device")
-FULL_DISK_OF_FILE = OSError(28, "No space left", "/a/b")
-NOT_PERMITTED = PermissionError(13, "Permission denied", "/a/b")
-CLOSED_CONNECTION = RuntimeError("[/gloo/x.cc:1] Connection closed by peer")
-
-
-@pytest.mark.parametrize(
-    ("error", "start"),
-    [
-        (NOT_PERMITTED, "/a/b cannot be read or written: Permission denied"),
-        (FULL_DISK, "the output cannot be written"),
-        (FULL_DISK_OF_FILE, "/a/b cannot be written"),
-        (CLOSED_CONNECTION, "another process of this run has ended"),
-        (torch.distributed.DistBackendError("NCCL"), "another process of this run has ended"),
-        (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), r"'a\udcffb'"),
-        (torch.OutOfMemoryError("x"), "memory ran out"),
-        (RuntimeError("can't allocate memory"), "memory ran out"),
-    ],
-)
-def test_an_error_is_one_sentence_if_the_user_can_fix_it(error, start):
-    sentence = user_message(error)
-    assert sentence.startswith(start)
-    assert "\n" not in sentence
 
 
 def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):

@@ -14,7 +14,6 @@ from train.networks import Dropout, WideResNet, build_network, describe
 from train.run_folder import BEST, PUBLISHED
 from train.training.initial import Initial
 
-PRETRAINED = Path(__file__).parents[2] / "pretrained"
 CLASSES = ("apple", "orange", "pear")
 MEAN = (0.4, 0.5, 0.6)
 STD = (0.2, 0.3, 0.25)
@@ -231,16 +230,6 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
     assert all(parameter.requires_grad for parameter in built.parameters())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [("vit_b_32", 64), ("inception_v3", 96), ("googlenet", 64)],
-)
-def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
-    network = build_network(CLASSES, size, f"torchvision:{name}").train()
-    assert network(torch.rand(2, 3, size, size)).shape == (2, 3)
-
-
 @pytest.mark.parametrize(
     ("name", "size", "message"),
     [
@@ -377,17 +366,7 @@ class TestANetworkThatIsPartOfThePackage:
     def test_is_found_from_any_folder(self, tmp_path, name):
         assert load_run(name).name == f"run:{name}"
 
-    def test_has_an_operating_point(self, tmp_path):
-        (point,) = load_run("pretrained/best").operating_points
-        assert point.false_positive_rate == 0.05
-
     def test_gives_way_to_a_folder_of_the_same_name(self, tmp_path):
         (tmp_path / "pretrained" / "none").mkdir(parents=True)
         with pytest.raises(InputError, match=r"run=pretrained/none holds neither"):
             load_run("pretrained/none")
-
-
-def test_the_folder_of_a_run_is_no_name_of_a_classifier(finished):
-    for path in (finished, finished / "weights.pt"):
-        with pytest.raises(InputError, match=f"give name=run:{finished}"):
-            load_network(str(path))

@@ -1,20 +1,15 @@
 """A run's folder, also where others write to it or have damaged its files."""
 
-import io
 import itertools
 import os
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from augment.service import AttackExamples
 from renderer.errors import InputError
-from renderer.light.basis import HARMONICS
 from train import fingerprints
 from train.cli import read_settings
 from train.command_settings import AuditSettings
@@ -227,45 +222,6 @@ def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
     board = EventAccumulator(str(tmp_path)).Reload()
     assert [event.step for event in board.Scalars("train/loss")] == [1, 2, 3]
     assert [(event.step, event.value) for event in board.Scalars("test/accuracy")] == [(4, 0.25)]
-
-
-def test_tensorboard_shows_the_renders(tmp_path):
-    renders = torch.rand(5, 3, 16, 16)
-    log = RunLog(tmp_path)
-    log.renders(renders, epoch=2)
-    log.scalars({"train/loss": 0.25}, epoch=2)
-    (image,) = EventAccumulator(str(tmp_path)).Reload().Images("renders")
-    with Image.open(tmp_path / "renders" / "epoch_002.png") as grid:
-        pixels = np.asarray(grid)
-    assert image.step == 2
-    assert np.array_equal(Image.open(io.BytesIO(image.encoded_image_string)), pixels)
-    assert pixels.shape == (18, 5 * 17 + 1, 3)
-    for number, render in enumerate(renders):
-        tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
-        np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
-
-
-def resize_to_128(image: np.ndarray) -> np.ndarray:
-    """Average squares of 4 × 4 pixels of a large image, or repeat each pixel of a small one."""
-    if len(image) == 512:
-        return image.reshape(128, 4, 128, 4, 3).mean((1, 3))
-    return image.repeat(8, 0).repeat(8, 1)
-
-
-@pytest.mark.parametrize("side", [16, 512])
-def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_path, side):
-    images = torch.rand(2, 3, 3, side, side)
-    predictions = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, 3, 2)
-    lights = torch.rand(2, 3, HARMONICS.size, 3)
-    examples = AttackExamples(images, lights, predictions, torch.tensor([0, 1, -1]))
-    RunLog(tmp_path).attack_examples(examples, ["apple", "orange"], epoch=2)
-    sheet = np.asarray(Image.open(tmp_path / "renders" / "attacks_002.png")).astype(int)
-    for image in images.flatten(0, 1):
-        shown = resize_to_128(image.numpy().transpose(1, 2, 0))
-        corners = np.argwhere((abs(sheet - 255 * shown[0, 0]) < 1).all(2))
-        windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
-        windows = [window for window in windows if window.shape == shown.shape]
-        assert any((abs(window - 255 * shown) < 1).all() for window in windows)
 
 
 def test_attack_success_is_the_fraction_of_the_clean_correct_examples():

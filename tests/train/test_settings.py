@@ -13,8 +13,7 @@ from scripts.attack import main as attack_command
 from scripts.evaluate import main as evaluate_command
 from tests.runs import loaded_run
 from train.__main__ import main as train_command
-from train.cli import Command, as_override, quoted
-from train.data.batches import rounds_of_epoch
+from train.cli import as_override, quoted
 from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "out=here"]
@@ -36,11 +35,6 @@ def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
         train_command.read([f"experiment={experiment}", *OTHER_DATA])
 
 
-def test_an_experiment_that_fine_tunes_takes_random_weights_if_the_settings_say_so():
-    settings = train_command.read(["experiment=harden", "network=null", "out=here"])
-    assert settings.network is None
-
-
 def test_a_classifier_of_another_library_needs_no_class_but_the_label():
     files = ["network=b", "out=a", "unlabeled=c"]
     settings = train_command.read(["experiment=classifier", "label=mug", *files])
@@ -57,22 +51,6 @@ def test_a_solid_of_the_label_is_no_hard_negative_unless_it_is_of_another_class(
         label=label, hard_negatives=negatives, scene=scene, augment=augment
     )
     assert settings.hard_negatives == negatives[2:]
-
-
-def test_the_demonstration_has_one_epoch_of_three_rounds():
-    settings = train_command.read(["out=here", "label=orange"])
-    image_count = round(0.9 * 10 * settings.data.train_per_class)
-    rounds = rounds_of_epoch(
-        image_count,
-        settings.augment.examples,
-        seed=0,
-        epoch=0,
-        images_per_epoch=settings.train.images_per_epoch,
-        images_per_round=settings.augment.regenerate_every,
-    )
-    assert settings.train.epochs == 1
-    # A round has 120 images and 480 renders.
-    assert [len(part.rows) for part in rounds] == [600] * 3
 
 
 def attacked_parameters(*overrides: str) -> dict:
@@ -265,28 +243,3 @@ def test_a_name_that_is_no_text_to_hydra_is_quoted(argument, override):
 )
 def test_other_arguments_are_overrides_as_they_are(argument):
     assert as_override(argument, KEYS) == argument
-
-
-def samples_of(command: Command, *overrides: str) -> int:
-    return command.read(overrides).renderer.image(8).samples
-
-
-@pytest.mark.parametrize(
-    ("overrides", "samples"),
-    [
-        (["attack=lighting"], 2),
-        (["attack=pose"], 8),
-        (["attack=geometry", "renderer.silhouettes=true"], 8),
-        (["attack=pose", "renderer.samples=4"], 4),
-    ],
-)
-def test_attacks_that_need_outlines_take_the_samples_of_their_documented_accuracy(
-    overrides,
-    samples,
-):
-    assert samples_of(attack_command, "meshes=[solid:orange]", *overrides) == samples
-
-
-def test_training_with_outlines_takes_the_samples_of_their_documented_accuracy():
-    outlines = "renderer.silhouettes=true", "renderer.samples=null"
-    assert samples_of(train_command, "out=here", *outlines) == 8

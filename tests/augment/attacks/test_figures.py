@@ -85,12 +85,6 @@ def test_wrong_animations_are_refused(result, tmp_path, name, arguments):
         result.save_animation(**{"path": tmp_path / "attack.gif"} | arguments)
 
 
-@pytest.mark.parametrize(("example", "view"), [(2, 0), (-1, 0), (0, 1), (0.5, 0)])
-def test_an_index_that_does_not_exist_is_refused(result, example, view):
-    with pytest.raises(renderer.InputError):
-        result.plot(example, view)
-
-
 def test_a_plot_shows_an_example_that_was_correct_and_is_fooled_with_its_true_class():
     """The first example is wrong before the attack, and the second one is not fooled."""
     names = ["orange", *(f"other {index}" for index in range(9))]

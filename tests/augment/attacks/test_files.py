@@ -12,7 +12,7 @@ import torch
 import augment
 from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.checks import warnings
-from augment.attacks.files import LINES, SIDE, _captions, figure
+from augment.attacks.files import LINES, SIDE, figure
 from augment.attacks.result import AttackResult
 from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.io.meshes import load_mesh
@@ -295,12 +295,6 @@ def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(r
     for image in expected / 255:
         [(_, column)] = places_of(sheet, image)
         assert column == MARGIN + 2 * COLUMN_WIDTH
-
-
-def test_captions_are_the_predicted_class_and_the_right_one_if_it_is_another(result):
-    probabilities = torch.tensor([[0.123, 0.0004, 0.8766, 1e-6], [0.85, 0.1, 0.05, 1e-6]])
-    captions = _captions(result, probabilities.log()[None], 0)
-    assert captions == [("87.7% sky", "12.3% orange"), ("85.0% orange",)]
 
 
 def test_the_light_is_shown_if_the_attack_has_changed_it(attacked, result):

@@ -522,12 +522,3 @@ def test_the_model_and_the_random_state_are_left_as_they_were(fails_at, grad_mod
     torch.testing.assert_close(after, before, rtol=0, atol=0)
     assert model.training
     assert not model.network[1].training
-
-
-def test_the_start_is_not_written_to():
-    start = random(1, VALUE_COUNT, seed=2)
-    shared = start.expand(4, VALUE_COUNT)  # All four rows lie in one place in memory.
-    result = attack(Linear(), LinearScene(shared, StepSettings(step_size=0.3)), torch.arange(4) % 2)
-    assert torch.equal(start, random(1, VALUE_COUNT, seed=2))
-    assert not result.values.requires_grad
-    assert not result.images.requires_grad

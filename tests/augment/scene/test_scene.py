@@ -23,12 +23,9 @@ from augment.scene.render import NEAR
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
-from renderer.errors import InputError
 from renderer.io.images import gray_or_image
-from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
 from renderer.light.presets import ambient, probe
-from renderer.light.ringing import required_degree
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
@@ -76,20 +73,6 @@ def test_views_follow_from_examples_meshes_and_backgrounds(
     expected,
 ):
     assert count_views(examples, meshes, backgrounds, views) == expected
-
-
-@pytest.mark.parametrize(
-    ("examples", "meshes", "backgrounds", "views"),
-    [(100, 3, 5, None), (None, 2, 5, None), (100, 2, 5, 9), (100, 0, 5, None)],
-)
-def test_numbers_of_examples_and_views_that_do_not_fit_are_refused(
-    examples,
-    meshes,
-    backgrounds,
-    views,
-):
-    with pytest.raises(InputError, match=r"^examples=|must not be empty"):
-        count_views(examples, meshes, backgrounds, views)
 
 
 def test_a_scene_takes_paths_as_text_and_as_path(tmp_path):
@@ -140,33 +123,6 @@ def glossy(map_options) -> Scene:
     """Return a scene with a matte and a shiny example."""
     with pytest.warns(UserWarning, match="gloss of roughness 0.35, which takes light of degree 12"):
         return build_scene([MATTE, SHINY], 16, **map_options)
-
-
-# A lower degree would show rings, of which a warning tells.
-@pytest.mark.filterwarnings("ignore")
-def test_light_has_the_degree_of_the_smoothest_part_of_a_gloss_texture():
-    """Half of the texture is rough."""
-    pear = renderer.solid("pear")
-    face_count = len(pear.faces)
-    gloss = np.tile(np.float32([1.0, 0.0, 1.0]), (face_count, 1))
-    texels = np.full((8, 8, 2), 255, np.uint8)
-    texels[:4, :, 0] = 96
-    textured = replace(
-        pear,
-        corner_uvs=np.zeros((face_count, 3, 2), np.float32),
-        texture_ids=np.zeros(face_count, np.int32),
-        textures=(np.full((8, 8, 3), 255, np.uint8),),
-        gloss=gloss,
-        gloss_textures=(texels,),
-    )
-    scene = build_scene([(textured, "pear")], 8, 1, rasterizer="numpy", samples=1)
-    assert scene.basis == Harmonics(required_degree(96 / 255))
-    assert scene.basis.degree > 6
-
-
-def test_a_scene_has_the_degree_of_its_smoothest_object(glossy, map_options):
-    assert glossy.basis == Harmonics(required_degree(0.35)) == Harmonics(12)
-    assert build_scene([MATTE], 16, **map_options).basis == Harmonics(6)
 
 
 def test_light_of_a_higher_degree_shows_the_image_of_the_renderer(glossy, map_options):
@@ -322,52 +278,6 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
     for change in ({}, unmoved, unpainted):
         images = scene.render(Conditions(lights, **change), rows)[:, 0]
         torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)
-
-
-def orange_on(
-    ground: tuple[float, ...] | None,
-    shadows: bool = True,
-    bounces: int = 0,
-) -> torch.Tensor:
-    """Render an orange, on a table of a color or alone."""
-    scene = build_scene(
-        [("solid:orange", "orange")],
-        size=16,
-        views=1,
-        light="st_peters",
-        exposure=0.2,
-        backgrounds=[0.0],
-        width=3.0,
-        shadows=shadows,
-        bounces=bounces,
-        ground=ground,
-        rasterizer="numpy",
-    )
-    return first_image(scene)
-
-
-GREEN = (0.1, 0.8, 0.1)
-
-
-def test_the_object_darkens_a_part_of_its_table():
-    is_object = orange_on(None, shadows=False).sum(0) > 0
-    unshadowed = orange_on(GREEN, shadows=False)
-    shadowed = orange_on(GREEN)
-    is_table = (unshadowed.sum(0) > 0) & ~is_object
-    kept = (shadowed / unshadowed)[1, is_table]
-    assert kept.min() < 0.3
-    assert kept.max() > 0.8
-    assert (shadowed <= unshadowed + 0.02 * unshadowed.max()).all()
-
-
-def test_a_green_table_reflects_mostly_green_light_onto_the_object():
-    is_object = orange_on(None, shadows=False).sum(0) > 0
-    shadowed = orange_on(GREEN)
-    lit = orange_on(GREEN, bounces=2)
-    red, green, blue = ((lit - shadowed) / shadowed)[:, is_object].mean(1)
-    assert red > 0
-    assert green > 3 * red
-    assert green > 3 * blue
 
 
 def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small_ones():

@@ -11,7 +11,6 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment.attacks.attack import ZERO_GRADIENT
 from renderer.io.meshes import load_mesh
 from renderer.light.presets import load_light
 from train.cli import USER_ERROR
@@ -258,19 +257,3 @@ def test_a_mistake_is_an_error_in_one_line(run, tmp_path, capsys, arguments, mes
     assert printed.err.count("\n") == 1
     assert message in printed.err
     assert not (tmp_path / "out").exists()
-
-
-def test_a_zero_gradient_is_said_once_for_each_mesh(run, tmp_path, capsys):
-    (tmp_path / "constant_network.py").write_text(
-        "import torch\n"
-        "def load():\n"
-        "    def constant(images):\n"
-        "        nothing = 0 * images.mean((1, 2, 3))\n"
-        "        return torch.stack([nothing + 2, nothing], dim=1)\n"
-        "    return constant, 8, ['orange', 'apple']\n"
-    )
-    meshes = "meshes=['solid:orange:0','solid:apple:0']"
-    network = "network=python:constant_network:load"
-    assert run("attack=skylight", meshes, network, "attack.verify=null") == 0
-    captured = capsys.readouterr()
-    assert (captured.out + captured.err).count(ZERO_GRADIENT) == 2

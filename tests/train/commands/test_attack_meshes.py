@@ -17,7 +17,6 @@ from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
 from train.commands.attack import attacks, overrides
-from train.results.attack_tables import format_attack
 
 
 def configured(*arguments: str) -> AttackExperimentSettings:
@@ -156,29 +155,10 @@ def test_bad_input_is_refused_in_one_sentence(arguments, message):
     assert "\n" not in str(refused.value)
 
 
-def test_success_is_printed_for_examples_and_for_their_views():
-    """Attack two views in one light, with the targets green and blue.
-
-    No light makes both images right, so that at most one view succeeds.
-    """
-    shared = "scene.views=2", "attack.shared=true"
-    result = attacked("target=[lime,sky]", *shared, "attack.margin=0.5")
-    (text,) = format_attack("mesh", result, None)
-    assert text.startswith("mesh: lighting against by_color: ")
-    assert f"{int(result.success)} of 1 [" in text
-    assert f", {int(result.success_in_views.sum())} of 2 views" in text
-    with_margin = int(result.success_with_margin)
-    assert f", {with_margin} with the margin of {result.settings.margin:g}" in text
-
-
 class TestExamplesThatWereWrongBefore:
     @pytest.fixture
     def result(self) -> AttackResult:
         return attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
-
-    def test_are_no_successes_in_the_text(self, result):
-        (text,) = format_attack("mesh", result, None)
-        assert "none of 2 examples was correct before" in text
 
     def test_are_no_successes_in_the_checks(self, result):
         checks = check(result)

@@ -71,16 +71,6 @@ def test_nothing_is_written_without_a_folder(options, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_mesh_without_a_class_needs_a_label(options):
-    with pytest.raises(nb.InputError, match="label"):
-        nb.audit(Brightness().eval(), ["solid:lemon"], **options)
-
-
-def test_a_class_that_the_network_lacks_is_refused_with_the_nearest(options):
-    with pytest.raises(nb.InputError, match="orange"):
-        nb.audit(Brightness().eval(), ["solid:orange"], label="ornage", **options)
-
-
 def test_a_hard_negative_of_the_class_itself_is_refused(options):
     negatives = ["solid:apple", "solid:orange:1"]
     options |= {"laboratory": None}

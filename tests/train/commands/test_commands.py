@@ -226,25 +226,6 @@ def photographed_cup(here) -> Path:
     return here
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["mask=small.png"], "mask=small.png has 9 × 9 pixels"),
-        (["mask=black.png"], "all of its pixels have the value 0"),
-        (["mask=none.png"], "none.png does not exist"),
-        ([], "mask=FILE or box="),
-    ],
-)
-def test_a_fit_without_a_usable_mask_is_refused(call, photographed_cup, capsys, arguments, message):
-    half = np.zeros((9, 9), np.uint8)
-    half[:5] = 255
-    Image.fromarray(half).save(photographed_cup / "small.png")
-    Image.new("L", (192, 192)).save(photographed_cup / "black.png")
-    assert call(*FIT, *arguments) == USER_ERROR
-    assert message in capsys.readouterr().err
-    assert not (photographed_cup / "fitted").exists()
-
-
 @pytest.mark.slow
 def test_a_scene_that_was_fitted_is_rendered_and_scored_as_it_was_photographed(
     call,

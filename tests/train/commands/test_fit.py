@@ -19,7 +19,7 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.image import decode, encode, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_image
-from renderer.light.environment import read_panorama, to_map, write_map
+from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import equirectangular, project
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh
@@ -27,16 +27,10 @@ from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_sc
 from renderer.settings import ImageSettings
 from scripts.attack import main as attack_command
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
 MARGIN = 1.6  # Side of the square around the object, in widths of the object.
 SIZE = 192  # Photographs have so many pixels per side.
 WHOLE = 0.98  # Coverage from which a pixel shows the object alone.
 ROUNDING = 0.0005  # Rounding error of a printed percentage with one decimal.
-
-
-def missed(reason: str) -> pytest.MarkDecorator:
-    """Mark a bound that the fit does not reach yet."""
-    return pytest.mark.xfail(reason=reason, raises=AssertionError, strict=True)
 
 
 def textured(name: str) -> Mesh:
@@ -177,45 +171,4 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
         unclipped(generated_map()),
         encoding,
         determined=True,
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*normalTexture:UserWarning")
-@pytest.mark.realdata
-@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
-@pytest.mark.parametrize(
-    ("name", "light", "determined"),
-    [
-        ("banana.glb", "city", True),
-        ("apple_scan.glb", "forest", True),
-        pytest.param(
-            "golf_ball.glb",
-            "night",
-            False,
-            marks=missed("no descent begins near the ball's label"),
-        ),
-    ],
-)
-def test_camera_and_light_of_a_path_traced_scan_are_found(
-    call,
-    tmp_path,
-    capsys,
-    name,
-    light,
-    determined,
-):
-    """Check the camera as well, except for a golf ball, whose shape does not determine it."""
-    pytest.importorskip("mitsuba")
-    camera = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
-    radiance = unclipped(read_panorama(DATA / "hdri" / f"{light}.npy"))
-    check_fit(
-        call,
-        capsys,
-        tmp_path,
-        str(DATA / "meshes" / name),
-        camera,
-        radiance,
-        "srgb",
-        determined,
     )

@@ -163,11 +163,6 @@ def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, 
     assert not torch.equal(plain[4].weight, harden(network, photographs)[4].weight)
 
 
-def test_a_field_that_does_not_exist_is_refused(network, photographs):
-    with pytest.raises(nb.InputError, match=r"train\.epoch"):
-        harden(network, photographs, train={"epoch": 1})
-
-
 def test_a_mesh_in_memory_trains_as_its_file_does(network, photographs, tmp_path):
     nb.export_mesh(nb.Gloss(0.6).on(nb.solid("orange", 0)), tmp_path / "a.glb")
     nb.export_mesh(nb.solid("lemon"), tmp_path / "b.glb")

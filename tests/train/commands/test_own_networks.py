@@ -1,7 +1,6 @@
 """The commands with a user's own network of ten classes, as it was trained and saved elsewhere."""
 
 import argparse
-import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +27,6 @@ from tests.train.own_networks import (
     trained_weights,
 )
 from train.__main__ import main as train_command
-from train.auditing import audit
 from train.checkpoints import load_run
 from train.networks import build_network
 from train.training.initial import load_initial
@@ -129,22 +127,6 @@ def test_an_attack_finds_the_class_by_its_name_or_index(call, here):
         assert call("attack", *OWN, *words, *scene) == 0
         (line,) = (here / str(label) / "0_solid_orange_0" / "attack.jsonl").read_text().splitlines()
         assert json.loads(line)["label"] == ["Orange"]
-
-
-@pytest.mark.slow
-def test_an_audit_of_one_mesh_finds_its_class_and_has_hard_negatives(
-    call, here, monkeypatch, caplog
-):
-    pytest.importorskip("mitsuba")
-    monkeypatch.setattr(audit, "SPP", 1)
-    assert (
-        call("audit", *OWN, "meshes=solid:orange", "environments=[]", "budget=0.01", "out=audit")
-        == 0
-    )
-    assert "hard_negatives is empty" in caplog.text
-    with (here / "audit" / "classifier" / "laboratory" / "predictions.csv").open() as file:
-        labels = {row["label"] for row in csv.DictReader(file)}
-    assert "Orange" in labels and len(labels) > 1
 
 
 def test_photographs_are_scored_in_the_users_classes(call, here):

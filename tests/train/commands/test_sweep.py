@@ -308,30 +308,6 @@ def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
         )
 
 
-@pytest.mark.slow
-def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    folder = tmp_path / "sweep"
-    process = start_sweep(
-        folder,
-        f"data.path={tiny_npz}",
-        "train.learning_rate=0.05,-1",
-        "launcher=joblib",
-        "hydra.launcher.n_jobs=2",
-    )
-    assert process.wait(300) == 1
-    printed = (tmp_path / "output.txt").read_text()
-    assert "Traceback" not in printed
-    good = folder_of(folder, "train.learning_rate=0.05")
-    bad = folder_of(folder, "train.learning_rate=-1")
-    (table,) = read_markdown(printed).values()
-    assert [row[0] for row in table] == ["network", "none"]
-    assert f"{bad}: failed: {(bad / FAILURE).read_text()}" in printed
-    first_run = [line for line in printed.splitlines() if line.startswith("#0 ")]
-    log = (good / "train.log").read_text().splitlines()
-    assert [line.removeprefix("#0 ") for line in first_run] == log
-
-
 def child_of(process_id: int) -> int:
     """Return the id of the only child of a process."""
     return int(Path(f"/proc/{process_id}/task/{process_id}/children").read_text())

@@ -1,7 +1,6 @@
 """The folder of the laboratory, its random draws, and its photographs against closed forms."""
 
 import csv
-import json
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -94,12 +93,6 @@ class TestALaboratory:
         _, images, _ = load_photographs(laboratory, photographs, 8)
         assert len(images.unique(dim=0)) == 8
 
-    def test_records_its_settings(self, laboratory):
-        described = json.loads((laboratory / "lab.json").read_text())
-        assert described["meshes"] == MESHES
-        assert described["setups"] == 4
-        assert described["seed"] == 0
-
     def test_shows_an_object_of_the_label_and_another_one_in_the_same_light(self, laboratory):
         pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}]
         for setup, source in enumerate(["stripes", "stripes", "half", "half"]):
@@ -176,13 +169,6 @@ def test_renders_that_replace_others_count_as_complete_only_at_their_end(
         lab.write_laboratory(again)
     assert not lab.is_laboratory(folder, again)
     assert not list(folder.rglob("*.json"))
-
-
-def test_a_folder_that_holds_something_is_left_alone(laboratory):
-    before = {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
-    with pytest.raises(InputError, match=r"out=.*lab .* overwrite=true"):
-        lab.write_laboratory(settings(laboratory))
-    assert before == {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
 
 
 class TestAnEnvironment:

@@ -1,6 +1,5 @@
 """The first screen shows images that only one of two networks gets right."""
 
-import json
 import re
 from pathlib import Path, PurePosixPath
 
@@ -10,14 +9,12 @@ import torch
 from PIL import Image
 
 from train.data.photo import Photograph
-from train.data.photographs import DESCRIPTION
 from train.results.compare import Difference, Evaluation
 from train.results.first_screen import (
     NETWORKS,
     Compared,
     choose_disagreements,
     compare_networks,
-    describe_place,
     gain_sentence,
 )
 from train.results.metrics import Pooled
@@ -53,14 +50,6 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
     assert [re.findall(r"\d+", title) for title in rows] == [["2", "6"], ["2", "6"]]
-
-
-@pytest.mark.parametrize(("environments", "is_named"), [([], True), (["grace.pfm"], False)])
-def test_the_patterns_are_named_if_they_are_the_only_lighting(tmp_path, environments, is_named):
-    description = {"patterns": ["rings", "text"], "environments": environments}
-    (tmp_path / DESCRIPTION).write_text(json.dumps(description))
-    place = describe_place(tmp_path, "laboratory")
-    assert ("rings" in place, "text" in place) == (is_named, is_named)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import shlex
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,9 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from renderer.errors import InputError
 from train.results.page import report_of, write_report
-from train.results.pictures import plot_curves
 from train.results.run_tables import format_comparison, format_short_comparison, format_table
 from train.results.store import summarize
 from train.run_config import write_config
@@ -168,25 +164,6 @@ def test_an_attack_is_shown_with_its_rates_and_the_outcome_of_each_example(page)
         "no success in 3 steps",
         "success only without noise in 3 steps",
     ]
-
-
-def test_a_page_shows_once_the_command_of_a_run(page):
-    command = f"<pre>cd {shlex.quote(os.getcwd())}\n{COMMAND}</pre>"
-    assert page.read_text().count(command) == 1
-
-
-def test_a_figure_is_drawn_if_a_line_has_different_points():
-    assert plot_curves({"a": [[(1, 0.5)]], "b": [[(1, 1), (2, 1)]]}, "x") is None
-    assert plot_curves({"a": [[(1, 0.5)]], "b": [[(1, 0), (2, 1)]]}, "x") is not None
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no run and no attack"):
-        write_report([tmp_path], tmp_path)
-
-
-def test_the_report_of_a_command_says_why_there_is_none(tmp_path):
-    assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
 
 
 def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_training(

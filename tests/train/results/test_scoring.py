@@ -375,10 +375,6 @@ class TestSeveralClasses:
             assert part == {name: alone[name] for name in part}
             assert {*METRICS[:2], "auc"} < {*part}
 
-    def test_are_named_in_their_order(self, summary):
-        assert summary["label"] == self.LABELS
-        assert [point["label"] for point in summary["operating_point"]] == self.LABELS
-
     def test_have_the_auc_of_all_pairs(self, summary):
         everything = pooled_auc(self.LABELS, "abcdehij")
         mesh = pooled_auc(self.LABELS, "ac")
@@ -402,15 +398,6 @@ class TestSeveralClasses:
         for name in AT_THRESHOLD:
             hits = [part[name]["hits"] for part in summary["by_label"].values()]
             assert summary[name]["hits"] == sum(hits)
-
-    def test_are_in_one_file_of_predictions(self, fruit, summary, tmp_path):
-        written = tmp_path / "both" / "predictions.csv"
-        expected = []
-        for label in ("orange", "pear"):
-            evaluate(*fruit, label, tmp_path / label)
-            expected += read_predictions(tmp_path / label / "predictions.csv", label)
-        assert read_predictions(written, ["orange", "pear"]) == expected
-        assert len(read_predictions(written, "pear")) == 10
 
 
 def test_the_score_is_the_log_odds_also_if_the_probability_rounds_to_0_or_1(known_model, tmp_path):
@@ -496,38 +483,6 @@ class TestPhotographsThatCannotBeRead:
         for text in (format_scores(scores), format_overall(scores)):
             assert "orange/broken.jpg" in text
             assert "orange/photo.HEIC" in text
-
-
-class ModeRecorder(torch.nn.Module):
-    """Apply a model, and record whether parts are in training mode and gradients are on."""
-
-    def __init__(self, model: torch.nn.Module):
-        super().__init__()
-        self.norm = torch.nn.BatchNorm2d(3)
-        self.frozen_norm = torch.nn.BatchNorm2d(3).eval()
-        self.model = model
-        self.is_training = []
-        self.has_gradients = []
-
-    def forward(self, images):
-        self.is_training.append(any(part.training for part in self.modules()))
-        self.has_gradients.append(torch.is_grad_enabled())
-        self.frozen_norm(self.norm(images))
-        return self.model(images)
-
-
-def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(fruit, tmp_path):
-    fruit_model, classes, folder = fruit
-    model = ModeRecorder(fruit_model)
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    evaluate(model, classes, folder, "orange", tmp_path)
-    assert set(model.is_training) == {False}
-    assert set(model.has_gradients) == {False}
-    assert model.training
-    assert model.norm.training
-    assert not model.frozen_norm.training
-    for name, value in model.state_dict().items():
-        assert torch.equal(value, before[name])
 
 
 @pytest.mark.parametrize(
@@ -619,12 +574,6 @@ def test_predictions_of_an_earlier_version_are_read_but_not_those_of_its_class_t
         read_predictions(tmp_path / "a.csv", "true")
 
 
-def test_predictions_of_another_class_are_refused(tmp_path):
-    write_predictions(tmp_path / "a.csv", PREDICTIONS)
-    with pytest.raises(InputError, match=r"a\.csv is not a table .* label=pear"):
-        read_predictions(tmp_path / "a.csv", "pear")
-
-
 # Colors of the frames of true positives, false negatives and false positives.
 FRAMES = [(46, 158, 91), (208, 59, 59), (232, 163, 23)]
 FRAMED = IMAGE_SIZE + 2 * FRAME_WIDTH
@@ -646,23 +595,6 @@ def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_pa
     evaluate(*fruit, "orange", tmp_path)
     with Image.open(tmp_path / "contact_sheet.png") as sheet:
         assert count_frames(sheet) == [1, 4, 2]
-
-
-def test_the_contact_sheet_shows_at_most_40_images_evenly_by_probability(known_model, tmp_path):
-    """Show 40 of 101 true positives, among them the first and the last by probability."""
-    names = [f"{index:03}.png" for index in range(101)]
-    logits = np.stack([np.arange(1, 102), np.zeros(101)], axis=1) / 20
-    evaluate(*known_model(names, logits, ["orange", "pear"]), "orange", tmp_path)
-    with Image.open(tmp_path / "contact_sheet.png") as sheet:
-        assert count_frames(sheet) == [40, 0, 0]
-        red, green, blue = np.moveaxis(np.asarray(sheet).astype(int), 2, 0)
-    # The red of an image is its number.
-    areas = np.bincount(red[(green == 0) & (blue == 0)])
-    shown = np.flatnonzero(areas >= IMAGE_SIZE**2)
-    assert len(shown) == 40
-    assert shown[0] == 0
-    assert shown[-1] == 100
-    assert set(np.diff(shown)) == {2, 3}
 
 
 def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(

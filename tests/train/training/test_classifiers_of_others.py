@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torchvision.models import get_model
 
 from augment.network import normalize_light
-from augment.plain_networks import _say_once
 from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
 from renderer.errors import InputError
@@ -124,17 +123,6 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     initial = [f"network={folder}", "weights=null"]
     continued, _ = tuned("unlabeled", *initial, ALMOST_FIXED)
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_a_run_says_the_size_of_its_images_and_that_their_normalization_is_assumed(tuned, caplog):
-    _say_once.cache_clear()
-    tuned("unlabeled", ALMOST_FIXED)
-    (line,) = [item.message for item in caplog.records if "pixels, " in item.message]
-    assert f"torchvision:{NAME}" in line
-    assert f"{SIZE} × {SIZE}" in line
-    assert "(0.485, 0.456, 0.406)" in line
-    assert "normalization is assumed" in line
-    assert "size" not in line
 
 
 class TestNormalizedLight:
@@ -258,14 +246,3 @@ class TestANetworkOfTimm:
         expected = normalized_logits(network, images, facts["mean"], facts["std"])
         classifier = load_classifier(f"timm:{self.NAME}", path)
         torch.testing.assert_close(classifier(images), expected, rtol=1e-4, atol=1e-5)
-
-    @pytest.mark.parametrize(
-        ("name", "message"),
-        [
-            ("mobilenetv3_smal_050", "choose one, such as mobilenetv3_small_050"),
-            ("tf_efficientnetv2_s.in21k", "has 21843 classes"),
-        ],
-    )
-    def test_is_refused_if_it_is_unknown_or_has_other_classes(self, path, name, message):
-        with pytest.raises(InputError, match=message):
-            load_classifier(f"timm:{name}", path)

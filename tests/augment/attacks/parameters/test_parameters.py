@@ -11,12 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from augment.attack_settings import PARAMETER_NAMES, AttackSettings, SkylightSettings, StepSettings
+from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
 from augment.attacks import norm_ball
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.parameters import make_parameter, parameter_class
-from augment.attacks.parameters.lights import LocalLight
+from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.scene import render
 from augment.scene.objects import Conditions
@@ -25,7 +24,6 @@ from renderer.camera import orbit_cameras
 from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import irradiance_error, nonzero_coefficients, project
-from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import ZENITH, coefficients
@@ -102,15 +100,6 @@ def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
 
 
 # --------------------------------------------------------------- settings and starting points
-
-
-@pytest.mark.parametrize("name", PARAMETER_NAMES)
-def test_each_field_of_the_settings_has_a_class_of_its_name_or_is_a_local_light(name):
-    kind = parameter_class(name)
-    if name in LOCAL_LIGHTS:
-        assert kind is LocalLight
-    else:
-        assert kind.name == name
 
 
 def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene):
@@ -251,28 +240,6 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     assert largest > 0.01
     found = directions @ gradient_at(weighted_sum, at)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9 * largest)
-
-
-@pytest.mark.parametrize("view", [0, 1])
-def test_vertices_that_move_along_the_view_have_the_gradient_of_new_images(make_scene, view):
-    """No outline moves then, so that every change is one of normals and nothing is kept fixed."""
-    scene = make_scene()
-    problem = problem_of(scene, **free("geometry"))
-    weights = float64_noise(3, 6, 6, draws=torch.Generator().manual_seed(2))
-    camera = scene.cameras[1][view]
-    away = torch.from_numpy(camera.axes()[2])
-    directions = torch.kron(torch.eye(12, dtype=torch.float64), away)
-
-    def weighted_sum(values: Tensor) -> Tensor:
-        example = torch.ones(len(values), dtype=torch.int64)
-        images = problem.render(values, example)[:, view]
-        return (images * weights).sum((1, 2, 3))
-
-    at = problem.start[0]
-    expected = derivatives(weighted_sum, at, directions)
-    assert expected.abs().max() > 0.01
-    found = directions @ gradient_at(weighted_sum, at)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
 # --------------------------------------------------------------- pixels
@@ -428,20 +395,6 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
         if radius is not None:
             rounding = 20 * 64 * torch.finfo(dtype).eps
             assert (norms(candidate - center, norm) <= radius + rounding).all()
-
-
-@given(start=SKY_STARTS, values=st.tuples(FINITE, FINITE, FINITE), radius=RADII)
-def test_in_a_cube_the_nearest_sky_is_that_of_each_axis(scenes_by_dtype, start, values, radius):
-    scene = scenes_by_dtype[torch.float64]
-    sky = make_parameter("skylight", scene, sky_at(start, norm="linf", radius=radius))
-    low = torch.tensor(LOWEST_SKY, dtype=torch.float64)
-    high = torch.tensor(HIGHEST_SKY, dtype=torch.float64)
-    if radius is not None:
-        low = torch.maximum(low, sky.start[0] - radius)
-        high = torch.minimum(high, sky.start[0] + radius)
-    unconstrained = torch.tensor(values, dtype=torch.float64).expand(3, 3)
-    nearest = sky.project(unconstrained, EVERY)
-    torch.testing.assert_close(nearest, unconstrained.clamp(low, high), rtol=0, atol=0)
 
 
 # --------------------------------------------------------------- light and a linear classifier
