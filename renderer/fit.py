@@ -276,7 +276,7 @@ class _LightFit(NamedTuple):
 
     residuals: Float[Tensor, " N"]
     light: Float[Tensor, "49 3"]
-    coverage: Float[Tensor, " size²"]
+    coverage: Float[Tensor, " P"]
 
 
 class _Target(NamedTuple):
@@ -286,8 +286,8 @@ class _Target(NamedTuple):
     the share of each pixel that the object covers. Meshes are rendered with `options`.
     """
 
-    image: Float[Tensor, "3 size²"]
-    mask: Float[Tensor, " size²"]
+    image: Float[Tensor, "3 P"]
+    mask: Float[Tensor, " P"]
     gray: float
     mesh: Mesh
     size: int

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,9 +27,6 @@ from renderer.errors import InputError
 from renderer.fit import FittedScene, fit_scene
 from renderer.image import decode
 from renderer.mesh import Mesh
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, UInt8
 
 Array = NDArray[Any]
 # Smallest number of samples along one side of a

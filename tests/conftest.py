@@ -13,8 +13,7 @@ import torch
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from renderer.io.mesh_file import warn_once
-from renderer.visibility.rasterizer import Rasterizer
+from tests import shapes
 
 # Property tests draw the same examples everywhere. With `-m slow`, they draw 30 times as many, and
 # others in each run.
@@ -23,7 +22,8 @@ settings.register_profile("search", max_examples=1200, deadline=None)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose how property tests draw their examples."""
+    """Choose how property tests draw their examples, and check the annotated shapes."""
+    shapes.install()
     settings.load_profile("search" if config.option.markexpr == "slow" else "same")
 
 
@@ -87,6 +87,8 @@ def no_network() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def warnings_of_this_test() -> None:
     """Forget which warnings earlier tests have shown."""
+    from renderer.io.mesh_file import warn_once
+
     warn_once.cache_clear()
 
 
@@ -119,6 +121,8 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 @pytest.fixture
 def rasterized(monkeypatch) -> list[int]:
     """Return a list that grows by the number of views with each rasterization."""
+    from renderer.visibility.rasterizer import Rasterizer
+
     view_counts = []
     rasterize = Rasterizer.rasterize
 

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -26,9 +25,6 @@ from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, selec
 from renderer.short_repr import ShortRepr
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # Smallest distance of the sides of a table from its center below the object, in world units.
 MIN_TABLE_REACH = 1.2
@@ -433,14 +429,14 @@ class Conditions(ShortRepr):
             addition of `albedo`, shape (A, F).
     """
 
-    light: Float[Tensor, "A coefficients 3"]
-    vertices: Float[Tensor, "A N 3"] | None = None
-    albedo: Float[Tensor, "A F 3"] | None = None
-    pixels: Float[Tensor, "A V 3 size size"] | None = None
-    positions: Float[Tensor, "A L 3"] | None = None
-    cameras: Float[Tensor, "A 3"] | None = None
-    gloss: Float[Tensor, "A F 3"] | Float[Tensor, "A 1 3"] | None = None
-    hue: Float[Tensor, "A F"] | None = None
+    light: Float[Tensor, "*A coefficients 3"]
+    vertices: Float[Tensor, "*A N 3"] | None = None
+    albedo: Float[Tensor, "*A F 3"] | None = None
+    pixels: Float[Tensor, "*A V 3 size size"] | None = None
+    positions: Float[Tensor, "*A L 3"] | None = None
+    cameras: Float[Tensor, "*A 3"] | None = None
+    gloss: Float[Tensor, "*A F 3"] | Float[Tensor, "*A 1 3"] | None = None
+    hue: Float[Tensor, "*A F"] | None = None
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():

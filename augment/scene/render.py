@@ -101,7 +101,7 @@ class OperatorRenderer:
     objects: Sequence[SceneObject]
     views: Sequence[tuple[int, Camera]]
     image_to_background: Int[Tensor, " N"]
-    backgrounds: Float[Tensor, "B _ size²"]
+    backgrounds: Float[Tensor, "B _ P"]
     settings: ImageSettings
     build: Callable[..., Sequence[TransferOperator]]
     attack_bytes: int = 0
@@ -223,8 +223,8 @@ class FrozenView(NamedTuple):
             computed.
     """
 
-    added_transfer: Float[Tensor, "3 K size²"]
-    albedo_sums: Float[Tensor, "3 size²"]
+    added_transfer: Float[Tensor, "3 K P"]
+    albedo_sums: Float[Tensor, "3 P"]
 
 
 class FrozenTransport:

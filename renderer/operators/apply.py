@@ -478,7 +478,7 @@ class _PreparedBackground(NamedTuple):
             the P covered pixels, shape (..., 3, P).
     """
 
-    images: Float[Tensor, "... 3 size²"]
+    images: Float[Tensor, "... 3 N"]
     term: Float[Tensor, "... 3 P"]
 
 

@@ -111,7 +111,7 @@ class TransferOperators(Sequence[TransferOperator]):
         background: float | Tensor = 0.5,
         *,
         light_per_view: bool = False,
-    ) -> Float[Tensor, "V *lights 3 size size"]:
+    ) -> Float[Tensor, "... 3 size size"]:
         """Render all V views under one or more lights.
 
         The result is differentiable with respect to the lights and the
@@ -163,7 +163,7 @@ class TransferOperators(Sequence[TransferOperator]):
         background: float | Tensor = 0.5,
         *,
         light_per_view: bool = False,
-    ) -> tuple[Float[Tensor, "V *lights 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
+    ) -> tuple[Float[Tensor, "... 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
         """Render all V views, and compute the gradient of a loss with respect to the lights.
 
         Args:

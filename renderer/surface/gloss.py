@@ -91,9 +91,9 @@ class Gloss:
         True
     """
 
-    roughness: float | Float[Tensor, ...] = 0.5
-    metallic: float | Float[Tensor, ...] = 0.0
-    specular_factor: float | Float[Tensor, ...] = 1.0
+    roughness: float | Tensor = 0.5
+    metallic: float | Tensor = 0.0
+    specular_factor: float | Tensor = 1.0
     textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:

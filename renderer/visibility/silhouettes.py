@@ -194,7 +194,7 @@ class _MovingView:
     sample_grid: Int[Tensor, "_ _"]
     uncovered_pixels: Int[Tensor, " E"]
     radiance: Float[Tensor, "3 S"]
-    background: Float[Tensor, "3 size²"]
+    background: Float[Tensor, "3 P"]
 
     def gradient_of_surfaces(
         self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]

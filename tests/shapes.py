@@ -1,0 +1,117 @@
+"""Each annotation of an array's shape is checked whenever a test calls its function.
+
+The check follows the call, so that a function which refuses a wrong shape is not disturbed.
+"""
+
+import functools
+import inspect
+import sys
+import types
+from collections.abc import Callable
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from typing import Any, Union, get_args, get_origin
+
+from jaxtyping import AbstractArray, jaxtyped
+
+PACKAGES = ("renderer", "augment", "train")
+
+
+def install() -> None:
+    """Check the functions of modules that are imported from now on."""
+    sys.meta_path.insert(0, _Finder())
+
+
+class _Finder(MetaPathFinder):
+    """Wraps the functions of each module of the packages after its import."""
+
+    def find_spec(self, name, path=None, target=None) -> ModuleSpec | None:
+        if name.partition(".")[0] not in PACKAGES:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is None or spec.loader is None or not (spec.origin or "").endswith(".py"):
+            return spec
+        execute = spec.loader.exec_module
+
+        def exec_module(module: types.ModuleType) -> None:
+            execute(module)
+            _wrap_members(module, module.__name__)
+
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
+
+
+def _wrap_members(owner: Any, module: str) -> None:
+    for name, value in list(vars(owner).items()):
+        if isinstance(value, (staticmethod, classmethod)):
+            wrapped = _checked(value.__func__)
+            if wrapped is not value.__func__:
+                setattr(owner, name, type(value)(wrapped))
+        elif isinstance(value, types.FunctionType) and value.__module__ == module:
+            wrapped = _checked(value)
+            if wrapped is not value:
+                setattr(owner, name, wrapped)
+        elif inspect.isclass(value) and value.__module__ == module and value is not owner:
+            _wrap_members(value, module)
+
+
+def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function itself if it annotates no shape."""
+    if not any(_names_shape(hint) for hint in function.__annotations__.values()):
+        return function
+    signature = inspect.signature(function)
+    is_constructor = function.__name__ == "__init__"
+
+    @functools.cache
+    def hints() -> dict[str, Any]:
+        namespace = inspect.unwrap(function).__globals__
+        return {
+            name: eval(hint, namespace) if isinstance(hint, str) else hint
+            for name, hint in function.__annotations__.items()
+            if _names_shape(hint)
+        }
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        result = function(*args, **kwargs)
+        # Tests make wrong objects on purpose: their user refuses them.
+        if is_constructor and "tests" in sys._getframe(1).f_globals["__name__"]:
+            return result
+        values = signature.bind(*args, **kwargs).arguments | {"return": result}
+        with jaxtyped("context"):
+            for name, hint in hints().items():
+                if name in values and not _holds(values[name], hint):
+                    where = f"{function.__module__}.{function.__qualname__}, {name}"
+                    raise AssertionError(
+                        f"{where}: {hint} is annotated, {_shape(values[name])} given"
+                    )
+        return result
+
+    return checked
+
+
+def _names_shape(hint: Any) -> bool:
+    text = hint if isinstance(hint, str) else repr(hint)
+    return any(
+        f"{kind}[" in text for kind in ("Float", "Int", "Integer", "Bool", "UInt8", "Num", "Shaped")
+    )
+
+
+def _holds(value: Any, hint: Any) -> bool:
+    """Compare arrays, and those of tuples; other types are left to mypy."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return any(_holds(value, part) for part in get_args(hint))
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return isinstance(value, hint)
+    if get_origin(hint) is tuple and isinstance(value, tuple) and Ellipsis not in get_args(hint):
+        return all(map(_holds, value, get_args(hint)))
+    return hint is not type(None) or value is None
+
+
+def _shape(value: Any) -> str:
+    shape = getattr(value, "shape", None)
+    return (
+        f"{type(value).__name__} {getattr(value, 'dtype', '')} {tuple(shape)}"
+        if shape is not None
+        else repr(value)[:80]
+    )
