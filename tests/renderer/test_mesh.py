@@ -105,12 +105,6 @@ def test_the_vertices_of_a_normalized_mesh_are_exact_in_float32():
     assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
 
 
-@pytest.mark.parametrize("faces", [[[0, 1, 9]], [[0, 1, -1]], np.zeros((0, 3))])
-def test_missing_faces_and_faces_of_missing_vertices_are_refused(faces):
-    with pytest.raises(InputError, match="faces"):
-        Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], faces)
-
-
 def test_a_surface_of_zero_area_cannot_be_normalized():
     with pytest.raises(InputError):
         normalize(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))

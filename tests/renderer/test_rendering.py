@@ -1,6 +1,5 @@
 """The public functions that render: images, their gradients, and what they accept."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 
 import renderer
 from renderer.errors import InputError
-from renderer.image import as_background, decode, encode
+from renderer.image import decode, encode
 from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
@@ -226,32 +225,6 @@ def test_backgrounds_are_grays_colors_and_images_of_one_view_or_all(
     beside_the_image = replace(stone, vertices=stone.vertices + 10)
     found = renderer.render(beside_the_image, CAMERAS, light, background=background, **SMALL)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("background", [-0.1, math.nan, torch.rand(2), torch.rand(3, 8, 9)])
-def test_backgrounds_of_another_shape_or_range_are_refused(background):
-    with pytest.raises(InputError, match=r"^background "):
-        as_background(background, 9, torch.zeros(1))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "name"),
-    [
-        ({"vertices": torch.zeros(4, 3)}, "vertices"),
-        ({"albedo": torch.zeros(4, 3)}, "albedo"),
-        ({"light": torch.full((49, 3), math.nan)}, "light"),
-        ({"light": torch.zeros(48, 3)}, "light"),
-        ({"cameras": []}, "cameras"),
-        ({"size": 0}, "size"),
-        ({"encoding": "jpeg"}, "encoding"),
-        ({"rasterizer": "eyes"}, "rasterizer"),
-        ({"lights": [(Projector(), torch.zeros(9, 3))]}, "lights"),
-    ],
-)
-def test_wrong_input_is_refused_by_its_name(stone, light, wrong, name):
-    right = {"mesh": stone, "cameras": CAMERAS, "light": light, **SMALL}
-    with pytest.raises(InputError, match=rf"^{name}\b"):
-        renderer.render(**right | wrong)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4])

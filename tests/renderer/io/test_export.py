@@ -16,7 +16,6 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
-from renderer.errors import InputError
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh
@@ -241,13 +240,6 @@ def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path)
     first, second = loaded.textures
     assert_array_equal(first, mesh.textures[0])
     assert_array_equal(second, mesh.textures[2])
-
-
-@pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply", "folder.glb"])
-def test_a_path_that_cannot_be_written_is_refused(tmp_path, name):
-    (tmp_path / "folder.glb").mkdir()
-    with pytest.raises(InputError, match=name):
-        export_mesh(box(), tmp_path / name)
 
 
 def glossy(mesh: Mesh) -> Mesh:

@@ -14,7 +14,6 @@ from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
 
-from renderer.errors import InputError
 from renderer.light import skylight
 from renderer.light.harmonics import basis, rotate
 
@@ -226,19 +225,3 @@ def test_gradients_are_finite_differences(sky):
         return (weights * coefficients(*parameters)).sum()
 
     assert torch.autograd.gradcheck(projection, sky_parameters(*sky), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("sky", "argument"),
-    [
-        ((0.5, 0.0, 1.99), "turbidity"),
-        ((0.5, 0.0, 10.1), "turbidity"),
-        ((-0.01, 0.0, 3.0), "zenith"),
-        ((math.nan, 0.0, 3.0), "zenith"),
-        ((0.5, math.nan, 3.0), "azimuth"),
-    ],
-)
-def test_a_sky_outside_the_domain_is_refused_by_name(sky, argument):
-    for values in (sky, sky_parameters(*sky)):
-        with pytest.raises(InputError, match=f"^{argument}"):
-            skylight.coefficients(*values)

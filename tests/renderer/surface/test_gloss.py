@@ -21,7 +21,6 @@ from oracles import draw, draw_uniform
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
-from renderer.errors import InputError
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import Basis, Harmonics, LightPaths, LocalBasis, SplitLight
 from renderer.light.harmonics import bands, basis, lambertian_factors
@@ -846,20 +845,6 @@ def test_a_roughness_below_the_minimum_is_raised_to_it_with_a_warning():
     with pytest.warns(UserWarning):
         mirror = render(mesh, CAMERA, light, 8, gloss=Gloss(0.0))
     assert torch.equal(mirror, render(mesh, CAMERA, light, 8, gloss=Gloss(MIN_ROUGHNESS)))
-
-
-@pytest.mark.parametrize(
-    ("gloss", "argument"),
-    [
-        (Gloss(1.5), "roughness"),
-        (Gloss(math.nan), "roughness"),
-        (Gloss(0.5, -0.1), "metallic"),
-        (Gloss(0.5, specular_factor=torch.ones(3)), "specular_factor"),
-    ],
-)
-def test_gloss_out_of_range_is_refused(gloss, argument):
-    with pytest.raises(InputError, match=argument):
-        render(solid("pear"), CAMERA, positive_light(6), 8, gloss=gloss)
 
 
 def test_the_parts_of_a_joined_mesh_keep_their_gloss():
