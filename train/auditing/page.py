@@ -348,14 +348,12 @@ def attack_pictures(network: AuditedNetwork) -> list[ComparedImage]:
 
 def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
     """Describe the right prediction before an attack and the wrong one after it, if it succeeds."""
-    texts = [in_words(name) for name in attack_counts.get("predicted", ())]
-    # Earlier versions of the library did not write the key "confidence".
-    for index, probability in enumerate(attack_counts.get("confidence", ())):
-        texts[index] += f" {probability:.0%}"
-    return [
-        ShownPrediction(text, verdict)
-        for text, verdict in zip(texts, ("right", "wrong"), strict=False)
-    ]
+    if "predicted" not in attack_counts:
+        return []
+    shown = zip(
+        attack_counts["predicted"], attack_counts["confidence"], ("right", "wrong"), strict=True
+    )
+    return [ShownPrediction(f"{in_words(name)} {p:.0%}", verdict) for name, p, verdict in shown]
 
 
 def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:

@@ -411,7 +411,7 @@ class Pooled(ShortRepr):
     @cached_property
     def by_label(self) -> dict[str, Pool]:
         """For each label, its predictions, which are scored together."""
-        groups = _group(self._included, lambda prediction: prediction.label)
+        groups = group_predictions(self._included, lambda prediction: prediction.label)
         return {label: pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
@@ -424,7 +424,9 @@ class Pooled(ShortRepr):
         positive can name other sources in its `hard_negatives`. The negatives
         of these sources are added.
         """
-        groups = _group(self.predictions, lambda prediction: prediction.photograph.source)
+        groups = group_predictions(
+            self.predictions, lambda prediction: prediction.photograph.source
+        )
         pools = {}
         for source, group in groups.items():
             source_pool = pool(group, self.thresholds)
@@ -472,7 +474,7 @@ class Pooled(ShortRepr):
         """
         labels = {prediction.label for prediction in self.predictions}
         pools = {}
-        for name, group in _group(self._included, name_of).items():
+        for name, group in group_predictions(self._included, name_of).items():
             own_pool = pool(group, self.thresholds)
             # Images of positive classes are left out. With the labels orange and lemon,
             # an image of an orange is also a negative for lemon, so oranges would be
@@ -495,7 +497,7 @@ class Pooled(ShortRepr):
         return [item for item in self.predictions if item.photograph.source not in self.exclude]
 
 
-def _group(
+def group_predictions(
     predictions: Sequence[Prediction], name_of: Callable[[Prediction], str | None]
 ) -> dict[str, list[Prediction]]:
     """Group predictions by a name, such as the name of their source.

@@ -135,15 +135,8 @@ def _from_row(row: Mapping[str, str], label: str) -> Prediction:
         label=row["label"],
         source=row["source"] or None,
         hard_negatives=split_sources(row["hard_negatives"]),
-        # Earlier versions of the library did not write the column "mesh".
-        mesh=row.get("mesh") or None,
+        mesh=row["mesh"] or None,
     )
-    if TRUE_RANK not in row:
-        # Earlier versions of the library wrote columns with these names, which also are the
-        # columns of a positive class "true".
-        if label == "true":
-            raise LookupError("an earlier version mixed up the columns of the class 'true'")
-        row = {**row, TRUE_PROBABILITY: row["true_probability"], TRUE_RANK: row["true_rank"]}
     true_probability = row[TRUE_PROBABILITY]
     true_rank = row[TRUE_RANK]
     return Prediction(

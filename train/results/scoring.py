@@ -23,7 +23,6 @@ import torch
 from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_names
 from augment.losses import log_odds
 from augment.network import compute_outputs
-from augment.progress import progress
 from renderer.errors import InputError, as_folder, require_choice, require_kind, require_whole
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
@@ -48,6 +47,7 @@ from train.results.metrics import (
     Pool,
     Pooled,
     describe_point,
+    group_predictions,
     metric_title,
     within_rank,
 )
@@ -352,21 +352,18 @@ class Scores(ShortRepr):
             entries = self.point_entries
             summary["operating_point"] = entries if has_several_labels else entries[0]
         if has_several_labels:
-            summary["by_label"] = _entries(self.by_label)
-        summary["by_source"] = _entries(self.by_source)
+            summary["by_label"] = {name: item.to_summary() for name, item in self.by_label.items()}
+        summary["by_source"] = {name: item.to_summary() for name, item in self.by_source.items()}
         if self.by_mesh is not None:
-            summary["by_mesh"] = _entries(self.by_mesh)
+            summary["by_mesh"] = {name: item.to_summary() for name, item in self.by_mesh.items()}
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
         if self.class_metrics is not None:
-            summary["class_metrics"] = _entries(self.class_metrics)
+            summary["class_metrics"] = {
+                name: item.to_summary() for name, item in self.class_metrics.items()
+            }
         summary["unreadable"] = predicted.unreadable
         summary["left_out"] = predicted.left_out
         return summary
-
-
-def _entries(metrics_by_name: Mapping[str, Metrics]) -> dict[str, dict[str, Any]]:
-    """Convert the metrics of several groups to entries of summary.json."""
-    return {name: metrics.to_summary() for name, metrics in metrics_by_name.items()}
 
 
 def evaluate_photographs(
@@ -407,6 +404,7 @@ def score(
     thresholds_by_label = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
     has_several_labels = len(predicted.labels) > 1
+    classes = group_predictions(predicted.photographs, lambda item: item.photograph.label)
     return Scores(
         predicted=predicted,
         pooled=pooled,
@@ -415,25 +413,14 @@ def score(
         by_label=_metrics_of(pooled.by_label) if has_several_labels else {},
         by_source=_metrics_of(pooled.by_source),
         by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
-        by_class=_score_classes(predicted),
+        by_class={name: _score_class(item, predicted.labels) for name, item in classes.items()},
         class_metrics=_metrics_of(pooled.by_class) if by == "class" else None,
     )
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of several groups of predictions, and show the progress."""
-    return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
-
-
-def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
-    """Score the photographs of each class in a folder separately."""
-    predictions_by_class: dict[str, list[Prediction]] = {}
-    for prediction in predicted.photographs:
-        predictions_by_class.setdefault(prediction.photograph.label, []).append(prediction)
-    scores = {}
-    for name in sorted(predictions_by_class):
-        scores[name] = _score_class(predictions_by_class[name], predicted.labels)
-    return scores
+    """Compute the metrics of several groups of predictions."""
+    return {name: pool.metrics for name, pool in pools.items()}
 
 
 def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:

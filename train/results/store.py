@@ -404,8 +404,7 @@ class AttackSummary:
         folder: Folder of the attack.
         rows: A row for each attacked example.
         successes: Number of examples that are misclassified after the attack, in
-            images with the simulated noise of a sensor. Attacks of earlier
-            versions of the library had no noise.
+            images with the simulated noise of a sensor.
         without_noise: Number of examples that are misclassified after the attack
             in images without noise.
         correct: Number of examples that are classified correctly before the
@@ -436,7 +435,7 @@ def read_attack(folder: Path) -> AttackSummary:
             folder=folder,
             rows=[_example_row(line) for line in examples],
             successes=sum(bool(line["success"]) for line in correct),
-            without_noise=sum(_is_success_without_noise(line) for line in correct),
+            without_noise=sum(bool(line["success_without_noise"]) for line in correct),
             correct=len(correct),
             checks=checks[0] if checks else {},
         )
@@ -446,14 +445,6 @@ def read_attack(folder: Path) -> AttackSummary:
             f"{path} is damaged or was written by no attack ({single_line(error)}): "
             "use the folder of another attack",
         ) from error
-
-
-def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
-    """Return whether the attack on an example succeeds in images without noise.
-
-    Files of earlier versions have only "success", which was measured without noise.
-    """
-    return bool(line.get("success_without_noise", line["success"]))
 
 
 def _example_row(line: Mapping[str, Any]) -> ExampleRow:
@@ -481,7 +472,7 @@ def _describe_outcome(line: Mapping[str, Any]) -> str:
     success = "no success"
     if line["success"]:
         success = "success"
-    elif _is_success_without_noise(line):
+    elif line["success_without_noise"]:
         success = "success only without noise"
     return f"{success} in {int(line['steps'])} steps"
 

@@ -74,6 +74,7 @@ SUCCESSFUL_EXAMPLE = {
     "predicted": ["b"],
     "confidence": [0.5],
     "success": True,
+    "success_without_noise": True,
     "success_before": False,
     "steps": 3,
 }
@@ -82,7 +83,7 @@ SUCCESSFUL_EXAMPLE = {
 def write_attack(folder: Path) -> None:
     """Write an attack on four examples with different outcomes."""
     folder.mkdir(parents=True)
-    unsuccessful = SUCCESSFUL_EXAMPLE | {"success": False}
+    unsuccessful = SUCCESSFUL_EXAMPLE | {"success": False, "success_without_noise": False}
     lines = [
         SUCCESSFUL_EXAMPLE,
         SUCCESSFUL_EXAMPLE | {"example": 1, "steps": 0, "success_before": True},

@@ -564,16 +564,6 @@ def test_columns_of_any_class_name_are_read_bit_by_bit(tmp_path):
     assert read_predictions(tmp_path / "a.csv", AWKWARD_CLASSES) == predictions
 
 
-def test_predictions_of_an_earlier_version_are_read_but_not_those_of_its_class_true(tmp_path):
-    write_predictions(tmp_path / "a.csv", PREDICTIONS)
-    text = (tmp_path / "a.csv").read_text()
-    earlier = text.replace("probability_of_true", "true_probability")
-    (tmp_path / "a.csv").write_text(earlier.replace("rank_of_true", "true_rank"))
-    assert read_predictions(tmp_path / "a.csv", "orange") == PREDICTIONS
-    with pytest.raises(InputError, match="mixed up"):
-        read_predictions(tmp_path / "a.csv", "true")
-
-
 # Colors of the frames of true positives, false negatives and false positives.
 FRAMES = [(46, 158, 91), (208, 59, 59), (232, 163, 23)]
 FRAMED = IMAGE_SIZE + 2 * FRAME_WIDTH
