@@ -55,9 +55,8 @@ KEPT_CAMERAS = 3
 MAX_STEPS = 20
 # The refinement ends if a step changes the squared error, or the camera, by less than this.
 MIN_GAIN = 1e-3
-# Step sizes of numerical derivatives, times the image size in pixels. The five parameters of a
-# camera are the polar angle and the azimuth in radians, the relative width, and the shifts right
-# and up as fractions of the width.
+# Step sizes of numerical derivatives by the five parameters of `_Target.refine_camera`, times the
+# image size in pixels.
 DERIVATIVE_STEPS = (1.0, 1.0, 1.0, 0.5, 0.5)
 # Smallest angle in radians of a refined camera to the z-axis, where the azimuth has no effect.
 MIN_POLE_ANGLE = 0.02
@@ -67,17 +66,15 @@ SAMPLES = 8
 MIN_CAMERA_ANGLE = 2.0
 # A camera is refined in full size if its squared error is at most this multiple of the smallest.
 MAX_ERROR_RATIO = 3
-# Weight of the smoothness penalty of the light, relative to the squared brightness of the object
-# under uniform light. Without a penalty, light from directions that the object hardly reflects
-# could become arbitrarily bright.
+# Weight of the smoothness penalty, relative to the squared brightness under uniform light. Without
+# it, light from directions that the object hardly reflects could become arbitrarily bright.
 SMOOTHNESS_WEIGHT = 1e-6
 # A pixel of the photograph with this linear value or more counts as clipped: the scene may have
 # been brighter than the photograph can show.
 CLIPPED_VALUE = 0.995
 # Largest number of fits of a light. Each ignores clipped pixels that the last made brighter than 1.
 CLIPPING_ROUNDS = 3
-# Smallest radiance of a light in all directions of a grid, as a fraction of its mean radiance. The
-# margin keeps the radiance positive between the directions.
+# Smallest radiance in the directions of a grid, over the mean. It is positive between them, too.
 MIN_RADIANCE_RATIO = 0.01
 # Largest number of iterations of `nnls` for each direction of the grid. Three are usual.
 MAX_NNLS_ITERATIONS = 100
@@ -499,8 +496,7 @@ def _fit_channels(
     # The brightest channel reflects most of a uniform light, which is coefficient 0.
     best = int(normal_matrix[:, 0, 0].argmax())
     best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
-    # The expected light of a channel is the multiple of `best_light` with the smallest squared
-    # error.
+    # The expected light is the multiple of `best_light` with the smallest squared error.
     squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
     factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
