@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 from torch import Tensor
 
+from augment.attacks.problem import SceneProblem
+from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -431,3 +433,30 @@ def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
         message = f"{path} cannot be read ({single_line(error)}): write the adversary again"
         raise InputError(message) from error
     return images
+
+
+def final_images(
+    problem: SceneProblem,
+    values: Float[Tensor, "A D"],
+    examples: Int[Tensor, " A"],
+    images: Float[Tensor, "A V 3 size size"],
+) -> Float[Tensor, "A V 3 size size"]:
+    """Return the images after a search, with the shadows and bounces of the attacked shape.
+
+    A search that changes shape, colors or gloss computes shadows and bounces
+    once, for the original shape. This function renders its images again. The
+    images of all other searches are returned as they are.
+    """
+    scene = problem.scene
+    conditions = problem.conditions(values, examples)
+    surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+    has_changed_surface = any(change is not None for change in surface_changes)
+    needs_renders = has_changed_surface and scene.settings.global_illumination
+    if not needs_renders or not len(examples):
+        return images
+    rendered = []
+    for row, example in enumerate(progress(examples.tolist(), "final images")):
+        # `Adversary` needs images, but does not use them for rendering.
+        adversary = Adversary.of(scene, example, conditions, images[row], images[row], row)
+        rendered.append(adversary.render_views(scene.rasterizer))
+    return torch.stack(rendered).to(images)

@@ -12,16 +12,21 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
-from augment.attacks.adversary import Adversary
+from augment.attacks.adversary import final_images
 from augment.attacks.eot import NOISE_DRAWS, preprocessed_model
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
-from augment.attacks.result import AttackResult
+from augment.attacks.problem import (
+    SceneProblem,
+    build_problem,
+    source_labels,
+    warn_of_changed_light,
+)
+from augment.attacks.result import ZERO_GRADIENT, AttackResult
 from augment.classifier import Classifier, class_index, remembering
 from augment.network import compute_outputs
 from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
-from augment.progress import Phases, progress
+from augment.progress import Phases
 from augment.random_streams import generator
 from augment.scene.build import with_needed_degree
 from augment.scene.scene import Scene
@@ -31,10 +36,6 @@ from renderer.errors import InputError, as_list, is_whole, require_flag, require
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
 LEAST_LIKELY = "least_likely"
-# What `attack` and its checks say if gradient descent finds no direction.
-ZERO_GRADIENT = (
-    "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
-)
 
 
 def attack(
@@ -234,12 +235,6 @@ def _count_queries(
     return queries
 
 
-def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:
-    """Return the true class of each view as an index of the classifier."""
-    labels = [classifier.label(label) for label in scene.labels]
-    return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)
-
-
 def require_clean_correct(
     scene: Scene,
     logits: Float[Tensor, "E V C"],
@@ -314,30 +309,3 @@ def random_starts(problem: SceneProblem, count: int, seed: int) -> Iterator[Tens
     """Draw the initial attack values of restarts from the norm-balls."""
     for number in range(1, count + 1):
         yield problem.sample(generator(seed, number, "restart"))
-
-
-def final_images(
-    problem: SceneProblem,
-    values: Float[Tensor, "A D"],
-    examples: Int[Tensor, " A"],
-    images: Float[Tensor, "A V 3 size size"],
-) -> Float[Tensor, "A V 3 size size"]:
-    """Return the images after a search, with the shadows and bounces of the attacked shape.
-
-    A search that changes shape, colors or gloss computes shadows and bounces
-    once, for the original shape. This function renders its images again. The
-    images of all other searches are returned as they are.
-    """
-    scene = problem.scene
-    conditions = problem.conditions(values, examples)
-    surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-    has_changed_surface = any(change is not None for change in surface_changes)
-    needs_renders = has_changed_surface and scene.settings.global_illumination
-    if not needs_renders or not len(examples):
-        return images
-    rendered = []
-    for row, example in enumerate(progress(examples.tolist(), "final images")):
-        # `Adversary` needs images, but does not use them for rendering.
-        adversary = Adversary.of(scene, example, conditions, images[row], images[row], row)
-        rendered.append(adversary.render_views(scene.rasterizer))
-    return torch.stack(rendered).to(images)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import StepSettings
-from augment.attacks.adversary import Adversary
-from augment.attacks.attack import ZERO_GRADIENT, final_images
+from augment.attacks.adversary import Adversary, final_images
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.parameters import parameter_class
@@ -30,15 +29,6 @@ from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, requi
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
-
-# Keys of the result of `check` that `warnings` reads. `nb.save` refuses checks without them.
-CHECKED = {
-    "success",
-    "success_without_noise",
-    "random_search",
-    "cost_fell",
-    "zero_gradient",
-}
 
 
 def check(result: AttackResult) -> dict[str, Any]:
@@ -112,25 +102,6 @@ def check(result: AttackResult) -> dict[str, Any]:
         "success_by_steps": rate_by_steps,
         "success_by_steps_without_noise": rate_by_steps_without_noise,
     }
-
-
-def warnings(checks: Mapping[str, Any]) -> list[str]:
-    """Return reasons to doubt the strength of an attack, as one sentence each."""
-    success = checks["success"]
-    lost_to_noise = checks["success_without_noise"] - success
-    reasons = []
-    if lost_to_noise > success:
-        reasons.append(
-            "most successes are lost with sensor noise, and a larger margin helps",
-        )
-    if 0 < success <= checks["random_search"]:
-        reasons.append("random search does as well or better")
-    # The following two are fractions of the examples.
-    if checks["cost_fell"] < 1:
-        reasons.append("the attack did not lower the cost of some examples")
-    if checks["zero_gradient"] > 0:
-        reasons.append(ZERO_GRADIENT)
-    return reasons
 
 
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.checks import CHECKED, warnings
 from augment.attacks.eot import as_jpeg
-from augment.attacks.result import AttackResult, predictions, require_result
+from augment.attacks.result import CHECKED, AttackResult, predictions, require_result, warnings
 from augment.progress import progress
 from renderer.errors import InputError, as_folder, as_list, require_choice, require_kind
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit

@@ -21,8 +21,14 @@ from torch import Tensor
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
 from augment.attacks.eot import NOISE_DRAWS
 from augment.attacks.objective import Objective, Score
-from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, RandomSearch
-from augment.attacks.problem import Problem
+from augment.attacks.optimizers import (
+    CMAES,
+    Evaluation,
+    Gradient,
+    Optimizer,
+    Problem,
+    RandomSearch,
+)
 from augment.network import frozen_eval_mode
 from augment.progress import progress
 from renderer.short_repr import ShortRepr

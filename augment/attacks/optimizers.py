@@ -1,4 +1,4 @@
-"""Optimizers, which are asked for candidates and told their costs.
+"""Problems, and optimizers that are asked for candidates and told their costs.
 
 A candidate is a vector of attack values that is evaluated next.
 
@@ -13,7 +13,7 @@ import importlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ from renderer.errors import InputError
 
 if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings
-    from augment.attacks.problem import Problem
 
 # Random search multiplies the length of its random changes by GROWTH after an accepted candidate
 # and by SHRINKAGE after a rejected one. Four rejections undo one acceptance (the 1/5 success rule
@@ -36,6 +35,35 @@ SHRINKAGE = GROWTH**-0.25
 # CMA-ES with more values than this uses a diagonal covariance (Ros and Hansen
 # 2008), because the size of a full covariance is the square of their number.
 MAX_FULL_COVARIANCE = 1000
+
+
+class Problem(Protocol):
+    """Values of E examples that an attack changes, and the images that they give.
+
+    Attributes:
+        start: Values at which attacks start, one row for each example.
+        group_size: Largest number of examples that are rendered at the same time,
+            so that they fit in memory.
+    """
+
+    start: Float[Tensor, "E D"]
+    group_size: int
+
+    def render(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Render the V views of examples, differentiable in the values."""
+
+    def project(
+        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A D"]:
+        """Find the nearest values that are feasible and lie in the norm-balls."""
+
+    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+        """Compute the step that gradient descent subtracts from the values."""
+
+    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+        """Return how much a search without gradients should change each value at first."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -12,40 +11,12 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.parameter import Parameter
+from augment.classifier import Classifier
 from augment.progress import progress
 from augment.scene.build import MAX_IRRADIANCE_ERROR
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.light.harmonics import irradiance_error
-
-
-class Problem(Protocol):
-    """Values of E examples that an attack changes, and the images that they give.
-
-    Attributes:
-        start: Values at which attacks start, one row for each example.
-        group_size: Largest number of examples that are rendered at the same time,
-            so that they fit in memory.
-    """
-
-    start: Float[Tensor, "E D"]
-    group_size: int
-
-    def render(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
-        """Render the V views of examples, differentiable in the values."""
-
-    def project(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A D"]:
-        """Find the nearest values that are feasible and lie in the norm-balls."""
-
-    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
-        """Compute the step that gradient descent subtracts from the values."""
-
-    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
-        """Return how much a search without gradients should change each value at first."""
 
 
 class SceneProblem:
@@ -191,3 +162,9 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
             "or set allow_negative=True to keep the light as it is"
         )
         warnings.warn(message, stacklevel=stacklevel)
+
+
+def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:
+    """Return the true class of each view as an index of the classifier."""
+    labels = [classifier.label(label) for label in scene.labels]
+    return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -33,6 +33,18 @@ BALL_SIZE = 96
 ANIMATION_SUFFIXES = (".gif", ".webp")
 # Largest number of frames that `AttackResult.save_animation` writes.
 MAX_FRAME_COUNT = 1000
+# What `attack` and its checks say if gradient descent finds no direction.
+ZERO_GRADIENT = (
+    "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
+)
+# Keys of the result of `check` that `warnings` reads. `nb.save` refuses checks without them.
+CHECKED = {
+    "success",
+    "success_without_noise",
+    "random_search",
+    "cost_fell",
+    "zero_gradient",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -337,3 +349,22 @@ def predictions(logits: Float[Tensor, "... C"], classes: Sequence[str]) -> dict[
     highest = logits.softmax(-1).max(-1)
     names = np.asarray(classes)[highest.indices.cpu().numpy()]
     return {"predicted": names.tolist(), "confidence": highest.values.tolist()}
+
+
+def warnings(checks: Mapping[str, Any]) -> list[str]:
+    """Return reasons to doubt the strength of an attack, as one sentence each."""
+    success = checks["success"]
+    lost_to_noise = checks["success_without_noise"] - success
+    reasons = []
+    if lost_to_noise > success:
+        reasons.append(
+            "most successes are lost with sensor noise, and a larger margin helps",
+        )
+    if 0 < success <= checks["random_search"]:
+        reasons.append("random search does as well or better")
+    # The following two are fractions of the examples.
+    if checks["cost_fell"] < 1:
+        reasons.append("the attack did not lower the cost of some examples")
+    if checks["zero_gradient"] > 0:
+        reasons.append(ZERO_GRADIENT)
+    return reasons

@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.attacks.checks import warnings
-from augment.attacks.result import AttackResult
+from augment.attacks.result import AttackResult, warnings
 from renderer.io.files import atomic_write
 from train.results.pictures import COLORS
 from train.results.tables import Proportion, Table, format_fraction, fraction

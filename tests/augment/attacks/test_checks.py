@@ -8,8 +8,7 @@ from torch import Tensor
 
 import augment
 from augment.attack_settings import StepSettings
-from augment.attacks.checks import warnings
-from augment.attacks.result import AttackResult
+from augment.attacks.result import AttackResult, warnings
 from renderer.errors import InputError
 
 SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}

@@ -11,9 +11,8 @@ import torch
 
 import augment
 from augment.attacks.adversary import MAP_HEIGHT
-from augment.attacks.checks import warnings
 from augment.attacks.files import LINES, SIDE, figure
-from augment.attacks.result import AttackResult
+from augment.attacks.result import AttackResult, warnings
 from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.io.meshes import load_mesh
 from renderer.light.environment import read_map, to_map

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import Adversary, reload, write_adversary
-from augment.attacks.attack import final_images
+from augment.attacks.adversary import Adversary, final_images, reload, write_adversary
 from augment.attacks.files import render_again
 from augment.attacks.parameters.material import Material
 from augment.attacks.problem import SceneProblem
