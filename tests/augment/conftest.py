@@ -148,17 +148,7 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
         force: bool = False,
         **settings,
     ) -> augment.AttackResult:
-        """Attack the orange.
-
-        Args:
-            parameters: Names joined by "+", or settings by name.
-            scene: Keywords of `build_scene`.
-            classifier: What is attacked.
-            target: Class to reach; None for any error.
-            seed: Of the random draws.
-            force: Whether images that are misclassified from the start are attacked.
-            **settings: Keywords of `AttackSettings`.
-        """
+        """Attack the orange."""
         steps = parameters
         if isinstance(parameters, str):
             steps = {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}

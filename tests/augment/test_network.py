@@ -25,19 +25,10 @@ OUT_OF_MEMORY = [
 
 
 class Limited(nn.Module):
-    """A classifier of two classes with little memory.
-
-    Attributes:
-        batch_sizes: The number of images of every call.
-    """
+    """A classifier of two classes with little memory."""
 
     def __init__(self, most: int = 99, error: Exception = OUT_OF_MEMORY[0]):
-        """Create a classifier.
-
-        Args:
-            most: The largest batch that does not raise an error.
-            error: What larger batches raise.
-        """
+        """Create a classifier."""
         super().__init__()
         self.most = most
         self.error = error
@@ -70,13 +61,7 @@ class Shades:
 
 
 def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minimum:
-    """Attack ten examples with one restart.
-
-    Args:
-        model: The classifier.
-        batch_size: The largest number of images of a pass.
-        group_size: The largest number of examples of a part.
-    """
+    """Attack ten examples with one restart."""
     criterion = Criterion(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, quantized=False, batch_size=batch_size)
     objective = Objective(model, criterion, settings)

@@ -357,11 +357,6 @@ def test_settings_that_are_out_of_range_or_contradict_are_refused(settings, mess
         AugmentationSettings(**settings)
 
 
-def test_an_attack_without_a_scene_is_refused():
-    with pytest.raises(InputError, match="scene"):
-        AugmentationService(AugmentationSettings(), None, torch.zeros(0), 0, Phases())
-
-
 # --------------------------------------------------------------- shape and albedo
 
 

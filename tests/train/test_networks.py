@@ -74,14 +74,7 @@ def write(
     description: dict | None = None,
     **changes,
 ) -> Path:
-    """Write best.pt and model.safetensors of a network.
-
-    Args:
-        folder: Folder of the files.
-        network: Network with the weights.
-        description: Description of the network. By default, it is its own.
-        changes: Entries of the description that are replaced.
-    """
+    """Write best.pt and model.safetensors of a network."""
     architecture = description_of(network) if description is None else description
     state = {"model": network.state_dict(), "architecture": architecture | changes}
     save(folder / BEST, state)
@@ -117,11 +110,7 @@ def test_convolutions_start_with_he_initialization():
 
 
 class PublishedWideResNet:
-    """The forward pass of the paper: pre-activation, and the shortcut after the first ReLU.
-
-    Attributes:
-        state: Weights by name.
-    """
+    """The forward pass of the paper: pre-activation, and the shortcut after the first ReLU."""
 
     def __init__(self, state: dict[str, Tensor]):
         self.state = state

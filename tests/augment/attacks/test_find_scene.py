@@ -49,14 +49,7 @@ def found(
     cameras: int = 40,
     shared: bool = False,
 ) -> SceneSettings:
-    """Search for a scene.
-
-    Args:
-        score: What the classifier decides by.
-        settings: The scene that the search starts from.
-        cameras: Number of cameras that are tried.
-        shared: Whether all views share one light.
-    """
+    """Search for a scene."""
     build = partial(built, shared=shared)
     classifier = classifier_of(score)
     return find_scene(classifier, settings, LIGHTING, build, cameras, generator(0))

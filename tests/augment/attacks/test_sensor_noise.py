@@ -54,13 +54,7 @@ def counted(images: Tensor, classifier: augment.Classifier, **settings) -> Tenso
 
 
 def survival(images: Tensor, classifier: augment.Classifier, deviation: float) -> float:
-    """Return the fraction of noisy images of 8 bits that are no orange.
-
-    Args:
-        images: Images (N, 3, SIZE, SIZE).
-        classifier: A classifier whose first class is the orange.
-        deviation: Standard deviation of NumPy's noise, in steps of 8 bits.
-    """
+    """Return the fraction of noisy images of 8 bits that are no orange."""
     draws = np.random.default_rng(7)
     rates = []
     for _ in range(30):

@@ -205,16 +205,6 @@ def test_an_attack_keeps_the_light_that_was_given(map_name):
 # --------------------------------------------------------------- warnings
 
 
-@pytest.mark.parametrize(
-    "item",
-    [MATTE, ObjectSettings("solid:pear", "pear", gloss=[0.5])],
-    ids=["matte", "glossy"],
-)
-def test_degree_0_is_told(item):
-    _, told = scene_of(item, degree=0, light="uniform")
-    assert "degree=0" in told
-
-
 def test_degree_0_is_exact_for_even_light():
     rows = torch.arange(1)
     low, _ = scene_of(MATTE, degree=0, light="uniform")

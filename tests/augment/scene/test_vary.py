@@ -484,11 +484,6 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
     assert shown == {0, 1}
 
 
-def test_a_folder_without_images_is_refused(scene, tmp_path):
-    with pytest.raises(InputError, match=f"backgrounds={tmp_path}"):
-        drawn(scene, backgrounds=str(tmp_path))
-
-
 def test_a_lit_background_is_shaded_as_a_wall_facing_the_camera():
     """A white wall looks like the middle of a white ball."""
     sphere = trimesh.creation.icosphere(subdivisions=4)

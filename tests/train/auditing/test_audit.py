@@ -355,14 +355,7 @@ def test_what_cannot_be_audited_is_refused_before_anything_is_written(
 
 
 def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None:
-    """Write what the answer of an audit is computed from.
-
-    Args:
-        folder: Folder of the classifier in the audit.
-        hits: Number of views, and of photographs, that are recognized.
-        n: Number of views, and of photographs.
-        adversarial: Number of 4 views that attacks change, by radius.
-    """
+    """Write what the answer of an audit is computed from."""
     is_recognized = [True] * hits + [False] * (n - hits)
     recognized = {"uniform": is_recognized, "random 1": is_recognized}
     (folder / RECOGNIZED).write_text(json.dumps(recognized))

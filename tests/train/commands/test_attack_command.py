@@ -55,14 +55,7 @@ ADVERSARY_FILES = {
 
 
 class Attacked(NamedTuple):
-    """What an attack printed, and the files that it wrote.
-
-    Attributes:
-        names: Names of the attacked parameters.
-        printed: Output of the command.
-        folder: Folder of the attack.
-        lines: Contents of attack.jsonl: one example, and a summary.
-    """
+    """What an attack printed, and the files that it wrote."""
 
     names: list[str]
     printed: str

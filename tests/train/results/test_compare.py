@@ -275,13 +275,7 @@ def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run):
 
 @dataclass
 class TwoArms:
-    """Runs of two methods with three seeds each, scored on 60 oranges and 40 other things.
-
-    Attributes:
-        folders: Run folders, all seeds of the first method first.
-        oranges: Scores by method, seed and orange, shape (2, 3, 60).
-        others: Scores by method, seed and other thing, shape (2, 3, 40).
-    """
+    """Runs of two methods with three seeds each, scored on 60 oranges and 40 other things."""
 
     folders: list[Path]
     oranges: np.ndarray
@@ -307,12 +301,7 @@ def methods(scored_run) -> TwoArms:
 
 
 def mean_auc(oranges: np.ndarray, others: np.ndarray) -> float:
-    """Average the AUC over seeds. No two scores are equal.
-
-    Args:
-        oranges: Scores by seed and orange.
-        others: Scores by seed and other thing.
-    """
+    """Average the AUC over seeds. No two scores are equal."""
     return (oranges[:, :, None] > others[:, None, :]).mean()
 
 

@@ -20,14 +20,7 @@ COMMAND = "python -m train experiment=best"
 
 
 class Page(HTMLParser):
-    """The contents of a page.
-
-    Attributes:
-        tags: Names of all tags, in order.
-        addresses: Values of all `src` and `href`.
-        alts: Alternative texts of the images, None for an image without one.
-        rows: Texts of the cells of each table row.
-    """
+    """The contents of a page."""
 
     def __init__(self, text: str):
         super().__init__()

@@ -74,13 +74,7 @@ FRUIT_CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
 @dataclass(frozen=True)
 class Fruit:
-    """A photograph of a fruit, and what the model predicts for it.
-
-    Attributes:
-        name: Path of the photograph in its folder.
-        source: Source of the photograph, or "".
-        order: Classes from the most probable one to the least probable one.
-    """
+    """A photograph of a fruit, and what the model predicts for it."""
 
     name: str
     source: str
@@ -325,11 +319,6 @@ def pooled_auc(labels: list[str], own_letters: str, source: str | None = None) -
     """Compute the AUC of all pairs of the photographs of labels and of others.
 
     Each photograph has a score for each label.
-
-    Args:
-        labels: Labels of the positives.
-        own_letters: Letters of the positives that count.
-        source: Source of the photographs that count. None counts all sources.
     """
     positives = []
     negatives = []

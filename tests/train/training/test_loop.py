@@ -195,13 +195,7 @@ def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp
 
 
 class Step:
-    """One step of a linear network on a batch of eight images.
-
-    Attributes:
-        before: Weight and bias before the step.
-        after: Weight and bias after the step.
-        gradients: The gradients of the mean loss of the whole batch.
-    """
+    """One step of a linear network on a batch of eight images."""
 
     def __init__(self, folder: Path, **settings):
         images = single_colors(8)
@@ -407,13 +401,7 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
 
 
 class DivergingNetwork(nn.Module):
-    """A network whose logits are infinite from one pass on.
-
-    Args:
-        in_training: Whether passes in training diverge, or else passes in evaluation mode.
-        first_pass: The first pass of that mode that diverges, counted from 1.
-        number: A signal that the first such pass sends, if any.
-    """
+    """A network whose logits are infinite from one pass on."""
 
     def __init__(self, in_training: bool, first_pass: int, number: signal.Signals | None = None):
         super().__init__()

@@ -57,13 +57,7 @@ def modification_times(folder: Path) -> dict[Path, int]:
 
 
 class ActingBatches:
-    """Give the batches of training, and call a function at one step.
-
-    Attributes:
-        act: Function to call.
-        round_number: Round in which it is called, from 0.
-        step: Step of the round at which it is called, from 1.
-    """
+    """Give the batches of training, and call a function at one step."""
 
     def __init__(self, act: Callable[[], None], round_number: int, step: int):
         self.act = act

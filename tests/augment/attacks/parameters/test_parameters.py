@@ -190,11 +190,6 @@ def derivatives(
 
     Central differences at h and 2h are combined by Richardson's rule. The error is a fourth
     power of h, times a fifth derivative, and rounding divided by h.
-
-    Args:
-        function: Maps points (N, D) to numbers (N,).
-        at: The point, shape (D,).
-        directions: The directions, shape (N, D).
     """
 
     def central(h: float) -> Tensor:
