@@ -2,24 +2,16 @@
 
 import csv
 import json
-import re
-import shlex
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import renderer
-from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import decode
 from renderer.io.images import read_image
-from renderer.light.environment import to_map
-from renderer.light.presets import load_light
-from scripts.attack import main as attack_command
 from tests.train.helpers import save_noise, save_untrained_network
 from train import console
 from train.checkpoints import load_run
@@ -196,72 +188,6 @@ def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
 def test_grab_cut_refuses_a_box_outside_the_image(box):
     with pytest.raises(InputError, match="within 96 × 96 pixels"):
         grab_cut(np.zeros((96, 96, 3), np.uint8), box)
-
-
-FIT = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48", "bounces=0"]
-
-
-@pytest.fixture
-def photographed_cup(here) -> Path:
-    """Render a cup in front of noise, away from the middle of the image, and its mask."""
-    size = 192
-    mesh = renderer.normalize(renderer.solid("cup"))
-    camera = OrthographicCamera(57.3, 28.6, 4.0, 0.6, -0.3)
-    light = 0.2 * load_light("grace").double()
-    light[0] += 0.2  # The light has no negative radiance.
-    generator = torch.Generator().manual_seed(0)
-    background = torch.rand(3, size, size, generator=generator).double()
-    photograph = renderer.render(
-        mesh,
-        camera,
-        light,
-        size,
-        background,
-        samples=4,
-        encoding="srgb",
-    )
-    white_behind_black = renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)
-    Image.fromarray(to_pixels(photograph)).save(here / "photo.png")
-    Image.fromarray(to_pixels(1 - white_behind_black)).save(here / "mask.png")
-    return here
-
-
-@pytest.mark.slow
-def test_a_scene_that_was_fitted_is_rendered_and_scored_as_it_was_photographed(
-    call,
-    photographed_cup,
-    capsys,
-):
-    assert call(*FIT, "mask=mask.png") == 0
-    output = capsys.readouterr().out
-    attack = shlex.split(output.splitlines()[-1])
-    settings = attack_command.read(attack[1:])
-    scene = settings.scene
-    assert not settings.renderer.shadows
-    assert settings.label == "orange"
-
-    mesh = renderer.normalize(renderer.solid("cup"))
-    (camera,) = renderer.orbit_cameras(1, scene.width, scene.polar, scene.azimuth)
-    light = load_light(scene.light).double()
-    assert to_map(light, 128).min() >= 0
-
-    # The render differs from the photograph in the pixels of the object alone.
-    background = read_image(scene.backgrounds[0], 64).double()
-    image = renderer.render(mesh, camera, light, 64, background, samples=4, encoding="srgb")
-    difference = (image - background).abs().amax(0)
-    assert (difference > 0).double().mean() > 0.2
-    assert float(difference[difference > 0].mean()) < 0.06
-
-    # The printed error is that of images in the size of the default classifier.
-    background = read_image(scene.backgrounds[0], 224).double()
-    image = renderer.render(mesh, camera, light, 224, background, samples=2, encoding="srgb")
-    is_inside = read_image(photographed_cup / "fitted" / "mask.png", 224)[0] > 0.98
-    rendered = decode(image[:, is_inside], "srgb")
-    photographed = decode(background[:, is_inside], "srgb")
-    error = float((rendered - photographed).norm() / photographed.norm())
-    printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
-    assert printed == pytest.approx(error, abs=0.00051)
-    assert error < 0.15
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -44,7 +44,7 @@ def sweep(made_up_run, tmp_path) -> list[Path]:
     "words",
     [
         pytest.param(["attack", f"meshes=[{SOLIDS}]", *ATTACK], marks=pytest.mark.slow),
-        ["attack", "meshes=solid:orange:0", *ATTACK, *TRANSFER],
+        pytest.param(["attack", *ATTACK, *TRANSFER], marks=pytest.mark.slow),
         ["compare", f"runs=[{','.join(f'sweep/{index}' for index in range(20))}]"],
         ["report", "runs=[sweep]", "out=page"],
         pytest.param(["evaluate", *EVALUATE, "out=scores"], marks=pytest.mark.slow),

@@ -217,50 +217,6 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
     torch.testing.assert_close(built(images), network(given), **ROUNDING)
 
 
-def save_exported(network: nn.Module) -> str:
-    batch = {0: torch.export.Dim("N", min=1, max=512)}
-    images = torch.rand(2, 3, SIZE, SIZE)
-    torch.export.save(torch.export.export(network, (images,), dynamic_shapes=(batch,)), "mine.pt2")
-    return "mine.pt2"
-
-
-def load_original(name: str) -> nn.Module:
-    if name.endswith(".pt2"):
-        return torch.export.load(name).module()
-    return torch.jit.load(name)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-@pytest.mark.parametrize("save", [save_torchscript, save_exported])
-def test_a_network_in_a_file_is_attacked_audited_and_hardened(
-    call, harden, here, monkeypatch, save
-):
-    """The class is given by its index. The hardened weights load into the network of the file."""
-    monkeypatch.chdir(here)
-    name = save(nn.Sequential(Normalize(MEAN, STD), trained_network()).eval())
-    network = [f"network={name}", "classes=classes.txt", f"size={SIZE}", "device=cpu"]
-    network += ["trust=true"]
-    label = f"label={CLASSES.index('Orange')}"
-    scene = ["meshes=solid:orange:0", "renderer.shadows=false", "attack.max_steps=1"]
-    assert call("attack", *network, label, *scene, "attack.checks=false", "out=attack") == 0
-    meshes = ["meshes=solid:orange", "environments=[]", "budget=0.01", "laboratory=photos"]
-    assert call("audit", *network, label, *meshes, "out=audit") == 0
-    assert (here / "audit" / "report.html").is_file()
-
-    start = [f"network={name}", "classes=classes.txt", f"size={SIZE}", "trust=true"]
-    folder = harden(*start, label)
-    images = renders()[0][:4]
-    original = load_original(name)
-    before = original(images)
-    original.load_state_dict(torch.load(folder / "weights.pt"))
-    hardened = load_run(folder, trust_code=True)
-    torch.testing.assert_close(hardened(images), original(images), **ROUNDING)
-    assert not torch.allclose(original(images), before)
-    with pytest.raises(InputError, match="trust=true"):
-        load_run(folder)
-
-
 class Normalize(nn.Module):
     """Normalization of images."""
 
