@@ -31,6 +31,7 @@ from renderer.errors import (
     as_list,
     as_tensor,
     describe,
+    has_memory,
     is_whole,
     require_bounded,
     require_flag,
@@ -43,7 +44,6 @@ from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.presets import load_light
 from renderer.light.ringing import highlight_error, required_degree
-from renderer.memory import has_memory
 from renderer.mesh import Mesh, require_mesh, select_faces, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.gloss import Gloss, smallest_roughness

@@ -29,9 +29,9 @@ from torch import Tensor
 from augment.progress import progress
 from augment.scene.objects import Conditions, SceneObject
 from renderer.camera import Camera
+from renderer.errors import require_memory
 from renderer.image import background_term
 from renderer.light.basis import Basis, split_light
-from renderer.memory import require_memory
 from renderer.mesh import Mesh
 from renderer.operators.apply import TransferOperator
 from renderer.operators.lamp_paths import LocalLightView

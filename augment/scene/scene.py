@@ -25,10 +25,10 @@ from renderer.errors import (
     describe,
     require_bounded,
     require_kind,
+    require_memory,
 )
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
-from renderer.memory import require_memory
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.operators.stack import OperatorStack, ScatterLayers

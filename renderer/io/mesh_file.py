@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, Num
 
-from renderer.errors import MAX_MAGNITUDE
+from renderer.errors import MAX_MAGNITUDE, require_memory
 from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
-from renderer.memory import require_memory
 from renderer.mesh import NO_TEXTURE, Mesh, transformed
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.

@@ -38,8 +38,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from renderer.errors import InputError, require_choice
-from renderer.memory import require_memory
+from renderer.errors import InputError, require_choice, require_memory
 from renderer.settings import RASTERIZERS
 from renderer.visibility import opengl
 

@@ -12,10 +12,9 @@ from augment import AugmentationService, AugmentationSettings
 from augment.augmentation_settings import CameraEffectSettings, TrainingAttackSettings
 from augment.scene import scene
 from augment.scene.build import build_scene
-from renderer import memory
-from renderer.errors import InputError
+from renderer import errors
+from renderer.errors import InputError, require_memory
 from renderer.image import to_bytes
-from renderer.memory import require_memory
 
 CPU = torch.device("cpu")
 ORANGE = [("solid:orange", "orange")]
@@ -24,8 +23,8 @@ ORANGE = [("solid:orange", "orange")]
 @pytest.fixture
 def system(tmp_path, monkeypatch) -> Path:
     """Return the folder that stands for the system's files on memory, which is empty."""
-    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
-    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(errors, "GROUP", tmp_path)
     return tmp_path
 
 
@@ -99,7 +98,7 @@ def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_fr
 
 
 def test_renders_need_their_memory_before_any_is_made(monkeypatch):
-    monkeypatch.setattr(memory, "free_memory", lambda device: 2**26)
+    monkeypatch.setattr(errors, "free_memory", lambda device: 2**26)
     grays = (0, 0.25, 0.5, 0.75, 1)
     with pytest.raises(InputError, match=r"^1000 renders of 64 pixels .* 0\.4 GB"):
         build_scene(ORANGE, 64, 200, backgrounds=grays, rasterizer="numpy")
@@ -107,6 +106,6 @@ def test_renders_need_their_memory_before_any_is_made(monkeypatch):
 
 def test_views_need_their_memory_before_any_is_made(monkeypatch):
     shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
-    monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
+    monkeypatch.setattr(errors, "free_memory", lambda device: 10**6)
     with pytest.raises(InputError, match=r"^100 views of 64 pixels"):
         _ = shown.stacks

@@ -314,7 +314,7 @@ def test_a_light_sphere_shows_even_light_before_white():
 def test_images_that_need_more_than_the_free_memory_are_refused(
     stone, light, function, monkeypatch
 ):
-    monkeypatch.setattr("renderer.memory.free_memory", lambda device: 10**6)
+    monkeypatch.setattr("renderer.errors.free_memory", lambda device: 10**6)
     arguments = (stone, CAMERAS, light)[: 3 if function == "render" else 2]
     getattr(renderer, function)(*arguments, **SMALL)
     with pytest.raises(InputError, match=r"^3 views of 512 samples per side need"):

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from augment.classifier import Label, class_index, nearest
 from augment.progress import progress
-from renderer.errors import InputError, composed, single_line
+from renderer.errors import InputError, composed, require_memory, single_line
 from renderer.io.images import read_square
-from renderer.memory import require_memory
 from train import console
 from train.data.photo import Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names

@@ -20,9 +20,9 @@ from augment.scene.build import load_backgrounds
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
+from renderer.errors import require_memory
 from renderer.image import to_bytes
 from renderer.light.presets import ambient, directional
-from renderer.memory import require_memory
 from renderer.mesh import Mesh, normalize
 from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid

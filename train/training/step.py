@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.network import eval_mode
 from augment.progress import progress_message
-from renderer.errors import InputError
-from renderer.memory import require_memory
+from renderer.errors import InputError, require_memory
 from train import console
 from train.data.batches import Batch
 from train.device import GraphedNetwork, MixedPrecision, compiles

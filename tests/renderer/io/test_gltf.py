@@ -19,10 +19,10 @@ from oracles import corners_of, srgb_of
 from PIL import Image
 from scipy.spatial import KDTree
 
-from renderer import memory
+from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode
-from renderer.io import cutout
+from renderer.io import gltf as gltf_reader
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh, read_parts
 from renderer.mesh import Mesh
@@ -372,7 +372,7 @@ def test_alpha_of_single_texels_is_cut_out(tmp_path):
 
 
 def test_a_mask_with_too_long_a_border_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(cutout, "MAX_FACES", 1000)
+    monkeypatch.setattr(gltf_reader, "MAX_FACES", 1000)
     gltf = masked(hole(16, 5))
     gltf.tree["accessors"][1]["bufferView"] = gltf.view((1e5 * SQUARE_UVS).tobytes())
     with pytest.raises(InputError, match="needs more than 1000 faces"):
@@ -736,8 +736,8 @@ def small_file_of_a_large_image() -> Gltf:
 )
 def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):
     (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
-    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
-    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(errors, "GROUP", tmp_path)
     (tmp_path / "mesh.glb").write_bytes(glb(create()))
     assert (tmp_path / "mesh.glb").stat().st_size < 400_000
     with pytest.raises(InputError, match=r"need .* GB of memory, but only 0\.4 GB are free"):

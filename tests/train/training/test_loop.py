@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from augment.augmentation_settings import AugmentationSettings
 from augment.progress import Phases
 from augment.service import AugmentationService
-from renderer import memory
+from renderer import errors
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data.sets import Split
@@ -189,7 +189,7 @@ def test_a_step_keeps_the_inputs_of_each_layer_that_learns():
 
 def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp_path, monkeypatch):
     (tmp_path / "meminfo").write_text("MemAvailable: 100 kB\n")
-    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
     with pytest.raises(InputError, match=r"batch_size=16 need .* free"):
         fit_noise(make_trainer(tmp_path))
 
