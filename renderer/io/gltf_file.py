@@ -484,7 +484,7 @@ def _specular_glossiness(file: GltfFile, model: dict[str, Any], gloss: bool) -> 
         material = _dimmed(material, 1 - reflectance, placement)
     if not gloss:
         return material
-    factor = min(float(reflectance.mean()) / DIELECTRIC, 1)
+    factor = min(float(reflectance.mean()) / DIELECTRIC, 1.0)
     if np.abs(specular - factor * DIELECTRIC).max() > 1e-3:
         file.file.assume(f"the specular factor {factor:.2g} stands for a specular color")
     material = replace(material, gloss=np.array([1, 0, factor]))

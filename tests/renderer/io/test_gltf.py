@@ -1,11 +1,9 @@
 """Features of glTF 2.0, compared with the formulas of its specification and with closed forms."""
 
 import base64
-import copy
 import io
 import json
 import math
-import struct
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, srgb_of
 from PIL import Image
@@ -26,98 +25,6 @@ from renderer.io import gltf as gltf_reader
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh, read_parts
 from renderer.mesh import Mesh
-
-TYPES = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125}
-KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-SQUARE = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-# v points down in glTF.
-SQUARE_UVS = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]])
-SQUARE_FACES = np.uint16([0, 1, 2, 0, 2, 3])
-
-
-class Gltf:
-    """Tree of a .gltf file with one buffer."""
-
-    def __init__(self) -> None:
-        self.buffer = b""
-        self.tree: dict[str, Any] = {
-            "asset": {"version": "2.0"},
-            "nodes": [{"mesh": 0}],
-            "scenes": [{"nodes": [0]}],
-            "scene": 0,
-            "accessors": [],
-            "bufferViews": [],
-            "materials": [],
-            "meshes": [],
-        }
-
-    def view(self, content: bytes, **entries: Any) -> int:
-        """Append bytes to the buffer, and return the index of their view."""
-        self.buffer += b"\0" * (-len(self.buffer) % 4)
-        view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(content), **entries}
-        self.buffer += content
-        self.tree["bufferViews"].append(view)
-        return len(self.tree["bufferViews"]) - 1
-
-    def array(self, values: np.ndarray, normalized: bool = False) -> int:
-        """Append an array, and return the index of its accessor."""
-        values = np.asarray(values)
-        width = values[0].size
-        accessor = {
-            "bufferView": self.view(values.tobytes()),
-            "componentType": TYPES.get(values.dtype.name, 5126),
-            "count": len(values),
-            "type": KINDS[width],
-            "normalized": normalized,
-        }
-        self.tree["accessors"].append(accessor)
-        return len(self.tree["accessors"]) - 1
-
-    def mesh(
-        self, attributes: dict[str, Any], indices: np.ndarray | None = None, **entries: Any
-    ) -> dict[str, Any]:
-        """Append a mesh with one primitive, and return the primitive."""
-        accessors = {
-            name: values if isinstance(values, int) else self.array(values)
-            for name, values in attributes.items()
-        }
-        primitive = {"attributes": accessors, **entries}
-        if indices is not None:
-            primitive["indices"] = self.array(indices)
-        self.tree["meshes"].append({"primitives": [primitive]})
-        return primitive
-
-    def texture(self, texels: np.ndarray, **sampler: int) -> dict[str, int]:
-        """Append a texture, and return a reference to it."""
-        content = io.BytesIO()
-        Image.fromarray(texels).save(content, "PNG")
-        for kind in ("images", "samplers", "textures"):
-            self.tree.setdefault(kind, [])
-        view = self.view(content.getvalue())
-        self.tree["images"].append({"bufferView": view, "mimeType": "image/png"})
-        self.tree["samplers"].append(sampler)
-        index = len(self.tree["textures"])
-        self.tree["textures"].append({"source": index, "sampler": index})
-        return {"index": index}
-
-    def square(self, **material: Any) -> "Gltf":
-        """Append a square with texture coordinates and a material."""
-        attributes = {"POSITION": SQUARE, "TEXCOORD_0": SQUARE_UVS}
-        self.mesh(attributes, SQUARE_FACES, material=len(self.tree["materials"]))
-        self.tree["materials"].append(material)
-        return self
-
-    def write(self, path: Path) -> Path:
-        """Write the file with its buffer as a data URI."""
-        tree = copy.deepcopy(self.tree)
-        uri = "data:application/octet-stream;base64," + base64.b64encode(self.buffer).decode()
-        tree["buffers"] = [{"byteLength": len(self.buffer), "uri": uri}]
-        path.write_text(json.dumps(tree))
-        return path
-
-    def load(self, folder: Path, gloss: bool = False) -> Mesh:
-        """Write the file and load it, with the axes of the file."""
-        return load_mesh(self.write(folder / "mesh.gltf"), up="z", gloss=gloss)
 
 
 def linear(colors: np.ndarray) -> np.ndarray:
@@ -681,16 +588,6 @@ def test_files_outside_of_the_folder_are_not_read(tmp_path, kind, uri):
         load_mesh(folder / "mesh.gltf")
 
 
-def glb(gltf: Gltf) -> bytes:
-    """Encode a file as .glb."""
-    tree = gltf.tree | {"buffers": [{"byteLength": len(gltf.buffer)}]}
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(gltf.buffer), b"BIN\0") + gltf.buffer
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
 def small_file_of_many_copies() -> Gltf:
     gltf = Gltf()
     gltf.mesh({"POSITION": SQUARE}, np.tile(np.uint16([0, 1, 2]), 10_000))
@@ -738,7 +635,7 @@ def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, m
     (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
     monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
     monkeypatch.setattr(errors, "GROUP", tmp_path)
-    (tmp_path / "mesh.glb").write_bytes(glb(create()))
+    create().write(tmp_path / "mesh.glb")
     assert (tmp_path / "mesh.glb").stat().st_size < 400_000
     with pytest.raises(InputError, match=r"need .* GB of memory, but only 0\.4 GB are free"):
         load_mesh(tmp_path / "mesh.glb")

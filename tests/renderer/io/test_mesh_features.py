@@ -3,7 +3,6 @@
 Ignored features change neither the shape nor the base color.
 """
 
-import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from gltf_files import Gltf
 from numpy.testing import assert_allclose
 from oracles import png_of
 
@@ -112,35 +112,14 @@ def stl(attribute: int, header: bytes = b"", face_count: int = 1) -> dict[str, s
     return {"mesh.stl": start + numbers + attribute.to_bytes(2, "little")}
 
 
-def gltf(**material: Any) -> dict[str, str | bytes]:
-    """Return a .gltf file with more entries of its material."""
-    return gltf_vertices(material=material)
-
-
-def gltf_vertices(
-    name: str = "", width: int = 3, kind: int = 5126, material: Any = None
-) -> dict[str, str | bytes]:
+def gltf(name: str = "", width: int = 3, dtype: Any = np.float32, **material: Any) -> Files:
     """Return a .gltf file with a further attribute, whose vectors begin with 1 0 0 1."""
-    rows = np.array([1, 0, 0, 1][:width] * 3, np.uint8 if kind == 5121 else "<f4")
-    content = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + rows.tobytes()
-    attributes = {"POSITION": 0} | ({name: 1} if name else {})
-    tree = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
-        "materials": [material or {}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": kind, "count": 3, "type": f"VEC{width}"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": rows.nbytes},
-        ],
-        "buffers": [{"byteLength": len(content), "uri": "mesh.bin"}],
-    }
-    return {"mesh.gltf": json.dumps(tree), "mesh.bin": content}
+    file = Gltf()
+    rows = np.array([[1, 0, 0, 1][:width]] * 3, dtype)
+    corners = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    file.mesh({"POSITION": corners} | ({name: rows} if name else {}), material=0)
+    file.tree["materials"] = [material]
+    return {"mesh.gltf": file.text()}
 
 
 def alpha(value: float) -> dict[str, Any]:
@@ -335,7 +314,7 @@ ROWS = [
     Row("opaque BLEND", gltf(alphaMode="BLEND", **alpha(1)), WHITE),
     Row("unlit", gltf(extensions={"KHR_materials_unlit": {}}), IGNORED),
     *(
-        Row(f"{name} VEC{width}", gltf_vertices(name, width), outcome)
+        Row(f"{name} VEC{width}", gltf(name, width), outcome)
         for name, width, outcome in (
             ("COLOR_0", 3, RED),
             ("COLOR_0", 4, RED),
@@ -346,7 +325,7 @@ ROWS = [
             ("_FEATURE_ID_0", 3, WHITE),
         )
     ),
-    Row("_FEATURE_ID_0 of integers", gltf_vertices("_FEATURE_ID_0", 3, 5121), WHITE),
+    Row("_FEATURE_ID_0 of integers", gltf("_FEATURE_ID_0", 3, np.uint8), WHITE),
     Row("text", {"mesh.stl": STL_TEXT}, WHITE),
     Row("text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
     *(
