@@ -192,7 +192,7 @@ def dark_center(images: Tensor) -> Tensor:
     return torch.stack([brightness, 0 * brightness], dim=1)
 
 
-@pytest.mark.parametrize("seed", [1, 3, 6, 7])
+@pytest.mark.parametrize("seed", [1, 6])
 def test_restarts_go_on_with_successes_that_do_not_survive_noise(seed):
     """The first start ends just below the threshold, where noise undoes the success."""
     scene = augment.build_scene([("solid:orange", 0)], SIZE, rasterizer="numpy")
@@ -265,7 +265,8 @@ def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps
     assert result.steps.tolist() == [steps]
 
 
-@pytest.mark.parametrize("parameter", ["pose", pytest.param("material", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("parameter", ["pose", "material"])
 def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(
     attacked,
     tmp_path,

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
 from unittest.mock import Mock
 
 import numpy as np
@@ -237,20 +236,23 @@ def horizontal_cosine(first: np.ndarray, second: np.ndarray) -> float:
 
 
 class TestShots:
-    SHOTS: ClassVar = draw(220, LAB_PATTERNS, seed=3)
+    @pytest.fixture(scope="class")
+    @classmethod
+    def shots(cls) -> list[Shot]:
+        return draw(220, LAB_PATTERNS, seed=3)
 
-    def test_are_equally_many_of_each_family(self):
+    def test_are_equally_many_of_each_family(self, shots):
         expected = [name for name in LAB_PATTERNS for _ in range(20)]
-        assert [shot.lighting for shot in self.SHOTS] == expected
+        assert [shot.lighting for shot in shots] == expected
 
-    def test_of_a_family_are_evenly_from_dim_to_bright(self):
+    def test_of_a_family_are_evenly_from_dim_to_bright(self, shots):
         edges = np.geomspace(0.2, 2.5, 21)
-        brightness = np.array([shot.brightness for shot in self.SHOTS]).reshape(-1, 20)
+        brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
         assert (edges[:-1] <= brightness).all()
         assert (brightness <= edges[1:]).all()
 
-    def test_have_object_camera_and_projector_within_their_ranges(self):
-        for shot in self.SHOTS:
+    def test_have_object_camera_and_projector_within_their_ranges(self, shots):
+        for shot in shots:
             backwards = shot.camera - shot.aim
             half_width = np.linalg.norm(backwards) * np.tan(np.radians(FOV / 2))
             assert 18 <= elevation(backwards) <= 60
@@ -275,22 +277,25 @@ def test_settings_leave_draws_that_they_do_not_name_as_they_were():
 
 
 class TestShotsWithWallsAndTwoProjectors:
-    SHOTS: ClassVar = draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
+    @pytest.fixture(scope="class")
+    @classmethod
+    def shots(cls) -> list[Shot]:
+        return draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
 
-    def test_have_a_pattern_for_each_projector(self):
-        for shot in self.SHOTS:
+    def test_have_a_pattern_for_each_projector(self, shots):
+        for shot in shots:
             assert len(shot.projectors) == len(shot.patterns) == 2
 
-    def test_have_projectors_within_the_elevations_of_the_settings(self):
-        for shot in self.SHOTS:
+    def test_have_projectors_within_the_elevations_of_the_settings(self, shots):
+        for shot in shots:
             for position in shot.projectors:
                 assert 5 <= elevation(position - shot.center) <= 85
 
-    def test_have_a_wall_behind_the_object_unless_it_would_hide_a_projector(self):
-        has_wall = [shot.wall is not None for shot in self.SHOTS]
+    def test_have_a_wall_behind_the_object_unless_it_would_hide_a_projector(self, shots):
+        has_wall = [shot.wall is not None for shot in shots]
         assert any(has_wall)
         assert not all(has_wall)
-        for shot in self.SHOTS:
+        for shot in shots:
             if shot.wall is not None:
                 behind = shot.wall - shot.center
                 cosine = horizontal_cosine(behind, shot.camera - shot.aim)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torchvision.models import get_model
 
 from augment.random_streams import generator
 from renderer.image import to_unit
@@ -26,20 +25,6 @@ from train.training.losses import TrainingLoss
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory) -> Path:
-    """Save a network with batch statistics whose predictions differ between images."""
-    torch.manual_seed(0)
-    network = get_model(NAME)
-    with torch.no_grad():
-        for _ in range(20):
-            network(torch.randn(16, 3, SIZE, SIZE))
-        network.fc.weight *= 10
-    path = tmp_path_factory.mktemp("weights") / "network.pt"
-    torch.save(network.state_dict(), path)
-    return path
 
 
 @pytest.fixture(scope="module")
