@@ -204,7 +204,7 @@ class Part:
     colors: Float[np.ndarray, "F 3 3"]
     texture: UInt8[np.ndarray, "H W 3"] | None
     gloss: Float[np.ndarray, " 3"] | None = None
-    factors: UInt8[np.ndarray, "H W 2"] | None = None
+    factors: UInt8[np.ndarray, "_ _ 2"] | None = None
 
 
 def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) -> list[Part]:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,8 +104,8 @@ def _glb(
     parts = []
     for key in np.unique(keys, axis=0):
         has_key = (keys == key).all(1)
-        surface = _PartSurface(texture_id=int(key[1]), gloss=key[2:].tolist())
-        parts.append(_part_for_trimesh(mesh, normals, surface, has_key))
+        material = _material(mesh, int(key[1]), key[2:].tolist())
+        parts.append(_part_for_trimesh(mesh, normals, material, has_key))
     return trimesh.Scene(parts).export(
         file_type="glb",
         include_normals=False,
@@ -114,23 +113,10 @@ def _glb(
     )
 
 
-@dataclass(frozen=True)
-class _PartSurface:
-    """Texture and gloss that some faces of a mesh have in common.
-
-    Attributes:
-        texture_id: Index of the texture in `Mesh.textures`, or -1 for no texture.
-        gloss: Roughness, metallic and specular factor. Empty for a matte mesh.
-    """
-
-    texture_id: int
-    gloss: list[float]
-
-
 def _part_for_trimesh(
     mesh: Mesh,
     normals: Float[np.ndarray, "F 3 3"],
-    surface: _PartSurface,
+    material: "PBRMaterial",
     is_in_part: Bool[np.ndarray, " F"],
 ) -> "trimesh.Trimesh":
     """Convert the faces of a mesh with one texture and gloss to a mesh of trimesh, with y up."""
@@ -152,7 +138,7 @@ def _part_for_trimesh(
     return trimesh.Trimesh(
         positions,
         faces,
-        visual=TextureVisuals(uv=values[:, 3:5], material=_material(mesh, surface)),
+        visual=TextureVisuals(uv=values[:, 3:5], material=material),
         vertex_attributes={
             _COLOR: linear_colors.float().numpy(),
             _NORMAL: rotated_normals.astype(np.float32),
@@ -161,25 +147,28 @@ def _part_for_trimesh(
     )
 
 
-def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
-    """Create the glTF material of one texture and gloss. Its name ends with the specular factor."""
+def _material(mesh: Mesh, texture_id: int, gloss: list[float]) -> "PBRMaterial":
+    """Create the glTF material of one texture and gloss. Its name ends with the specular factor.
+
+    The index is NO_TEXTURE (-1) for no texture, and `gloss` is empty for a matte mesh.
+    """
     from trimesh.visual.material import PBRMaterial
 
     texture = None
     gloss_texture = None
-    if surface.texture_id >= 0:
-        texture = Image.fromarray(mesh.textures[surface.texture_id])
+    if texture_id >= 0:
+        texture = Image.fromarray(mesh.textures[texture_id])
         if mesh.gloss_textures:
-            factors = mesh.gloss_textures[surface.texture_id]
+            factors = mesh.gloss_textures[texture_id]
             # glTF stores roughness in green and metallic
             # in blue, so an empty red channel is inserted.
             gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
     # Materials need different names. Otherwise trimesh would merge two
     # images with the same bytes, even if their widths and heights differ.
-    name = f"texture {surface.texture_id}"
+    name = f"texture {texture_id}"
     roughness, metallic = MATTE
-    if surface.gloss:
-        roughness, metallic, specular_factor = surface.gloss
+    if gloss:
+        roughness, metallic, specular_factor = gloss
         name = f"{name}, {SPECULAR} {specular_factor}"
     return PBRMaterial(
         name=name,

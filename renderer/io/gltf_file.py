@@ -338,7 +338,7 @@ class Material:
     texture: UInt8[np.ndarray, "H W 3"] | None = None
     alpha: UInt8[np.ndarray, "H W"] | None = None
     gloss: Float[np.ndarray, " 3"] | None = None
-    gloss_texture: UInt8[np.ndarray, "H W 2"] | None = None
+    gloss_texture: UInt8[np.ndarray, "_ _ 2"] | None = None
 
     def placed(self, uvs: np.ndarray) -> tuple["Material", np.ndarray]:
         """Convert texture coordinates (V, 2) of the file to those of `Mesh`.
@@ -438,7 +438,7 @@ def _metallic_roughness(file: GltfFile, entry: dict[str, Any], gloss: bool) -> M
         return material
     factors = [model.get("roughnessFactor", 1), model.get("metallicFactor", 1)]
     factors = [*factors, _specular_factor(entry.get("extensions", {}))]
-    material = replace(material, gloss=np.clip(factors, 0, 1))
+    material = replace(material, gloss=np.clip(factors, 0.0, 1.0))
     if "metallicRoughnessTexture" not in model:
         return material
     image, placement = _image(file, model["metallicRoughnessTexture"])
@@ -487,10 +487,10 @@ def _specular_glossiness(file: GltfFile, model: dict[str, Any], gloss: bool) -> 
     factor = min(float(reflectance.mean()) / DIELECTRIC, 1.0)
     if np.abs(specular - factor * DIELECTRIC).max() > 1e-3:
         file.file.assume(f"the specular factor {factor:.2g} stands for a specular color")
-    material = replace(material, gloss=np.array([1, 0, factor]))
+    material = replace(material, gloss=np.array([1.0, 0, factor]))
     roughness = np.clip(1 - glossiness, 0, 1)
     if placement is None:
-        return replace(material, gloss=np.array([roughness, 0, factor]))
+        return replace(material, gloss=np.array([float(roughness), 0, factor]))
     factors = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
     return _with_gloss_texture(material, factors.astype(np.uint8), placement)
 
