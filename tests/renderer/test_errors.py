@@ -1,14 +1,28 @@
-"""NaN, infinity and too large values are refused by the name of the tensor that holds them."""
+"""Each check of arguments refuses every kind of wrong value by the name of the argument."""
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
-from renderer.errors import MAX_MAGNITUDE, InputError
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    InputError,
+    as_array,
+    as_integers,
+    as_list,
+    as_path,
+    as_tensor,
+    require_choice,
+    require_flag,
+    require_number,
+    require_range,
+    require_whole,
+)
 from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
@@ -112,3 +126,40 @@ def test_magnitudes_that_would_overflow_are_refused_by_name(name, good, take):
     take(good * MAX_MAGNITUDE * 0.99)
     with pytest.raises(InputError, match=f"^{name} "):
         take(good * MAX_MAGNITUDE * 1.01)
+
+
+COMPLEX = torch.ones(2, 3) * 1j
+NO_NUMBERS = ("x", None, 1j, {}, MESH, [None], ["a"], [[1], [1, 2]], COMPLEX, COMPLEX.numpy())
+NO_NUMBERS += (np.full(3, None), torch.ones(3) > 0, True)
+NO_SCALARS = ("2", None, True, 1j, [1.0, 2.0], (5,), torch.ones(2), MESH)
+OUT_OF_RANGE = (-1, 10, math.nan, math.inf)
+# Checks of an argument x, from 0 to 9 if it is a number, and wrong values of each kind.
+CHECKS = [
+    (lambda x: as_tensor("x", x), NO_NUMBERS),
+    (lambda x: as_tensor("x", x), ([torch.ones(1), torch.ones(2)], [torch.ones(1), "a"])),
+    (lambda x: as_integers("x", x), (*NO_NUMBERS, 0.5, [0.5, 1], torch.ones(2))),
+    (lambda x: as_array("x", x), NO_NUMBERS),
+    (lambda x: as_array("x", x, "iu"), (0.5, [0.5], np.ones(2))),
+    (lambda x: as_path("x", x), (None, 3, b"a", ["a"], True, MESH)),
+    (lambda x: as_list("x", x, int, "numbers"), ("ab", b"ab", {}, {1}, 3, None, torch.tensor(1))),
+    (lambda x: as_list("x", x, int, "numbers"), ([None], [1, "a"], torch.ones(2))),
+    (lambda x: require_whole("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, 0.5, 1.0)),
+    (lambda x: require_number("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, -1e-9, 9.001)),
+    (lambda x: require_range("x", x, 0, 9), (*OUT_OF_RANGE, "2", True, 1j, [1.0])),
+    (lambda x: require_choice("x", x, ("a", "b")), ("c", "A", "", None, 3, ["a"], True)),
+    (lambda x: require_flag("x", x), ("no", None, 2, -1, 0.5, 1.0, [True], torch.ones(2) > 0)),
+]
+
+
+@pytest.mark.parametrize(
+    ("check", "value"), [(check, value) for check, values in CHECKS for value in values]
+)
+def test_a_value_of_a_wrong_kind_or_range_is_refused_by_its_name(check, value):
+    with pytest.raises(InputError, match=r"^x\b"):
+        check(value)
+
+
+@pytest.mark.parametrize("value", [0, 9, np.int64(3), np.uint8(9)])
+def test_the_ends_of_a_range_are_inside(value):
+    for check in (require_whole, require_number, require_range):
+        check("x", value, 0, 9)
