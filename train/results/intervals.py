@@ -99,7 +99,8 @@ class Jackknife:
     @property
     def estimate(self) -> Estimate:
         """Value with its 95% interval."""
-        return Estimate(float(self.value), *map(float, self.interval), self.over)
+        low, high = map(float, self.interval)
+        return Estimate(float(self.value), low, high, self.over)
 
 
 def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
@@ -187,8 +188,8 @@ def change(
     """
     one, other = average(after), average(before)
     over = max(one.over, other.over, key=len)
-    ends = change_ends(one, other, is_paired)
-    return Estimate(float(one.value - other.value), *map(float, ends), over)
+    low, high = map(float, change_ends(one, other, is_paired))
+    return Estimate(float(one.value - other.value), low, high, over)
 
 
 def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.ndarray:
