@@ -30,11 +30,11 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def tonemap(
-    radiance: Float[Tensor, "*batch 3 P"],
-    coverage: Float[Tensor, "*#batch 1 P"],
-    background: Float[Tensor, "*#batch channels #P"],
+    radiance: Float[Tensor, "*#batch #channels #P"],
+    coverage: Float[Tensor, "*#batch 1 #P"],
+    background: Float[Tensor, "*#batch #channels #P"],
     encoding: str = "linear",
-) -> Float[Tensor, "*batch 3 P"]:
+) -> Float[Tensor, "*#batch #channels #P"]:
     """Convert the radiance of pixels to image values in front of a background.
 
     The radiance is already multiplied by the coverage, the covered fraction of a pixel.
