@@ -149,7 +149,9 @@ class Mesh:
                 f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
             )
         if self.normal_ids is not None:
-            require_range("the smallest of normal_ids", self.normal_ids.min(), 0, np.inf)
+            # A larger index is a mistake that would take all memory.
+            for index in (self.normal_ids.min(), self.normal_ids.max()):
+                require_range("an index of normal_ids", index, 0, 2**31 - 1)
         else:
             object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
         for name, channels in (("textures", 3), ("gloss_textures", 2)):

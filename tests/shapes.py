@@ -102,7 +102,8 @@ def _holds(value: Any, hint: Any) -> bool:
     if get_origin(hint) in (Union, types.UnionType):
         return any(_holds(value, part) for part in get_args(hint))
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        return isinstance(value, hint)
+        # Functions also take other arrays and lists where they convert them.
+        return not isinstance(value, hint.array_type) or isinstance(value, hint)
     if get_origin(hint) is tuple and isinstance(value, tuple) and Ellipsis not in get_args(hint):
         return all(map(_holds, value, get_args(hint)))
     return hint is not type(None) or value is None

@@ -59,8 +59,8 @@ class Criterion:
             views untargeted.
     """
 
-    source: Int[Tensor, "E V"]
-    target: Int[Tensor, "E V"] | None = None
+    source: Int[Tensor, "*E V"]
+    target: Int[Tensor, "*E V"] | None = None
 
     def select(self, examples: Tensor | slice) -> Criterion:
         """Return the criterion of some of the examples."""
