@@ -41,7 +41,7 @@ def scene(label: str | int) -> augment.Scene:
 def light() -> augment.AttackSettings:
     """Return settings of an attack on light of two steps."""
     lighting = augment.StepSettings(step_size=0.5)
-    return augment.AttackSettings(lighting=lighting, max_steps=2)
+    return augment.AttackSettings(lighting=lighting, max_steps=2, allow_negative=True)
 
 
 BYTES = ((100.0, 110.0, 120.0), (50.0, 60.0, 70.0))
@@ -239,7 +239,7 @@ def test_only_what_the_user_leaves_out_is_assumed(resnet_weights, said):
     assert "assumed" not in second
 
 
-@pytest.mark.parametrize("source", ["torchvision", "timm"])
+@pytest.mark.parametrize("source", [pytest.param("torchvision", marks=pytest.mark.slow), "timm"])
 def test_position_embeddings_tell_the_size(source, said, tmp_path):
     path = tmp_path / "vit.pth"
     if source == "torchvision":

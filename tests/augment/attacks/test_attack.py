@@ -185,6 +185,7 @@ def test_a_network_may_return_logits_in_half_precision(tmp_path, optimizer, dtyp
         lighting=augment.StepSettings(step_size=0.5),
         optimizer=optimizer,
         max_queries=40,
+        allow_negative=True,
         eot=augment.EOTSettings(draws=1),
     )
     result = augment.attack(
