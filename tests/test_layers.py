@@ -70,6 +70,20 @@ def test_no_import_leads_back_to_its_module():
     assert sorted(path, key=order.index) == path
 
 
+def test_the_longest_chain_of_imports_has_at_most_22_modules():
+    """Each further module is one more that a reader opens before the last."""
+    depths: dict[str, int] = {}
+    imported = imported_modules()
+    for name in TopologicalSorter(imported).static_order():
+        depths[name] = 1 + max((depths[other] for other in imported[name]), default=0)
+    assert 15 < max(depths.values()) <= 22
+
+
+def test_a_module_has_at_most_600_lines():
+    lines = {name: path.read_text().count("\n") for name, path in modules().items()}
+    assert [name for name, count in lines.items() if count > 600] == []
+
+
 @pytest.mark.parametrize("package", ALLOWED)
 def test_no_folder_of_a_package_imports_one_that_imports_it(package):
     folders: dict[str, set[str]] = {}

@@ -29,7 +29,7 @@ from torch.nn.functional import linear
 from renderer.errors import MAX_MAGNITUDE, InputError, as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
-from renderer.operators.lamp_paths import SparseTransfer
+from renderer.operators.sparse import SparseTransfer
 from renderer.settings import ImageSettings
 
 # Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.

@@ -22,9 +22,10 @@ from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
 from renderer.mesh import Mesh
 from renderer.operators.apply import COLORS, TransferOperator
-from renderer.operators.lamp_paths import SparseTransfer, concatenate_entries, local_transfer
+from renderer.operators.lamp_paths import local_transfer
 from renderer.operators.rays import Rays, Surface
 from renderer.operators.shadows import Transport, build_transport
+from renderer.operators.sparse import SparseTransfer, concatenate_entries
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import shared_albedo, surface_albedo
 from renderer.surface.gloss import Gloss, SampleGloss, at_samples

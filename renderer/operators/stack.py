@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from renderer.errors import InputError, as_tensor
 from renderer.image import as_background, background_term, clamp, encode
 from renderer.operators.apply import TransferOperator, apply_transfer, require_image_gradient
-from renderer.operators.lamp_paths import SparseTransfer, concatenate_entries
+from renderer.operators.sparse import SparseTransfer, concatenate_entries
 
 # Operators of small images are copied into common tensors (a stack) until their images have
 # this many pixels in total. Larger stacks are not faster.

@@ -19,7 +19,6 @@ from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
-from renderer.operators import lamp_paths
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.operators.lamp_paths import local_radiance, unoccluded
@@ -297,9 +296,9 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
-    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
+    monkeypatch.setattr("renderer.operators.sparse.SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(mesh, basis, samples=2)
-    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
+    monkeypatch.setattr("renderer.operators.sparse.SPARSE_FRACTION", 0)
     dense = operator_of(mesh, basis, samples=2)
     assert sparse.sparse is not None
     assert dense.sparse is None
@@ -315,7 +314,7 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 
 def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(monkeypatch):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
-    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
+    monkeypatch.setattr("renderer.operators.sparse.SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(ball(), basis, samples=2)
     assert len(sparse.nonzero) == len(HARMONICS.nonzero)
     dense_count = Projector(16).size * len(sparse.pixels)
