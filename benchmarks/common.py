@@ -43,30 +43,16 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
         The parser, with --sizes and --rounds.
     """
     parser = argparse.ArgumentParser(
-        description=description,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add(
-        "--sizes",
-        type=int,
-        nargs="+",
-        default=[32, 224],
-        help="pixels per side of the images",
-    )
-    add(
-        "--rounds",
-        type=int,
-        default=21,
-        help="number of rounds, in which all settings take turns",
-    )
+    add("--sizes", type=int, nargs="+", default=[32, 224], help="pixels per side of the images")
+    add("--rounds", type=int, default=21, help="number of rounds, in which all settings take turns")
     return parser
 
 
 def medians(
-    calls: Mapping[Key, Callable[[], object]],
-    rounds: int,
-    device: str = "cpu",
+    calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu"
 ) -> dict[Key, float]:
     """Measure calls with `times_in_turn`, and take the median over the rounds.
 
@@ -83,9 +69,7 @@ def medians(
 
 
 def times_in_turn(
-    calls: Mapping[Key, Callable[[], object]],
-    rounds: int,
-    device: str = "cpu",
+    calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu"
 ) -> dict[Key, list[float]]:
     """Measure every call once per round, on one thread.
 
@@ -140,8 +124,7 @@ def repeats_for(timer: Timer) -> int:
 
 
 def quartiles_of_ratio(
-    times: Sequence[float],
-    reference_times: Sequence[float],
+    times: Sequence[float], reference_times: Sequence[float]
 ) -> tuple[float, float, float]:
     """Compute the quartiles, over the rounds, of the ratio of two calls' times.
 
@@ -231,11 +214,7 @@ def format_cell(value: object) -> object:
     return f"{value:.4g}" if isinstance(value, float) else value
 
 
-def record(
-    rows: Iterable[Row],
-    path: Path | None,
-    device: str = "cpu",
-) -> list[Row]:
+def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[Row]:
     """Print the machine and each row as soon as it is measured, and write a file.
 
     The file is written anew after every row, so that a benchmark that is

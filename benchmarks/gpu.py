@@ -66,11 +66,7 @@ SHAPE = {"geometry": StepSettings("linf", 0.002, "sign", 0.001)}
 
 
 def compare_values(
-    question: str,
-    way: str,
-    value: float,
-    reference_way: str,
-    reference: float,
+    question: str, way: str, value: float, reference_way: str, reference: float
 ) -> Row:
     """Make a row that compares a way with a reference.
 
@@ -95,9 +91,7 @@ def compare_values(
 
 
 def compare_calls(
-    question: str,
-    calls: dict[str, Callable[[], object]],
-    device: str,
+    question: str, calls: dict[str, Callable[[], object]], device: str
 ) -> Iterator[Row]:
     """Time calls in turns, and compare each call with the first.
 
@@ -122,10 +116,7 @@ def load_on(device: str) -> MixedPrecision:
 
 
 def make_service(
-    device: str,
-    steps: int,
-    margin: float = ENDLESS_MARGIN,
-    **attack: StepSettings,
+    device: str, steps: int, margin: float = ENDLESS_MARGIN, **attack: StepSettings
 ) -> AugmentationService:
     """Make a service that attacks oranges from several views before five backgrounds.
 
@@ -145,12 +136,7 @@ def make_service(
     attack_settings = TrainingAttackSettings(max_steps=steps, margin=margin, **attack)
     settings = AugmentationSettings(attack=attack_settings)
     return AugmentationService.from_meshes(
-        meshes,
-        32,
-        settings,
-        views=VIEW_COUNT,
-        samples=2,
-        device=device,
+        meshes, 32, settings, views=VIEW_COUNT, samples=2, device=device
     )
 
 
@@ -290,9 +276,7 @@ def synchronizations(device: str) -> Iterator[Row]:
 
 
 def count_synchronizations(
-    device: str,
-    steps: int,
-    parameters: dict[str, StepSettings],
+    device: str, steps: int, parameters: dict[str, StepSettings]
 ) -> Counter[str]:
     """Count how often the host waits for the GPU at each line of code.
 
@@ -389,8 +373,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         All rows.
     """
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="cuda", help="cpu: a rehearsal")
     parser.add_argument("--questions", nargs="+", choices=QUESTIONS, default=list(QUESTIONS))

@@ -139,11 +139,7 @@ class Load:
 
 
 def build(
-    mesh: Mesh,
-    size: int,
-    samples: int,
-    case: Case,
-    cameras: Sequence[Camera] = (CAMERA,),
+    mesh: Mesh, size: int, samples: int, case: Case, cameras: Sequence[Camera] = (CAMERA,)
 ) -> list[TransferOperator]:
     """Build operators from the light of a case to the images of cameras.
 
@@ -174,9 +170,7 @@ def build_converged(mesh: Mesh, size: int, samples: int, case: Case) -> Transfer
         The operator.
     """
     more_patches = patch.multiple(
-        precomputed,
-        PATCHES=CONVERGED_PATCHES,
-        PATCH_DIRECTIONS=CONVERGED_RAYS_PER_PATCH,
+        precomputed, PATCHES=CONVERGED_PATCHES, PATCH_DIRECTIONS=CONVERGED_RAYS_PER_PATCH
     )
     more_rays = patch.object(rays, "DIRECTIONS", CONVERGED_RAYS)
     with more_rays, more_patches:
@@ -185,10 +179,7 @@ def build_converged(mesh: Mesh, size: int, samples: int, case: Case) -> Transfer
 
 
 def measure_costs(
-    table: str,
-    cases: Mapping[str, Case],
-    samples: Samples,
-    load: Load,
+    table: str, cases: Mapping[str, Case], samples: Samples, load: Load
 ) -> Iterator[Row]:
     """Measure light steps, operators and errors of several kinds of light.
 
@@ -356,9 +347,7 @@ def make_hard_meshes() -> dict[str, Mesh]:
         "rugged: a dented ball": replace(ball, vertices=shell.vertices * dents),
         "open: half a ball": half_ball,
         "self-touching: a ring without a hole": Mesh.plain(
-            torus.vertices,
-            torus.faces,
-            (0.3, 0.8, 0.5),
+            torus.vertices, torus.faces, (0.3, 0.8, 0.5)
         ),
         "touching parts: a ball on a plate": concatenate([ball, make_plate()]),
         "thin: boards 0.03 apart": concatenate(make_boards()),
@@ -478,9 +467,7 @@ def render_with_mitsuba(mesh: Mesh, size: int, case: Case, light: Tensor) -> Mit
     renders = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).flatten(2)
     mean = renders.mean(0)
     return MitsubaImage(
-        image=mean[:3],
-        coverage=mean[3],
-        standard_error=renders.std(0)[:3] / MITSUBA_SEEDS**0.5,
+        image=mean[:3], coverage=mean[3], standard_error=renders.std(0)[:3] / MITSUBA_SEEDS**0.5
     )
 
 
@@ -493,12 +480,7 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--csv", type=Path, default=Path("lights.csv"), help="file of the results")
     add("--mitsuba", action="store_true", help="compare with Mitsuba 3, too")
-    add(
-        "--vertices",
-        type=int,
-        default=4000,
-        help="smallest number of vertices of the cup",
-    )
+    add("--vertices", type=int, default=4000, help="smallest number of vertices of the cup")
     add(
         "--steps-only",
         action="store_true",

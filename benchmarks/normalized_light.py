@@ -236,8 +236,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words of the command line. None takes those of the process.
     """
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("command", choices=["render", "choose", "test"])

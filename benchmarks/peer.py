@@ -36,11 +36,7 @@ class PixelFacePairs:
 
 
 def find_pairs(
-    mesh: Mesh,
-    camera: Camera,
-    size: int,
-    samples: int,
-    rasterizer: Rasterizer,
+    mesh: Mesh, camera: Camera, size: int, samples: int, rasterizer: Rasterizer
 ) -> PixelFacePairs:
     """Rasterize a mesh, and count the samples of each face in each pixel.
 

@@ -103,11 +103,7 @@ def light_steps(view: View) -> Iterator[Contender]:
         light = coefficients(degree, light_dtype, view.device)
         step = LightStep(view, view.operator(SAMPLES, degree, dtype), light)
         yield Contender(
-            setting=f"degree {degree}, {name}",
-            samples=SAMPLES,
-            degree=degree,
-            step=step,
-            call=step,
+            setting=f"degree {degree}, {name}", samples=SAMPLES, degree=degree, step=step, call=step
         )
 
 
@@ -304,9 +300,7 @@ PANELS = {
     "light step": Panel(light_steps, scene.whole_irradiance),
     "building an operator": Panel(builds, scene.whole_irradiance),
     "gradient by the light": Panel(
-        light_gradients,
-        scene.cut_irradiance,
-        mitsuba_parameter="light.data",
+        light_gradients, scene.cut_irradiance, mitsuba_parameter="light.data"
     ),
     "gradient by the vertices": Panel(
         vertex_gradients,
@@ -459,12 +453,7 @@ def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
         style = STYLES.get(group, OTHER_STYLE)
         times, errors = zip(*group_points, strict=True)
         axes.loglog(
-            times,
-            errors,
-            style.line,
-            label=group,
-            ms=style.marker_size,
-            zorder=style.layer,
+            times, errors, style.line, label=group, ms=style.marker_size, zorder=style.layer
         )
     axes.set(title=rows[0]["panel"], xlabel="milliseconds", ylabel="relative error")
     axes.legend(fontsize=7)
@@ -492,19 +481,14 @@ def make_parser() -> argparse.ArgumentParser:
         help="pixels per side of the images in whole light steps",
     )
     add(
-        "--coarse",
-        type=int,
-        default=3,
-        help="subdivisions of the second mesh of whole light steps",
+        "--coarse", type=int, default=3, help="subdivisions of the second mesh of whole light steps"
     )
     add("--whole-steps-only", action="store_true", help="write whole_steps.csv alone")
     return parser
 
 
 def measure_steps_of_meshes(
-    meshes: Sequence[Mesh],
-    rasterizer: Rasterizer,
-    options: argparse.Namespace,
+    meshes: Sequence[Mesh], rasterizer: Rasterizer, options: argparse.Namespace
 ) -> list[Row]:
     """Measure whole light steps of one view and of many views.
 

@@ -129,11 +129,7 @@ def light_step_savings(view: View) -> Iterator[Saving]:
     glossy_view = replace(view, mesh=Gloss(0.4).on(view.mesh))
     glossy_operator = glossy_view.operator()
     glossy_step = LightStep(view, glossy_operator, light)
-    yield Saving(
-        name="a step by the light without gloss",
-        complete=glossy_step,
-        needed=step,
-    )
+    yield Saving(name="a step by the light without gloss", complete=glossy_step, needed=step)
     # A transfer matrix of random numbers has no zeros to skip.
     dense_transfer = torch.rand_like(glossy_operator.transfer)
     dense_operator = replace(glossy_operator, transfer=dense_transfer)
@@ -211,11 +207,7 @@ def vertex_step_savings(view: View) -> Iterator[Saving]:
     )
     for normals, samples in product(("flat", "smooth"), (8, 2)):
         step_with = partial(
-            RenderGradient.by_vertices,
-            view,
-            view.mesh,
-            normals=normals,
-            samples=samples,
+            RenderGradient.by_vertices, view, view.mesh, normals=normals, samples=samples
         )
         yield Saving(
             name=f"a step by the vertices with fixed outlines, {normals}, {samples}² samples",

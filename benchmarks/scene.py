@@ -87,11 +87,7 @@ def ellipsoid(subdivisions: int) -> Mesh:
     return Mesh.plain(ball.vertices * (1.0, 0.9, 0.8), ball.faces, ALBEDO)
 
 
-def coefficients(
-    degree: int,
-    dtype: torch.dtype = torch.float64,
-    device: str = "cpu",
-) -> Tensor:
+def coefficients(degree: int, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Tensor:
     """Return the SH coefficients of the probe and the sun up to a degree.
 
     Args:
@@ -170,10 +166,7 @@ class View:
     device: str = "cpu"
 
     def operator(
-        self,
-        samples: int = SAMPLES,
-        degree: int = DEGREE,
-        dtype: torch.dtype = torch.float32,
+        self, samples: int = SAMPLES, degree: int = DEGREE, dtype: torch.dtype = torch.float32
     ) -> TransferOperator:
         """Build the transfer operator of the view.
 
@@ -262,11 +255,7 @@ class Converged:
         by_vertices: Gradient of the same loss by the vertices, shape (V, 3).
     """
 
-    def __init__(
-        self,
-        view: View,
-        irradiance: Callable[[Tensor], Tensor] = whole_irradiance,
-    ):
+    def __init__(self, view: View, irradiance: Callable[[Tensor], Tensor] = whole_irradiance):
         fractions = CoveredFractions.measure(view)
         vertices = view.vertices(torch.float64).cpu().requires_grad_()
         visible_faces = torch.from_numpy(view.mesh.faces)[fractions.visible_faces]
@@ -337,10 +326,7 @@ class CoveredFractions:
             points = CAMERA.project(view.mesh.vertices)
             points[:, :2] += 2 * fraction_of_sample / (size * samples)
             [face_of_sample] = view.rasterizer.rasterize(
-                points[None],
-                view.mesh.faces,
-                size * samples,
-                closed=view.mesh.closed,
+                points[None], view.mesh.faces, size * samples, closed=view.mesh.closed
             )
             row, column = np.nonzero(face_of_sample >= 0)
             pixel_of_sample = row // samples * size + column // samples
@@ -411,10 +397,7 @@ class MitsubaStep:
 
     def _entries(self, texels: Tensor) -> dict[str, Any]:
         """Describe the scene with an environment map (rows, columns, 3) for Mitsuba."""
-        surface = {
-            "type": "diffuse",
-            "reflectance": {"type": "rgb", "value": list(ALBEDO)},
-        }
+        surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
         mesh = self.view.mesh
         return {
             "type": "scene",
@@ -437,12 +420,7 @@ class MitsubaStep:
         gradient = torch.from_numpy(np.array(drjit.grad(value)))
         drjit.disable_grad(self.parameters[self.parameter])
         if self.parameter == "light.data":
-            [gradient] = torch.autograd.grad(
-                self.texels,
-                self.light,
-                gradient,
-                retain_graph=True,
-            )
+            [gradient] = torch.autograd.grad(self.texels, self.light, gradient, retain_graph=True)
         radiance = np.pi * np.array(drjit.detach(image)).reshape(-1, 3).T
         return Result(
             pixels=torch.arange(self.view.size**2),

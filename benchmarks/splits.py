@@ -113,16 +113,7 @@ PICTURES = (
 # Environment maps of the validation split. The test split has all others.
 VALIDATION_MAPS = ("city", "studio")
 # Solids of the generator that are not oranges.
-OTHER_SOLIDS = (
-    "lemon",
-    "peach",
-    "ball",
-    "apple",
-    "pear",
-    "sweet_pepper",
-    "lemon",
-    "peach",
-)
+OTHER_SOLIDS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "lemon", "peach")
 # Number of different kinds in OTHER_SOLIDS. Repeated kinds get another seed.
 OTHER_KINDS = 6
 ORANGES = 8
@@ -204,9 +195,7 @@ def validation_parts(maps: Mapping[str, str]) -> dict[str, dict[str, Any]]:
 
 
 def test_parts(
-    maps: Mapping[str, str],
-    files: Mapping[str, str],
-    slides: Sequence[str],
+    maps: Mapping[str, str], files: Mapping[str, str], slides: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
     """Return the settings of the parts of the test split.
 
@@ -221,12 +210,7 @@ def test_parts(
         for name, scale in TRAINED.items()
     ]
     seen_meshes = [*trained_meshes, *solids(0)]
-    laboratory = {
-        **UNSEEN,
-        "patterns": UNSEEN_PATTERNS,
-        "slides": slides,
-        "seed": 3,
-    }
+    laboratory = {**UNSEEN, "patterns": UNSEEN_PATTERNS, "slides": slides, "seed": 3}
     environments = [maps[name] for name in sorted(maps) if name not in VALIDATION_MAPS]
     hdri = {
         "environments": environments,
@@ -630,10 +614,7 @@ def load_cifar(path: Path, split: str) -> Split:
 
 
 def difference_rows(
-    title: str,
-    images: str,
-    scores: Scores,
-    reference: Scores,
+    title: str, images: str, scores: Scores, reference: Scores
 ) -> Iterator[list[str]]:
     """Yield the differences of a method from a reference on a folder.
 
@@ -669,12 +650,7 @@ def agreement(pairs: Sequence[tuple[Prediction, Prediction]]) -> float:
     return fmean(first.predicted == second.predicted for first, second in pairs)
 
 
-def one_number_row(
-    network: str,
-    images: str,
-    group: str,
-    values: Sequence[float],
-) -> list[str]:
+def one_number_row(network: str, images: str, group: str, values: Sequence[float]) -> list[str]:
     """Return a row of one number per seed, whose cells after the first are empty.
 
     Args:
@@ -705,8 +681,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words of the command line. None takes those of the process.
     """
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("command", choices=["make", "validate", "test"])
@@ -720,9 +695,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--packages", type=Path)
     add("--size", type=int, default=64, help="pixels per side of a render")
     add(
-        "--part",
-        nargs="+",
-        help="only these folders, such as test/hdri for make and hdri for test",
+        "--part", nargs="+", help="only these folders, such as test/hdri for make and hdri for test"
     )
     add("--table", default="", help="test: name of the table that the scores are for")
     options = parser.parse_args(argv)

@@ -17,12 +17,7 @@ from renderer.visibility.fragments import Fragments
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 
 
-def shade_by_face(
-    fragments: Fragments,
-    vertices: Tensor,
-    light: Tensor,
-    albedo: Tensor,
-) -> Tensor:
+def shade_by_face(fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor) -> Tensor:
     """Compute the same radiance as `shading.radiance`, with operations of torch alone.
 
     Each face is shaded once, instead of once for each of its samples. This is
@@ -46,10 +41,7 @@ def shade_by_face(
 
 ANALYTIC = "analytic"
 AUTOGRAD = "plain autograd, face by face"
-SHADINGS: dict[str, Shading] = {
-    ANALYTIC: shading.radiance,
-    AUTOGRAD: shade_by_face,
-}
+SHADINGS: dict[str, Shading] = {ANALYTIC: shading.radiance, AUTOGRAD: shade_by_face}
 
 
 class LightStep:

@@ -130,8 +130,7 @@ def make_certain(weight: Tensor, bias: Tensor, label: int) -> None:
 
 
 def collate(
-    transform: Callable[[Image.Image], Tensor],
-    batch: list[tuple[Image.Image, int]],
+    transform: Callable[[Image.Image], Tensor], batch: list[tuple[Image.Image, int]]
 ) -> tuple[Tensor, Tensor]:
     """Transform the images of a batch, and stack images and labels.
 
@@ -199,11 +198,7 @@ class PlainLoop:
     def _train_epoch(self, network: nn.Module) -> None:
         """Train a network on all batches."""
         optimizer = torch.optim.SGD(
-            network.parameters(),
-            lr=0.125,
-            momentum=0.9,
-            weight_decay=5e-4,
-            nesterov=True,
+            network.parameters(), lr=0.125, momentum=0.9, weight_decay=5e-4, nesterov=True
         )
         for images, labels in self.loader:
             logits = network(images.to(self.device))
@@ -213,11 +208,7 @@ class PlainLoop:
             optimizer.step()
 
 
-def make_loader(
-    pixels: np.ndarray,
-    labels: np.ndarray,
-    options: argparse.Namespace,
-) -> DataLoader:
+def make_loader(pixels: np.ndarray, labels: np.ndarray, options: argparse.Namespace) -> DataLoader:
     """Make a loader of randomly cropped and mirrored, normalized images.
 
     Args:
@@ -259,12 +250,7 @@ def make_network(class_count: int, options: argparse.Namespace) -> WideResNet:
         options: Parsed command line with depth, width and dropout.
     """
     network = WideResNet(
-        class_count,
-        options.depth,
-        options.width,
-        0.3,
-        mean=(0, 0, 0),
-        std=(1, 1, 1),
+        class_count, options.depth, options.width, 0.3, mean=(0, 0, 0), std=(1, 1, 1)
     )
     for parent in list(network.modules()):
         for name, child in parent.named_children():
@@ -287,11 +273,7 @@ def measure_speed(options: argparse.Namespace) -> Iterator[Row]:
         runs = Path(folder)
         loop = PlainLoop(options)
         certain_run = train_certain_network(runs / "sure", options)
-        attacked = [
-            "augment=adversarial",
-            f"network={certain_run}",
-            "train.learning_rate=1e-6",
-        ]
+        attacked = ["augment=adversarial", f"network={certain_run}", "train.learning_rate=1e-6"]
         # The first epoch of each variant warms up.
         for variant in loop.networks:
             loop.time_epoch(variant)
@@ -393,12 +375,7 @@ def measure_attack(render_count: int, mesh_count: int, steps: int) -> Row:
     memory_before = peak_memory()
     start = time.process_time()
     service = AugmentationService.from_meshes(
-        solids,
-        32,
-        settings,
-        views=view_count,
-        samples=2,
-        rasterizer="numpy",
+        solids, 32, settings, views=view_count, samples=2, rasterizer="numpy"
     )
     precompute(service.scene)
     precomputed = time.process_time()
@@ -487,12 +464,7 @@ def measure_moved(options: argparse.Namespace) -> Iterator[Row]:
             yield row
 
 
-def render_varied(
-    scene: Scene,
-    settings: ExperimentSettings,
-    number: int,
-    is_direct: bool,
-) -> None:
+def render_varied(scene: Scene, settings: ExperimentSettings, number: int, is_direct: bool) -> None:
     """Draw views and lights of a scene, and render all its examples.
 
     Args:
@@ -513,13 +485,11 @@ def render_varied(
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line, with a command for each measurement."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(required=True)
     speed = commands.add_parser(
-        "speed",
-        help="against a plain loop, and the attack's fraction of an epoch",
+        "speed", help="against a plain loop, and the attack's fraction of an epoch"
     )
     add_speed_options(speed)
     renders = commands.add_parser("renders", help="the cost of attacks over the number of renders")
@@ -534,8 +504,7 @@ def make_parser() -> argparse.ArgumentParser:
     renders.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
     renders.add_argument("--steps", type=int, default=1)
     moved = commands.add_parser(
-        "moved",
-        help="renders of a view and a light each, directly and by operators",
+        "moved", help="renders of a view and a light each, directly and by operators"
     )
     moved.set_defaults(measure=lambda options: with_median(measure_moved(options)), device="cpu")
     moved.add_argument("--views", type=int, default=20, help="number of views of each mesh")
@@ -550,11 +519,7 @@ def add_speed_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(measure=lambda options: with_median(measure_speed(options)))
     add = parser.add_argument
     add("--data", type=Path, required=True, help=".npz file, as data=npz reads it")
-    add(
-        "--meshes",
-        default="[solid:orange:0,solid:orange:1]",
-        help="a list, as meshes takes it",
-    )
+    add("--meshes", default="[solid:orange:0,solid:orange:1]", help="a list, as meshes takes it")
     add("--label", default="orange", help="class of the meshes")
     add("--images", type=int, default=512, help="number of images in an epoch that is timed")
     add("--rounds", type=int, default=5)

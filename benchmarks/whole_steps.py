@@ -253,30 +253,16 @@ class ManyViews:
         return {
             LOOP: self.step_by_step,
             "loop over operators, one gradient": AutogradStep(
-                self.image_by_image,
-                self.light,
-                self.loss,
+                self.image_by_image, self.light, self.loss
             ),
-            "image of all, and autograd.grad": AutogradStep(
-                image_of_all,
-                self.light,
-                self.loss,
-            ),
+            "image of all, and autograd.grad": AutogradStep(image_of_all, self.light, self.loss),
             "image_and_gradient of all": partial(
-                self.operators.image_and_gradient,
-                self.light,
-                self.loss.gradient,
-                BACKGROUND,
+                self.operators.image_and_gradient, self.light, self.loss.gradient, BACKGROUND
             ),
         }
 
 
-def measure_many_views(
-    mesh: Mesh,
-    rasterizer: Rasterizer,
-    rounds: int,
-    device: str,
-) -> list[Row]:
+def measure_many_views(mesh: Mesh, rasterizer: Rasterizer, rounds: int, device: str) -> list[Row]:
     """Time whole light steps of many views, in a loop and in one call.
 
     Args:
@@ -303,11 +289,7 @@ def measure_many_views(
 
 
 def time_in_turn(
-    panel: str,
-    calls: Mapping[str, Call],
-    facts: Row,
-    rounds: int,
-    device: str,
+    panel: str, calls: Mapping[str, Call], facts: Row, rounds: int, device: str
 ) -> list[Row]:
     """Time calls in turns, and compare them with the first call.
 

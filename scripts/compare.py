@@ -9,9 +9,7 @@ main = Command(
     body="train.commands.compare:run",
     help=HelpText(
         about="Print a Markdown table of finished runs. With -v, print all tables.",
-        examples=[
-            "pnb-compare 'runs=[runs/a,runs/b]'",
-        ],
+        examples=["pnb-compare 'runs=[runs/a,runs/b]'"],
     ),
 )
 

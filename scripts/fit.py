@@ -9,9 +9,7 @@ main = Command(
     body="train.commands.fit:fit",
     help=HelpText(
         about="Find the camera and the lighting of a photograph.",
-        examples=[
-            "pnb-fit photograph=photo.jpg mask=mask.png mesh=orange.glb",
-        ],
+        examples=["pnb-fit photograph=photo.jpg mask=mask.png mesh=orange.glb"],
     ),
 )
 

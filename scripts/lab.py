@@ -9,9 +9,7 @@ main = Command(
     body="train.commands.lab:render_laboratory",
     help=HelpText(
         about="Path-trace renders of oranges and hard negatives under a projector.",
-        examples=[
-            "pnb-lab out=lab",
-        ],
+        examples=["pnb-lab out=lab"],
     ),
 )
 

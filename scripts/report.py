@@ -35,10 +35,7 @@ main = Command(
     settings=ReportSettings,
     body="train.commands.report:run",
     help=HelpText(
-        about="Write a page of runs, sweeps and attacks.",
-        examples=[
-            "pnb-report runs/sweep",
-        ],
+        about="Write a page of runs, sweeps and attacks.", examples=["pnb-report runs/sweep"]
     ),
     rewrite=name_folders,
 )

@@ -95,18 +95,12 @@ def make_parser(study: str | None, description: str | None) -> argparse.Argument
         The parser.
     """
     parser = argparse.ArgumentParser(
-        description=description,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     if study is not None:
         parser.set_defaults(study=study)
     add = parser.add_argument
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        help="JSON lines are appended to this file",
-    )
+    add("--out", type=Path, required=True, help="JSON lines are appended to this file")
     add(
         "--meshes",
         nargs="+",
@@ -129,9 +123,7 @@ def add_examples(parser: argparse.ArgumentParser) -> None:
 
 
 def prepare(
-    parser: argparse.ArgumentParser,
-    argv: Sequence[str] | None,
-    vertices: int = 0,
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None, vertices: int = 0
 ) -> Setup:
     """Parse the command line, load the network and the meshes, and begin a run in the file.
 
@@ -229,10 +221,7 @@ def last_run(path: Path) -> tuple[Row, list[Row]]:
 
 
 def attack_settings(
-    kind: str,
-    max_steps: int = 30,
-    step: StepSettings | None = None,
-    **overrides: Any,
+    kind: str, max_steps: int = 30, step: StepSettings | None = None, **overrides: Any
 ) -> AttackSettings:
     """Return the settings of the paper's attack (its appendix C).
 
@@ -323,10 +312,7 @@ def subjects_with_views(setup: Setup) -> Iterator[tuple[SceneObject, list[View]]
 
 
 def clean_correct_views(
-    subject: SceneObject,
-    classifier: Classifier,
-    count: int,
-    draws: torch.Generator,
+    subject: SceneObject, classifier: Classifier, count: int, draws: torch.Generator
 ) -> list[View]:
     """Draw random views until the classifier is correct in enough of them.
 

@@ -16,11 +16,7 @@ from benchmarks.common import Row, write_csv
 from train.run_folder import attack_success, read_metrics
 
 # Measures of a round of attacks, with the titles of their axes.
-MEASURES = {
-    "light_change": "L2 norm of the light's change",
-    "steps": "steps",
-    "success": "success",
-}
+MEASURES = {"light_change": "L2 norm of the light's change", "steps": "steps", "success": "success"}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -32,10 +28,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="a run with augment=adversarial")
     parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        help="a .png; its numbers go into a .csv beside it",
+        "--out", type=Path, required=True, help="a .png; its numbers go into a .csv beside it"
     )
     options = parser.parse_args(argv)
     epochs = [

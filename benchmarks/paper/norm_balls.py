@@ -57,19 +57,12 @@ def make_settings(space: str, radius: float | None, steps: int) -> AttackSetting
         step_size = radius if space == "pixels" else radius / 4
         step = StepSettings("linf", radius, "sign", step_size)
     return common.attack_settings(
-        kind,
-        steps,
-        step,
-        allow_negative=space != "physical",
-        batch_size=common.BATCH_SIZE,
+        kind, steps, step, allow_negative=space != "physical", batch_size=common.BATCH_SIZE
     )
 
 
 def search_ball(
-    attacked: AttackResult,
-    space: str,
-    radius: float | None,
-    draws: torch.Generator,
+    attacked: AttackResult, space: str, radius: float | None, draws: torch.Generator
 ) -> dict[str, Tensor]:
     """Check which searches of a ball succeed for each clean-correct example.
 
@@ -190,14 +183,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             draws = generator(options.seed, subject.name, space)
             for radius in RADII[space]:
                 record = {"mesh": subject.name, "space": space, "radius": radius}
-                record |= count_successes(
-                    classifier,
-                    scenes,
-                    space,
-                    radius,
-                    options.steps,
-                    draws,
-                )
+                record |= count_successes(classifier, scenes, space, radius, options.steps, draws)
                 common.append(options.out, record)
 
 

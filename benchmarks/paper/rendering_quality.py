@@ -30,10 +30,7 @@ STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {
 
 
 def measure_confidences(
-    subject: SceneObject,
-    classifier: Classifier,
-    renders: int,
-    seed: int,
+    subject: SceneObject, classifier: Classifier, renders: int, seed: int
 ) -> np.ndarray:
     """Render an object from random cameras until enough renders are classified correctly.
 
@@ -71,9 +68,7 @@ def measure_confidences(
 
 
 def confidences_of_camera(
-    subject: SceneObject,
-    classifier: Classifier,
-    camera: OrthographicCamera,
+    subject: SceneObject, classifier: Classifier, camera: OrthographicCamera
 ) -> np.ndarray:
     """Render an object before each gray, and measure the confidence in the label.
 
@@ -141,12 +136,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = setup.options
     renders_per_mesh = math.ceil(options.renders / len(setup.subjects))
     confidences = {
-        subject.name: measure_confidences(
-            subject,
-            setup.classifier,
-            renders_per_mesh,
-            options.seed,
-        )
+        subject.name: measure_confidences(subject, setup.classifier, renders_per_mesh, options.seed)
         for subject in setup.subjects
     }
     confidences["all"] = np.concatenate(list(confidences.values()))

@@ -19,10 +19,7 @@ from benchmarks.paper import common
 
 
 def measure_attack(
-    subject: SceneObject,
-    classifier: Classifier,
-    view: common.View,
-    settings: AttackSettings,
+    subject: SceneObject, classifier: Classifier, view: common.View, settings: AttackSettings
 ) -> Row:
     """Attack a view, and measure the seconds.
 

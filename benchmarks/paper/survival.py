@@ -54,13 +54,7 @@ def run_attack(overrides: Sequence[str], threads: int) -> Row:
         command = [sys.executable, "-m", "scripts.attack"]
         command += [f"out={folder}/out", "attack.checks=false", *overrides]
         environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-        done = subprocess.run(
-            command,
-            cwd=ROOT,
-            env=environment,
-            capture_output=True,
-            text=True,
-        )
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode == REFUSED:
             return {"refusal": done.stderr.strip().splitlines()[-1]}
         if done.returncode != 0:
@@ -71,12 +65,7 @@ def run_attack(overrides: Sequence[str], threads: int) -> Row:
     return {name: result[name] for name in KEPT_COLUMNS if name in result}
 
 
-def attack_example(
-    mesh: str,
-    attack: str,
-    example: int,
-    options: argparse.Namespace,
-) -> Row:
+def attack_example(mesh: str, attack: str, example: int, options: argparse.Namespace) -> Row:
     """Attack one view of a mesh.
 
     Args:

@@ -38,11 +38,7 @@ NETWORK_STATES = {
     "further_random": "random, as large",
 }
 # Titles of the columns of views, by the states in its records.
-VIEW_STATES = {
-    "first": "as found",
-    "further": "10 steps on",
-    "random": "random, as large",
-}
+VIEW_STATES = {"first": "as found", "further": "10 steps on", "random": "random, as large"}
 
 
 @dataclass(frozen=True)
@@ -335,13 +331,7 @@ def draw_space(axes: Axes, space: str, balls: Sequence[Row]) -> None:
         # Rounding alone can make a length negative.
         lengths = np.maximum([values - lows, highs - values], 0)
         axes.errorbar(radii, values, lengths, label=method, marker="o", capsize=3)
-    axes.set(
-        title=space,
-        xscale="log",
-        xlabel="L∞ radius",
-        ylabel="success",
-        ylim=(-0.03, 1.03),
-    )
+    axes.set(title=space, xscale="log", xlabel="L∞ radius", ylabel="success", ylim=(-0.03, 1.03))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -351,8 +341,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words of the command line. None takes those of the process.
     """
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("records", type=Path, help="file of JSON lines")
     parser.add_argument("--figure", type=Path, help="also draw norm_balls here")

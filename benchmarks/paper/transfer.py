@@ -139,9 +139,7 @@ def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> 
 
 
 def measure_networks(
-    subject: SceneObject,
-    networks: Sequence[Classifier],
-    options: argparse.Namespace,
+    subject: SceneObject, networks: Sequence[Classifier], options: argparse.Namespace
 ) -> None:
     """Attack the first network, and append the predictions of all networks.
 
@@ -161,11 +159,7 @@ def measure_networks(
             settings = common.attack_settings(kind, options.steps)
             problems = [build_problem(settings, scene) for scene in scenes]
             found = find_adversaries(
-                networks[0],
-                problems[0],
-                settings,
-                subject.label,
-                view_count=1,
+                networks[0], problems[0], settings, subject.label, view_count=1
             )
             states = {
                 "before": found.start,
@@ -190,10 +184,7 @@ def measure_networks(
 
 
 def measure_views(
-    subject: SceneObject,
-    classifier: Classifier,
-    set_index: int,
-    options: argparse.Namespace,
+    subject: SceneObject, classifier: Classifier, set_index: int, options: argparse.Namespace
 ) -> None:
     """Attack some views, and append the predictions in views that were not attacked.
 
@@ -282,12 +273,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         default=30,
         help="largest number of steps of a descent (the paper's appendix C)",
     )
-    add(
-        "--targets",
-        nargs="*",
-        default=[],
-        help="networks that are not attacked, NAME[=WEIGHTS]",
-    )
+    add("--targets", nargs="*", default=[], help="networks that are not attacked, NAME[=WEIGHTS]")
     setup = common.prepare(parser, argv, common.VERTICES)
     options = setup.options
     if options.study == "networks":

@@ -56,11 +56,7 @@ def test_a_callable_is_a_classifier_of_the_images_as_they_are():
 
 def test_a_classifier_is_frozen_and_stays_in_eval_mode():
     network = nn.Sequential(
-        nn.Conv2d(3, 4, 3),
-        nn.BatchNorm2d(4),
-        nn.Dropout(0.5),
-        nn.Flatten(),
-        nn.Linear(144, 2),
+        nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2)
     )
     classifier = Classifier(network, 8, ["fig", "lime"])
     images = random_images(8)

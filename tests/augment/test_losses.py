@@ -106,9 +106,7 @@ def test_the_gradient_is_finite_if_the_excluded_class_is_certain():
     ],
 )
 def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others(
-    predicted,
-    label,
-    right,
+    predicted, label, right
 ):
     assert is_correct(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
 

@@ -91,10 +91,7 @@ def serve(scene, labels):
     """Return a function that builds a service; keywords are those of its settings."""
 
     def build(
-        seed: int = 0,
-        labels: Tensor = labels,
-        positive_classes: tuple[int, ...] = (),
-        **settings,
+        seed: int = 0, labels: Tensor = labels, positive_classes: tuple[int, ...] = (), **settings
     ) -> AugmentationService:
         choices = AugmentationSettings(**{"attack": SHORT, **settings})
         return AugmentationService(choices, scene, labels, seed, Phases(), positive_classes)
@@ -182,15 +179,10 @@ def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(folder_image
 
 
 @pytest.mark.parametrize(
-    ("classified", "rows"),
-    [(250, list(range(EXAMPLE_COUNT))), (4, [0, 33, 66, 99])],
+    ("classified", "rows"), [(250, list(range(EXAMPLE_COUNT))), (4, [0, 33, 66, 99])]
 )
 def test_diagnostics_of_random_light_are_those_of_the_classified_images(
-    serve,
-    model,
-    monkeypatch,
-    classified,
-    rows,
+    serve, model, monkeypatch, classified, rows
 ):
     monkeypatch.setattr("augment.service.CLASSIFIED", classified)
     renders = serve(mode="random").regenerate(model, 0)
@@ -440,10 +432,7 @@ def probability_rises(model: nn.Module, before: Tensor, after: Tensor) -> Tensor
 
 
 def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_it(
-    serve,
-    scene,
-    model,
-    labels,
+    serve, scene, model, labels
 ):
     """Tables are complementary to a plate, so that every step raises the plate's probability."""
     is_plate = labels == 0
@@ -465,10 +454,7 @@ def test_hard_negatives_with_a_class_succeed_as_the_studied_class_alone(serve, m
 
 
 def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
-    serve,
-    scene,
-    model,
-    labels,
+    serve, scene, model, labels
 ):
     """Plates belong to neither of the two classes, and tables to the second.
 

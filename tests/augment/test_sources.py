@@ -12,12 +12,7 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 from torch import nn
-from torchvision.models import (
-    get_model,
-    get_model_weights,
-    squeezenet1_0,
-    squeezenet1_1,
-)
+from torchvision.models import get_model, get_model_weights, squeezenet1_0, squeezenet1_1
 
 from augment.classifier import Classifier
 from augment.sources import imagenet_classes, load_classifier
@@ -151,10 +146,7 @@ def as_in_2017(state: dict) -> dict:
     [("densenet121", {}, as_in_2017), ("googlenet", {"init_weights": False}, dict)],
 )
 def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_download(
-    hub,
-    model,
-    arguments,
-    published,
+    hub, model, arguments, published
 ):
     """The file lies where torchvision would have downloaded it."""
     torch.manual_seed(0)
@@ -198,16 +190,10 @@ def write_ten_classes(state: dict, path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("write", "message"),
-    [
-        (write_code, "cannot be read"),
-        (write_ten_classes, "torchvision:squeezenet1_1"),
-    ],
+    [(write_code, "cannot be read"), (write_ten_classes, "torchvision:squeezenet1_1")],
 )
 def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(
-    tmp_path,
-    monkeypatch,
-    write,
-    message,
+    tmp_path, monkeypatch, write, message
 ):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "squeezenet.pth"

@@ -68,8 +68,7 @@ def reproduce(folder: Path, *arguments: str, **environment: str) -> Outcome:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "environment"),
-    [(["gpu"], {}), ([], INPUTS), (["tpu"], INPUTS)],
+    ("arguments", "environment"), [(["gpu"], {}), ([], INPUTS), (["tpu"], INPUTS)]
 )
 def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, environment):
     outcome = reproduce(tmp_path, *arguments, **environment)

@@ -111,10 +111,7 @@ def made_up_run(tiny) -> Callable[..., Path]:
     """
 
     def make(
-        folder: Path,
-        method: str = "none",
-        photographs: dict | None = None,
-        *overrides: str,
+        folder: Path, method: str = "none", photographs: dict | None = None, *overrides: str
     ) -> Path:
         write_config(folder, tiny(f"augment={method}", "seed=0", *overrides))
         (folder / "metrics.jsonl").write_text(log_of_two_epochs())

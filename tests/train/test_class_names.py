@@ -41,10 +41,7 @@ def test_label_of_one_class_is_its_name():
 def test_generated_hard_negatives_of_these_classes_are_left_out():
     negatives = ["solid:fruit", "solid:lemon", {"mesh": "solid:orange", "label": 3}]
     named = class_names.with_class_names(settings(["lemon.glb"], negatives), CLASSES)
-    assert named.hard_negatives == [
-        "solid:fruit",
-        {"mesh": "solid:orange", "label": "orange"},
-    ]
+    assert named.hard_negatives == ["solid:fruit", {"mesh": "solid:orange", "label": "orange"}]
 
 
 @pytest.mark.parametrize(

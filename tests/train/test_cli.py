@@ -120,10 +120,7 @@ def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, 
 
 
 def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
-    call,
-    capsys,
-    tmp_path,
-    two_methods,
+    call, capsys, tmp_path, two_methods
 ):
     assert call("train", "out=here", *two_methods, *SMALL, "scene.views=3") == USER_ERROR
     assert "augment.examples=4" in capsys.readouterr().err
@@ -213,20 +210,10 @@ def test_nothing_is_written_to_a_folder_without_a_run(call, capsys, tmp_path, ov
 
 @pytest.mark.parametrize(
     ("function", "has_trained"),
-    [
-        ("train.training.inputs.load_data", False),
-        ("train.training.run.evaluate_photographs", True),
-    ],
+    [("train.training.inputs.load_data", False), ("train.training.run.evaluate_photographs", True)],
 )
 def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
-    call,
-    capsys,
-    monkeypatch,
-    tmp_path,
-    tiny_npz,
-    photos,
-    function,
-    has_trained,
+    call, capsys, monkeypatch, tmp_path, tiny_npz, photos, function, has_trained
 ):
     monkeypatch.setattr(function, Mock(side_effect=KeyboardInterrupt))
     data = "data=npz", f"data.path={tiny_npz}", f"photos={photos}"

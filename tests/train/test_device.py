@@ -34,14 +34,10 @@ def test_a_device_that_is_not_there_is_one_error(name):
 
 
 @pytest.mark.parametrize(
-    "quota, cores",
-    [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)],
+    "quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)]
 )
 def test_threads_are_no_more_than_the_containers_quota_of_cores(
-    tmp_path,
-    monkeypatch,
-    quota,
-    cores,
+    tmp_path, monkeypatch, quota, cores
 ):
     if quota:
         (tmp_path / "cpu.max").write_text(quota)
@@ -82,12 +78,7 @@ def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkey
     ],
 )
 def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
-    monkeypatch,
-    caplog,
-    where,
-    machine,
-    rule,
-    supported,
+    monkeypatch, caplog, where, machine, rule, supported
 ):
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     monkeypatch.setattr(rule, lambda **options: supported)
@@ -99,11 +90,9 @@ def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
     assert bool(caplog.records) == (where.type == "cpu" and not supported)
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
     assert choose_precision("auto", where, grouped) == expected
-    assert choose_precision(
-        "auto",
-        where,
-        depthwise,
-    ) == ("float32" if where.type == "cpu" else expected)
+    assert choose_precision("auto", where, depthwise) == (
+        "float32" if where.type == "cpu" else expected
+    )
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
@@ -111,7 +100,7 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     exact = network(images)
     inside = []
     network.stem.register_forward_hook(
-        lambda module, arguments, result: inside.append(result.dtype),
+        lambda module, arguments, result: inside.append(result.dtype)
     )
     logits = MixedPrecision(network, "bfloat16")(images)
     logits.sum().backward()
@@ -131,9 +120,7 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
         raise RuntimeError("Failed to find C compiler.")
 
     monkeypatch.setattr(
-        device.torch,
-        "compile",
-        lambda function: (lambda images: images) if works else no_compiler,
+        device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler
     )
     monkeypatch.setattr(device.torch, "zeros", lambda size, device: None)
     compiles.cache_clear()
@@ -149,7 +136,7 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
 
 
 @pytest.mark.filterwarnings(
-    "ignore:The .grad attribute of a Tensor that is not a leaf",
+    "ignore:The .grad attribute of a Tensor that is not a leaf"
 )  # the compiler looks at it
 def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_and_gradient():
     sizes = []

@@ -22,8 +22,7 @@ def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
     overrides = ("train.learning_rate=0.001", "model.dropout=0.0", "train.epochs=2")
     expected = weights_of(tiny(*overrides), tmp_path / "cpu")
     found = weights_of(
-        tiny(*overrides, "train.device=cuda", f"train.compile={compile}"),
-        tmp_path / "gpu",
+        tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu"
     )
     torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3)  # convolutions in TF32
     lines = [read_metrics(tmp_path / name) for name in ("cpu", "gpu")]

@@ -68,12 +68,7 @@ def normalize(images: Tensor) -> Tensor:
     return (images - mean) / std
 
 
-def write(
-    folder: Path,
-    network: nn.Module,
-    description: dict | None = None,
-    **changes,
-) -> Path:
+def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
     """Write best.pt and model.safetensors of a network."""
     architecture = description_of(network) if description is None else description
     state = {"model": network.state_dict(), "architecture": architecture | changes}
@@ -236,8 +231,7 @@ def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, me
 
 
 @pytest.mark.parametrize(
-    ("argument", "value"),
-    [("depth", 15), ("width", 0), ("dropout", 1.0), ("depth", 6 * 10**9 + 4)],
+    ("argument", "value"), [("depth", 15), ("width", 0), ("dropout", 1.0), ("depth", 6 * 10**9 + 4)]
 )
 def test_an_impossible_architecture_is_refused_by_its_argument(argument, value):
     with pytest.raises(InputError, match=f"{argument}={value}"):
@@ -306,9 +300,7 @@ def test_the_code_of_a_network_runs_only_if_it_is_named(tmp_path):
     ids=str,
 )
 def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
-    network,
-    tmp_path,
-    changes,
+    network, tmp_path, changes
 ):
     write(tmp_path, network, **changes)
     for name in (BEST, PUBLISHED):

@@ -64,19 +64,13 @@ def random_mode(file: Path) -> None:
         )
         settings = AugmentationSettings(mode="random")
         service = AugmentationService.from_meshes(
-            meshes,
-            8,
-            settings,
-            views=3,
-            samples=1,
-            rasterizer="numpy",
+            meshes, 8, settings, views=3, samples=1, rasterizer="numpy"
         )
         service.rank = distributed.rank()
         service.world_size = distributed.world_size()
         torch.manual_seed(0)
         made = service.regenerate(
-            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)),
-            0,
+            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0
         )
     torch.save((made.images, made.diagnostics, count[0]), file)
 
@@ -157,11 +151,7 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
         "renderer.samples=2",
         "augment.examples=10",
     ]
-    small += [
-        "meshes=['solid:orange','solid:pear']",
-        "hard_negatives=[]",
-        "scene.views=1",
-    ]
+    small += ["meshes=['solid:orange','solid:pear']", "hard_negatives=[]", "scene.views=1"]
     data = ["data=npz", f"data.path={tiny_npz}", "photos=null", "compare=[]"]
     overrides = [
         "experiment=paper",
@@ -197,11 +187,7 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
 
 @pytest.mark.parametrize(
     "ended, expected",
-    [
-        ("asked", Interrupted),
-        ("unasked", KeyboardInterrupt),
-        ("by an error", ZeroDivisionError),
-    ],
+    [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)],
 )
 def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
     """The run ends where it is asked for, or at the end of the block. Handlers are restored."""

@@ -107,8 +107,7 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     require_same_run(folder, settings)
     file.write_bytes(b"another")
     with pytest.raises(
-        InputError,
-        match=rf"{file.parent}\S* has changed since {folder} began: put it back",
+        InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"
     ):
         require_same_run(folder, settings)
 
@@ -201,15 +200,11 @@ def write_epochs(folder: Path, epochs: range, history=()) -> None:
 
 @pytest.mark.parametrize("done", [0, 2, 3])
 def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
-    tmp_path,
-    done,
-    monkeypatch,
+    tmp_path, done, monkeypatch
 ):
     """Later lines and scores are written again. Lines that were cut or lost come back."""
     monkeypatch.setattr(
-        time,
-        "time",
-        itertools.count(1e9).__next__,
+        time, "time", itertools.count(1e9).__next__
     )  # TensorBoard orders the files by their seconds
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)

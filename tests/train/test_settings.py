@@ -150,15 +150,9 @@ TWO_CLASSES = [
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
         (["label=ornage"], "'ornage' is not a class of the model"),
         ([*TWO_CLASSES, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
-        (
-            [*TWO_CLASSES, "label=[orange,pear,orange]"],
-            "label=[orange, pear, orange]",
-        ),
+        ([*TWO_CLASSES, "label=[orange,pear,orange]"], "label=[orange, pear, orange]"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
-        (
-            [*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"],
-            "meshes[0] has no class",
-        ),
+        ([*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"], "meshes[0] has no class"),
         (
             [
                 *TWO_CLASSES,

@@ -175,8 +175,7 @@ def test_an_attack_on_albedo_paints_the_object_alone(pear_with_prop):
 
 
 def test_an_attack_on_shape_moves_the_object_alone_even_after_it_is_read_back(
-    pear_with_prop,
-    tmp_path,
+    pear_with_prop, tmp_path
 ):
     """A file has its faces in the order of textures, and its vertices in that of places."""
     scene = scene_with(pear_with_prop)

@@ -114,9 +114,7 @@ def test_the_same_seed_gives_the_same_result(attacked):
 
 @pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(
-    by_color,
-    tmp_path,
-    bounces,
+    by_color, tmp_path, bounces
 ):
     options = {"shadows": True, "bounces": bounces, "rasterizer": "numpy", "width": 2.4}
     scene = augment.build_scene([("solid:cup:3", "orange")], 8, **SHARED, **options)

@@ -91,10 +91,7 @@ def test_no_version_of_an_example_that_was_wrong_before_is_a_success(by_color, t
 
 
 def test_each_line_has_the_predictions_before_and_after(saved):
-    for suffix, logits in (
-        ("_before", saved.result.logits_before),
-        ("", saved.result.logits),
-    ):
+    for suffix, logits in (("_before", saved.result.logits_before), ("", saved.result.logits)):
         for line, probabilities in zip(saved.lines, logits.softmax(1), strict=True):
             assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
             assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]

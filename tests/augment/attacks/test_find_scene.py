@@ -44,10 +44,7 @@ def built(settings: SceneSettings, shared: bool = False) -> augment.Scene:
 
 
 def found(
-    score: Score,
-    settings: SceneSettings,
-    cameras: int = 40,
-    shared: bool = False,
+    score: Score, settings: SceneSettings, cameras: int = 40, shared: bool = False
 ) -> SceneSettings:
     """Search for a scene."""
     build = partial(built, shared=shared)
@@ -63,8 +60,7 @@ def test_a_scene_that_is_classified_correctly_stays_as_it_is():
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("settings", [SceneSettings(views=2), SceneSettings(fov=40.0)])
 def test_a_camera_and_a_light_are_found_in_which_all_views_are_classified_correctly(
-    settings,
-    shared,
+    settings, shared
 ):
     chosen = found(bright_and_small, settings, shared=shared)
     assert chosen != settings

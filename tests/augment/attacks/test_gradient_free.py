@@ -28,11 +28,7 @@ def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatc
 
     monkeypatch.setattr(SceneProblem, "render", record)
     result = attacked(
-        {"lighting": ball},
-        optimizer=optimizer,
-        max_queries=20,
-        margin=100.0,
-        allow_negative=False,
+        {"lighting": ball}, optimizer=optimizer, max_queries=20, margin=100.0, allow_negative=False
     )
     values = torch.cat(rendered)
     offsets = values - result.problem.start

@@ -267,9 +267,7 @@ def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps
 @pytest.mark.slow
 @pytest.mark.parametrize("parameter", ["pose", "material"])
 def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(
-    attacked,
-    tmp_path,
-    parameter,
+    attacked, tmp_path, parameter
 ):
     """Their images are rendered from files. Without the noise margin, fewer survive."""
     rates = {}

@@ -88,7 +88,7 @@ def test_a_matte_object_attacked_in_its_material_has_the_gloss_that_the_attack_b
     "attack",
     [
         augment.AttackSettings(
-            material=MaterialSettings(roughness=0, metallic=0, specular_factor=0, hue=30),
+            material=MaterialSettings(roughness=0, metallic=0, specular_factor=0, hue=30)
         ),
         augment.AttackSettings(lighting=augment.StepSettings()),
     ],
@@ -229,9 +229,7 @@ def irradiance_rms(light: Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("sky", "is_told"),
-    [(0.0, True), (1.5, False)],
-    ids=["a sun alone", "a sun in a bright sky"],
+    ("sky", "is_told"), [(0.0, True), (1.5, False)], ids=["a sun alone", "a sun in a bright sky"]
 )
 def test_light_whose_irradiance_changes_as_it_is_made_physical_is_told(sky, is_told):
     """A sun of degree 6 is negative in places. Removing this changes the irradiance by 17 %.

@@ -81,11 +81,7 @@ def varnish_reflectance(roughness: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def brdf(
-    normals: np.ndarray,
-    view: np.ndarray,
-    light: np.ndarray,
-    roughness: float,
-    metallic: float,
+    normals: np.ndarray, view: np.ndarray, light: np.ndarray, roughness: float, metallic: float
 ) -> np.ndarray:
     """Return π times the BRDF (S, N) of glTF for a gray surface.
 
@@ -143,11 +139,7 @@ def texels(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def integrated(
-    path: Path,
-    mesh: Mesh,
-    camera: Camera,
-    roughness: float,
-    metallic: float,
+    path: Path, mesh: Mesh, camera: Camera, roughness: float, metallic: float
 ) -> np.ndarray:
     """Return the radiance (P, 3) of the pear's pixels by quadrature over all texels."""
     rasterizer = choose("numpy")

@@ -238,12 +238,7 @@ def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator
     item = shown.objects[0]
     cameras = [row.cameras[0] for row in shown.examples]
     operators = build_operators(
-        item.mesh,
-        cameras,
-        shown.settings,
-        shown.rasterizer,
-        item.albedo_scale,
-        shown.basis,
+        item.mesh, cameras, shown.settings, shown.rasterizer, item.albedo_scale, shown.basis
     )
     assert all(operator.sparse is not None for operator in operators)
     single_light = light.clone().requires_grad_(True)
@@ -263,10 +258,7 @@ def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator
 )
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_a_moved_mesh_under_moved_lamps_looks_like_a_mesh_built_there(
-    normals,
-    shadows,
-    distance,
-    tolerance,
+    normals, shadows, distance, tolerance
 ):
     """Operators sum over lights and samples in other code. Shadows of the sky are frozen."""
     shown = scene(**CUP, normals=normals, shadows=shadows)
@@ -275,9 +267,7 @@ def test_a_moved_mesh_under_moved_lamps_looks_like_a_mesh_built_there(
     vertices = before + distance * (torch.rand(before.shape, generator=draws) - 0.5)
     positions = torch.tensor(LAMPS.positions) + 0.3 * torch.randn(2, 3, generator=draws)
     conditions = Conditions(
-        shown.lights,
-        vertices.expand(2, -1, -1),
-        positions=positions.expand(2, -1, -1),
+        shown.lights, vertices.expand(2, -1, -1), positions=positions.expand(2, -1, -1)
     )
     mesh = replace(shown.mesh(0), vertices=vertices.double().numpy())
     objects = [replace(shown.objects[0], mesh=mesh)]
@@ -324,8 +314,7 @@ def test_images_and_gradients_by_shape_and_color_add_up_over_the_lights():
 
 
 @pytest.mark.parametrize(
-    ("parameter", "light"),
-    [("projector", "projector"), ("positions", "lamps")],
+    ("parameter", "light"), [("projector", "projector"), ("positions", "lamps")]
 )
 def test_an_attack_on_a_light_that_the_scene_lacks_is_refused(parameter, light):
     with pytest.raises(InputError, match=f"{light}"):

@@ -35,10 +35,7 @@ def test_a_mesh_without_colors_takes_the_given_one(plain_mesh):
 
 @pytest.mark.parametrize(
     ("mesh", "color", "message"),
-    [
-        ("solid:orange", [1.0, 0.0, 0.0], "solid:orange"),
-        ("solid:orange:x", None, "solid:orange:x"),
-    ],
+    [("solid:orange", [1.0, 0.0, 0.0], "solid:orange"), ("solid:orange:x", None, "solid:orange:x")],
 )
 def test_colors_and_seeds_that_a_mesh_cannot_have_are_refused(mesh, color, message):
     with pytest.raises(InputError, match=message):

@@ -66,11 +66,7 @@ def first_image(scene: Scene) -> torch.Tensor:
     [(100, 2, 5, None, 10), (100, 2, 5, 10, 10), (None, 7, 5, 36, 36)],
 )
 def test_views_follow_from_examples_meshes_and_backgrounds(
-    examples,
-    meshes,
-    backgrounds,
-    views,
-    expected,
+    examples, meshes, backgrounds, views, expected
 ):
     assert count_views(examples, meshes, backgrounds, views) == expected
 
@@ -300,10 +296,7 @@ def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small
 
 
 def images_of_moved(
-    scene: Scene,
-    mesh: Mesh,
-    vertices: np.ndarray,
-    lights: torch.Tensor,
+    scene: Scene, mesh: Mesh, vertices: np.ndarray, lights: torch.Tensor
 ) -> torch.Tensor:
     """Render each example (E, 3, H, W) by the operator of its own moved mesh."""
     images = []

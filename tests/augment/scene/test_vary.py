@@ -36,12 +36,7 @@ EVEN_LIGHT = ambient(torch.full((3,), 0.1))
 
 def built(*meshes: str, views: int = 1, **options) -> Scene:
     """Build a scene of each mesh before black; the label is the mesh's name."""
-    choices = {
-        "backgrounds": [0.0],
-        "light": EVEN_LIGHT,
-        "normals": "flat",
-        "rasterizer": "numpy",
-    }
+    choices = {"backgrounds": [0.0], "light": EVEN_LIGHT, "normals": "flat", "rasterizer": "numpy"}
     return augment.build_scene([(mesh, mesh) for mesh in meshes], SIZE, views, **choices | options)
 
 
@@ -219,8 +214,7 @@ ONCE = VariationSettings(shift=0.1, instances=True, azimuth=30.0)
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"normals": "smooth", "encoding": "srgb"}, {"fov": 40.0, "ground": [0.5, 0.4, 0.3]}],
+    "options", [{"normals": "smooth", "encoding": "srgb"}, {"fov": 40.0, "ground": [0.5, 0.4, 0.3]}]
 )
 def test_views_that_are_shown_once_are_shaded_as_their_operators_shade_them(options):
     """Irradiance by a polynomial of each normal equals that by 31 coefficients per sample."""
@@ -324,9 +318,7 @@ def test_tables_are_refused_in_scenes_where_they_would_be_wrong(options):
 
 LOCAL_LIGHTS = {
     "lamps": LampsSettings(
-        positions=[[0.6, 1.5, 2.0], [0.0, -2.0, 1.5]],
-        radius=0.3,
-        start=[[2, 1, 0.5], [0.5, 1, 2]],
+        positions=[[0.6, 1.5, 2.0], [0.0, -2.0, 1.5]], radius=0.3, start=[[2, 1, 0.5], [0.5, 1, 2]]
     ),
     "projector": ProjectorSettings(polar=20.0, pattern=0.8),
 }
@@ -431,13 +423,9 @@ def test_directional_light_comes_from_the_cameras_side(scene, sunlight):
     for camera, (x, y, z) in zip(cameras_of(scene), directions.tolist(), strict=True):
         polar = math.degrees(math.acos(z))
         azimuth = math.degrees(math.atan2(y, x))
-        direct = max(
-            abs(polar - camera.polar),
-            abs(math.remainder(azimuth - camera.azimuth, 360)),
-        )
+        direct = max(abs(polar - camera.polar), abs(math.remainder(azimuth - camera.azimuth, 360)))
         beyond_pole = max(
-            abs(-polar - camera.polar),
-            abs(math.remainder(azimuth - 180 - camera.azimuth, 360)),
+            abs(-polar - camera.polar), abs(math.remainder(azimuth - 180 - camera.azimuth, 360))
         )
         assert min(direct, beyond_pole) <= 70 + 1e-4
 

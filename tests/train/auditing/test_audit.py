@@ -145,9 +145,7 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, l
 
 
 def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
-    views,
-    tmp_path,
-    lamps_alone,
+    views, tmp_path, lamps_alone
 ):
     views = replace(views, count=2)
     attacked = darker_than(0.5)
@@ -246,11 +244,7 @@ class TestAWholeAudit:
         assert summary["n"]["positives"] == summary["n"]["negatives"] == 2
 
     def test_continues_if_it_was_stopped_and_writes_the_same(
-        self,
-        folder,
-        given,
-        monkeypatch,
-        tmp_path,
+        self, folder, given, monkeypatch, tmp_path
     ):
         expected = results_of(folder)
         assert len(expected) > 15
@@ -344,10 +338,7 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
     ],
 )
 def test_what_cannot_be_audited_is_refused_before_anything_is_written(
-    given,
-    tmp_path,
-    changes,
-    message,
+    given, tmp_path, changes, message
 ):
     with pytest.raises(InputError, match=message):
         run_audit(AuditSettings(**given | changes))

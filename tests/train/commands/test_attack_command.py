@@ -73,9 +73,7 @@ class TestAnAttack:
         return Attacked(names, capsys.readouterr().out, folder, lines)
 
     def test_prints_what_it_attacked_writes_its_files_and_records_its_settings(
-        self,
-        attacked,
-        tmp_path,
+        self, attacked, tmp_path
     ):
         parameters = "+".join(attacked.names)
         assert attacked.printed.startswith(f"solid:orange:0: {parameters} against run:")
@@ -192,9 +190,7 @@ def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
 
 
 def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_other_meshes(
-    run,
-    tmp_path,
-    capsys,
+    run, tmp_path, capsys
 ):
     assert (
         run(
@@ -238,9 +234,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    MISTAKES,
-    ids=[" ".join(arguments) for arguments, _ in MISTAKES],
+    ("arguments", "message"), MISTAKES, ids=[" ".join(arguments) for arguments, _ in MISTAKES]
 )
 def test_a_mistake_is_an_error_in_one_line(run, tmp_path, capsys, arguments, message):
     assert run(*arguments) == USER_ERROR

@@ -126,19 +126,13 @@ class TestARasterizerThatDoesNotStart:
     ("arguments", "message"),
     [
         (["attack.restarts=2"], "restarts draws from the norm-balls"),
-        (
-            ["target=[lime]", "scene.views=2", "attack.shared=true"],
-            "names 1 classes for 2 views",
-        ),
+        (["target=[lime]", "scene.views=2", "attack.shared=true"], "names 1 classes for 2 views"),
         (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
         (
             ["meshes=[{mesh: a, props: [solid:cup]}]"],
             r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'",
         ),
-        (
-            ["meshes=[{mesh: a, props: [{mesh: b}]}]"],
-            r"meshes\[0\].*at is not set",
-        ),
+        (["meshes=[{mesh: a, props: [{mesh: b}]}]"], r"meshes\[0\].*at is not set"),
         (
             ["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
             r"props\[0\]\.at=\[1\]: give two numbers",

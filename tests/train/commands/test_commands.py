@@ -134,16 +134,10 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(
-    ("command", "start"),
-    MISTAKES,
-    ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES],
+    ("command", "start"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
 )
 def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
-    call,
-    here,
-    capsys,
-    command,
-    start,
+    call, here, capsys, command, start
 ):
     before = sorted(here.rglob("*"))
     assert call(*command) == USER_ERROR
@@ -155,9 +149,7 @@ def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
 
 
 @pytest.mark.parametrize(
-    "command",
-    [EVALUATE, ["attack", "network=run:1.10"], ["lab"]],
-    ids=lambda given: given[0],
+    "command", [EVALUATE, ["attack", "network=run:1.10"], ["lab"]], ids=lambda given: given[0]
 )
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
     with sole_writer("out", here / "out"):

@@ -92,14 +92,7 @@ def irradiance(mesh: Mesh, camera: Camera, light: Tensor) -> Tensor:
 
 
 def check_fit(
-    call,
-    capsys,
-    here,
-    name: str,
-    camera: Camera,
-    radiance: Tensor,
-    encoding: str,
-    determined: bool,
+    call, capsys, here, name: str, camera: Camera, radiance: Tensor, encoding: str, determined: bool
 ):
     mesh = load_object(ObjectSettings(name, label="orange")).mesh
     side = MARGIN * photograph(here, mesh, camera, radiance, encoding)
@@ -153,10 +146,7 @@ def check_fit(
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["srgb", "linear"])
 def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
-    call,
-    tmp_path,
-    capsys,
-    encoding,
+    call, tmp_path, capsys, encoding
 ):
     pytest.importorskip("mitsuba")
     mesh = tmp_path / "pear.glb"

@@ -16,16 +16,7 @@ from train.run_config import format_command
 from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]
-NAMES = (
-    "train",
-    "attack",
-    "audit",
-    "compare",
-    "evaluate",
-    "fit",
-    "lab",
-    "report",
-)
+NAMES = ("train", "attack", "audit", "compare", "evaluate", "fit", "lab", "report")
 
 
 def help_of(name: str, *arguments: str) -> str:
@@ -80,17 +71,11 @@ def test_help_shows_the_values_that_the_given_choices_have():
 
 @pytest.mark.parametrize(
     ("program", "path", "word", "completed"),
-    [
-        ("bin/pnb-train", str(ROOT), "experiment=b", "experiment=best"),
-    ],
+    [("bin/pnb-train", str(ROOT), "experiment=b", "experiment=best")],
     ids=["installed"],
 )
 def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(
-    tmp_path,
-    program,
-    path,
-    word,
-    completed,
+    tmp_path, program, path, word, completed
 ):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "pnb-train").write_text("from train.__main__ import main\nmain()")

@@ -149,11 +149,7 @@ def harden(here, monkeypatch) -> Callable[..., Path]:
             "train.batch_size=8",
             "train.precision=float32",
         ]
-        scene = [
-            "meshes=solid:orange",
-            "hard_negatives=solid:lemon",
-            "scene.backgrounds=[0.2]",
-        ]
+        scene = ["meshes=solid:orange", "hard_negatives=solid:lemon", "scene.backgrounds=[0.2]"]
         machine = [
             "train.device=cpu",
             "train.threads=1",

@@ -87,11 +87,7 @@ def test_a_folder_with_results_of_any_command_is_refused_by_its_argument(tmp_pat
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("other", ["evaluate", pytest.param("attack", marks=pytest.mark.slow)])
 def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it_is(
-    call,
-    here,
-    capsys,
-    command,
-    other,
+    call, here, capsys, command, other
 ):
     write_results(here / "out", other)
     before = contents(here)

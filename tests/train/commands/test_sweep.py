@@ -145,10 +145,7 @@ def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
 
 
 def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
-    run_sweep,
-    folder_of,
-    swept,
-    capsys,
+    run_sweep, folder_of, swept, capsys
 ):
     folders = [folder_of(swept, f"seed={seed}") for seed in (0, 1)]
     before = read_files(folders)
@@ -160,12 +157,7 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
 
 
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
-    run_sweep,
-    folder_of,
-    swept,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    run_sweep, folder_of, swept, tmp_path, monkeypatch, capsys
 ):
     evaluate = loop.evaluate
     handler = signal.getsignal(signal.SIGTERM)
@@ -197,11 +189,7 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
 
 
 def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_other(
-    run_sweep,
-    folder_of,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    run_sweep, folder_of, tmp_path, monkeypatch, capsys
 ):
     fit = Run.fit
 
@@ -256,12 +244,7 @@ def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, t
 
 @pytest.mark.parametrize("is_finished", [True, False])
 def test_a_run_with_other_settings_is_refused_before_any_is_trained(
-    run_sweep,
-    folder_of,
-    swept,
-    tmp_path,
-    capsys,
-    is_finished,
+    run_sweep, folder_of, swept, tmp_path, capsys, is_finished
 ):
     parent = shutil.copytree(swept, tmp_path / "edited")
     folder = folder_of(parent, "seed=0")
@@ -330,6 +313,5 @@ def test_a_preempted_job_of_submitit_queues_itself_again_and_ends_with_the_same_
 
     assert run_sweep(tmp_path / "undisturbed", epochs) == 0
     require_same_weights(
-        folder_of(tmp_path / "jobs", epochs),
-        folder_of(tmp_path / "undisturbed", epochs),
+        folder_of(tmp_path / "jobs", epochs), folder_of(tmp_path / "undisturbed", epochs)
     )

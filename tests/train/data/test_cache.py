@@ -21,9 +21,7 @@ TENSORS = {
 def test_any_change_of_the_sources_is_another_key(tmp_path):
     package = tmp_path / "package"
     shutil.copytree(
-        Path(renderer.__file__).parent,
-        package,
-        ignore=shutil.ignore_patterns("__pycache__"),
+        Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
     )
     assert source_key(package) == source_key(Path(renderer.__file__).parent)
     module = package / "camera.py"
@@ -102,10 +100,7 @@ def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeyp
     ],
 )
 def test_the_folder_is_the_users_cache_folder_unless_chosen(
-    choice,
-    environment,
-    folder,
-    monkeypatch,
+    choice, environment, folder, monkeypatch
 ):
     monkeypatch.delenv("XDG_CACHE_HOME")
     for name, value in environment.items():

@@ -34,11 +34,7 @@ def files(tmp_path) -> ImageFiles:
     image.save(tmp_path / "f.gif", save_all=True, append_images=[ramp(90, 120).rotate(90)])
     ramp(1500, 1200).save(tmp_path / "g.jpg")
     return ImageFiles(
-        tmp_path,
-        tuple(item.path for item in find_unlabeled(tmp_path)),
-        SIZE,
-        workers=0,
-        skip=False,
+        tmp_path, tuple(item.path for item in find_unlabeled(tmp_path)), SIZE, workers=0, skip=False
     )
 
 
@@ -55,13 +51,9 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     rows = torch.zeros(200, dtype=torch.int64)
     seeds = torch.arange(200)
     (crops,) = files.crops([rows], [seeds])
-    halves = ImageFiles(
-        files.folder,
-        files.paths,
-        SIZE,
-        workers=2,
-        skip=False,
-    ).crops(rows.split(100), seeds.split(100))
+    halves = ImageFiles(files.folder, files.paths, SIZE, workers=2, skip=False).crops(
+        rows.split(100), seeds.split(100)
+    )
     assert torch.equal(crops, torch.cat(list(halves)))
     places = crops[:, :2].float() / 255
     spans = [
@@ -96,11 +88,7 @@ def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, cap
 
 def load_files(folder: Path, skip: bool) -> ImageFiles:
     return ImageFiles(
-        folder,
-        tuple(item.path for item in find_unlabeled(folder)),
-        SIZE,
-        workers=0,
-        skip=skip,
+        folder, tuple(item.path for item in find_unlabeled(folder)), SIZE, workers=0, skip=skip
     )
 
 
@@ -131,8 +119,7 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
 
 
 def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(
-    tmp_path,
-    monkeypatch,
+    tmp_path, monkeypatch
 ):
     (tmp_path / "a.png").write_bytes(b"no image")
     for number in range(9):

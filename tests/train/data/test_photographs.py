@@ -43,8 +43,7 @@ def touch(folder: Path, *names: str) -> Path:
 def load_one(path: Path) -> np.ndarray:
     """Return the image as integers, shape (32, 32, 3)."""
     _, images, _ = load_photographs(
-        path.parent,
-        [Photograph(PurePosixPath(path.name), "orange", None)],
+        path.parent, [Photograph(PurePosixPath(path.name), "orange", None)]
     )
     return images[0].permute(1, 2, 0).numpy().astype(int)
 
@@ -272,9 +271,7 @@ def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_p
 def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
     coarse = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8))
     path = save(
-        tmp_path / "a.jpg",
-        coarse.resize((2333, 1801), Image.Resampling.BICUBIC),
-        quality=90,
+        tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90
     )
     with Image.open(path) as image:
         whole = save(tmp_path / "a.bmp", image.convert("RGB"))
@@ -302,8 +299,7 @@ def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expecte
 
 def test_unreadable_images_are_named_or_skipped(tmp_path):
     cut = save(
-        tmp_path / "cut.jpg",
-        np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8),
+        tmp_path / "cut.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     )
     cut.write_bytes(cut.read_bytes()[:2000])
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")

@@ -90,9 +90,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
     for label, name in enumerate(["lime", "fig"]):
         for number in range(10):
             save_image(
-                tmp_path / name / f"{number}.png",
-                100 * label + number,
-                size=(20 + number, 30),
+                tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30)
             )
     (tmp_path / ".thumbnails").mkdir()
     data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
@@ -143,8 +141,7 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
 
 
 def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(
-    tmp_path,
-    caplog,
+    tmp_path, caplog
 ):
     for number in range(4):
         save_image(tmp_path / "fig" / f"{number}.png", 0)

@@ -146,9 +146,7 @@ UNSAFE_LABEL = {"mesh": "solid:orange", "label": "other_../../x"}
     ],
 )
 def test_what_cannot_be_photographed_is_refused_before_anything_is_written(
-    tmp_path,
-    changes,
-    message,
+    tmp_path, changes, message
 ):
     with pytest.raises(InputError, match=message):
         lab.write_laboratory(settings(tmp_path / "lab", **changes))
@@ -428,8 +426,7 @@ def test_a_texture_lies_upright_on_its_faces():
 
 @pytest.mark.parametrize(("albedo_scale", "brightness"), [(1, 1), (2, 1), (1, 0.5)])
 def test_a_card_reflects_its_linear_albedo_times_its_scale_and_the_brightness(
-    albedo_scale,
-    brightness,
+    albedo_scale, brightness
 ):
     """Add the gloss: 4 % of the light times the peak of the GGX distribution, 1 / (4 α²)."""
     shot = frontal(brightness=brightness)
@@ -457,9 +454,7 @@ def test_an_object_stands_on_the_table():
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_every_azimuth(
-    seed,
-):
+def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_every_azimuth(seed):
     """A map of one direction, off the vertical, is a distant lamp: the table under it is even."""
     sky = np.zeros((64, 128, 3), np.float32)
     sky[16, 40] = 1e4

@@ -161,9 +161,7 @@ def test_an_attack_is_shown_with_its_rates_and_the_outcome_of_each_example(page)
 
 
 def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_training(
-    finished,
-    tmp_path,
-    monkeypatch,
+    finished, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("train.results.page.plot_curves", lambda *_: 1 / 0)
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
@@ -196,10 +194,7 @@ def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
 def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dark(
-    page,
-    browser,
-    width,
-    scheme,
+    page, browser, width, scheme
 ):
     view = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
     urls = []

@@ -56,9 +56,7 @@ def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
     """
 
     def make(
-        names: Sequence[str],
-        logits: Sequence,
-        classes: list[str],
+        names: Sequence[str], logits: Sequence, classes: list[str]
     ) -> tuple[TableModel, list[str], Path]:
         folder = tmp_path / "photos"
         for red, name in enumerate(names):
@@ -287,17 +285,10 @@ class TestAnOperatingPoint:
 
     @pytest.mark.parametrize("is_in_sample", [True, False])
     @pytest.mark.parametrize(
-        ("rate", "recall", "false_positives"),
-        [(0.4, 1, 2), (0.39, 0, 0), (0.8, 3, 4), (0.6, 1, 2)],
+        ("rate", "recall", "false_positives"), [(0.4, 1, 2), (0.39, 0, 0), (0.8, 3, 4), (0.6, 1, 2)]
     )
     def test_is_the_lowest_threshold_within_its_rate(
-        self,
-        fruit,
-        tmp_path,
-        rate,
-        recall,
-        false_positives,
-        is_in_sample,
+        self, fruit, tmp_path, rate, recall, false_positives, is_in_sample
     ):
         model, classes, folder = fruit
         (point,) = choose_operating_points(Predictor(model, classes), folder, "orange", rate)
@@ -394,12 +385,7 @@ def test_the_score_is_the_log_odds_also_if_the_probability_rounds_to_0_or_1(know
     names = [f"{index}.png" for index in range(4)]
     evaluate(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
     predictions = read_predictions(tmp_path / "predictions.csv", "b")
-    expected = [
-        100 - logsumexp([0, 3]),
-        -900 - logsumexp([0, 3]),
-        2 - logsumexp([1, 3]),
-        -4000,
-    ]
+    expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3]), -4000]
     found = [prediction.log_odds for prediction in predictions]
     assert found == pytest.approx(expected, rel=1e-15)
     assert [prediction.label_rank for prediction in predictions] == [1, 3, 2, 2]
@@ -501,11 +487,7 @@ def test_scores_are_never_written_among_the_photographs(fruit, tmp_path, out):
 PREDICTIONS = [
     Prediction(
         photograph=Photograph(
-            PurePosixPath("orange/a, b.png"),
-            "orange",
-            "web",
-            ("lab", "studio"),
-            "m",
+            PurePosixPath("orange/a, b.png"), "orange", "web", ("lab", "studio"), "m"
         ),
         label="orange",
         predicted="orange",
@@ -577,8 +559,7 @@ def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_pa
 
 
 def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(
-    fruit,
-    tmp_path,
+    fruit, tmp_path
 ):
     """Compare with curves by hand.
 
@@ -603,9 +584,7 @@ def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both
 
 
 def test_a_folder_without_negatives_has_an_empty_table_and_figure(
-    known_model,
-    tmp_path,
-    monkeypatch,
+    known_model, tmp_path, monkeypatch
 ):
     monkeypatch.undo()
     evaluate(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)

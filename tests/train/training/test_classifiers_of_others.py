@@ -162,9 +162,7 @@ def test_of_networks_with_equal_agreement_the_last_one_is_kept(almost_fixed):
 
 
 def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_after(
-    tuned,
-    weights,
-    photos,
+    tuned, weights, photos
 ):
     _, scores = tuned("folder", ALMOST_FIXED)
     assert scores["test/agreement"] == 1

@@ -283,8 +283,7 @@ def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "stage, trained",
-    [("groups.1", ("groups.2", "norm", "head")), ("all_but_last", ("head",))],
+    "stage, trained", [("groups.1", ("groups.2", "norm", "head")), ("all_but_last", ("head",))]
 )
 def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trained):
     network = WideResNet(3, 10, 1, dropout=0.0)
@@ -306,8 +305,7 @@ def test_a_stage_that_the_network_lacks_is_refused():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(
-    monkeypatch,
-    training,
+    monkeypatch, training
 ):
     monkeypatch.setattr(loop, "EVALUATION_BATCH", 7)
     torch.manual_seed(0)

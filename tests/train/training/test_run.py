@@ -77,11 +77,7 @@ def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -
 
 
 def train_with_signal(
-    settings,
-    folder: Path,
-    round_number: int,
-    step: int,
-    number: signal.Signals,
+    settings, folder: Path, round_number: int, step: int, number: signal.Signals
 ) -> None:
     """Train, and raise a signal at a step of a round."""
     with pytest.MonkeyPatch.context() as patch:
@@ -226,10 +222,7 @@ def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp
     ],
 )
 def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(
-    tiny,
-    finished,
-    overrides,
-    message,
+    tiny, finished, overrides, message
 ):
     before = modification_times(finished)
     with pytest.raises(InputError, match=message):
@@ -333,9 +326,7 @@ TENSORBOARD_APPEND = "tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSyste
     ],
 )
 def test_a_full_disk_is_one_error_for_every_writer_and_the_run_can_be_resumed(
-    tiny,
-    tmp_path,
-    writer,
+    tiny, tmp_path, writer
 ):
     settings = tiny(*WITHOUT_RENDERS, "train.resume=true")
     full_disk = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -402,9 +393,7 @@ class TestARunFolder:
 
 
 def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(
-    tiny,
-    photos,
-    tmp_path,
+    tiny, photos, tmp_path
 ):
     named = f"photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
     scores = completed_run(tiny(*WITHOUT_RENDERS, named), tmp_path)
@@ -489,11 +478,7 @@ class TestAFolderOfRenders:
         )
 
     def test_is_shown_in_turn_with_its_labels(
-        self,
-        settings,
-        label_of_image,
-        renders_of_rounds,
-        tmp_path,
+        self, settings, label_of_image, renders_of_rounds, tmp_path
     ):
         completed_run(settings, tmp_path / "run")
         assert len(renders_of_rounds) == 4
@@ -566,9 +551,7 @@ def kill() -> None:
 
 
 def test_a_run_killed_within_its_first_epoch_is_resumed_there_and_ends_the_same(
-    tiny,
-    tmp_path,
-    monkeypatch,
+    tiny, tmp_path, monkeypatch
 ):
     settings = tiny("train.epochs=2", "train.resume=true")
     completed_run(settings, tmp_path / "whole")

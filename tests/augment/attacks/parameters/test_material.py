@@ -252,9 +252,7 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "change",
-    [(-0.5, 0.6, 0.8, 0.7), (-0.5, -1.5, 1.2, -0.7)],
-    ids=["metal", "varnish"],
+    "change", [(-0.5, 0.6, 0.8, 0.7), (-0.5, -1.5, 1.2, -0.7)], ids=["metal", "varnish"]
 )
 def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
     """The table beside the object stays matte. Mitsuba's varnish has Disney's diffuse part.

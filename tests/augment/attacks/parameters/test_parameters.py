@@ -75,12 +75,7 @@ def free(*names: str) -> dict[str, StepSettings]:
     return settings
 
 
-def attack(
-    model: nn.Module,
-    problem: SceneProblem,
-    criterion: Criterion,
-    steps: int,
-) -> Minimum:
+def attack(model: nn.Module, problem: SceneProblem, criterion: Criterion, steps: int) -> Minimum:
     """Run the descent until the classifier errs, without a margin."""
     settings = AttackSettings(max_steps=steps, margin=0.0, quantized=False)
     return minimize(problem, Objective(model, criterion, settings))
@@ -181,11 +176,7 @@ SINGLE = [[name] for name in VALUE_COUNTS]
 COMBINATIONS = [*SINGLE, ["lighting", "geometry", "albedo"], MIXTURE]
 
 
-def derivatives(
-    function: Callable[[Tensor], Tensor],
-    at: Tensor,
-    directions: Tensor,
-) -> Tensor:
+def derivatives(function: Callable[[Tensor], Tensor], at: Tensor, directions: Tensor) -> Tensor:
     """Return the derivatives of a function at a point in several directions.
 
     Central differences at h and 2h are combined by Richardson's rule. The error is a fourth
@@ -316,17 +307,12 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm, radi
 
 
 def test_an_attack_in_nonnegative_light_ends_in_light_that_a_map_holds(
-    make_scene,
-    make_linear,
-    tmp_path,
+    make_scene, make_linear, tmp_path
 ):
     """The map's format, RGBE, has no negative numbers. The map gives the images back."""
     scene = in_sunlight(make_scene())
     settings = StepSettings(step_size=0.5)
-    problem = SceneProblem(
-        scene,
-        [make_parameter("lighting", scene, settings, nonnegative=True)],
-    )
+    problem = SceneProblem(scene, [make_parameter("lighting", scene, settings, nonnegative=True)])
     result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=4)
     assert (result.values - problem.start).norm(dim=1).min() > 1
     lights = []
@@ -362,12 +348,7 @@ def scenes_by_dtype(make_scene) -> dict[torch.dtype, Scene]:
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_a_sky_stays_in_its_domain_and_its_ball(
-    scenes_by_dtype,
-    norm,
-    dtype,
-    start,
-    values,
-    radius,
+    scenes_by_dtype, norm, dtype, start, values, radius
 ):
     """Starts include the horizon and the clearest and haziest air of the sky model."""
     scene = scenes_by_dtype[dtype]
@@ -407,11 +388,7 @@ def light_slope(scene: Scene, weight: Tensor) -> Tensor:
     for row, cameras in enumerate(scene.cameras):
         mesh = scene.mesh(row)
         operators = build_operators(
-            mesh,
-            cameras,
-            scene.settings,
-            scene.rasterizer,
-            dtype=weight.dtype,
+            mesh, cameras, scene.settings, scene.rasterizer, dtype=weight.dtype
         )
         for operator in operators:
             transfer = operator.transfer * operator.albedo[:, None]  # (3, K, P)
@@ -579,12 +556,7 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
     ],
 )
 def test_only_an_attack_on_shape_rasterizes_in_every_step(
-    make_scene,
-    make_linear,
-    rasterized,
-    names,
-    steps,
-    expected,
+    make_scene, make_linear, rasterized, names, steps, expected
 ):
     problem = problem_of(make_scene(cameras=TWO_VIEWS), **free(*names))
     result = attack(make_linear(3, bias=50.0), problem, towards(problem), steps)

@@ -21,13 +21,7 @@ GRAY = [0.5, 0.5, 0.5]
 
 def scene_of(size: int = 24, **options) -> Scene:
     """Return a scene of a pear with outlines, in float64."""
-    choices = {
-        "samples": 2,
-        "silhouettes": True,
-        "width": 2.6,
-        "fov": 40.0,
-        "rasterizer": "numpy",
-    }
+    choices = {"samples": 2, "silhouettes": True, "width": 2.6, "fov": 40.0, "rasterizer": "numpy"}
     scene = augment.build_scene([("solid:pear:0", "pear")], size, **choices | options)
     return scene.changed(lights=0.4 * scene.lights.double())
 
@@ -45,9 +39,7 @@ def random_poses(problem: SceneProblem, count: int) -> torch.Tensor:
 
 
 def costs(
-    result: augment.AttackResult,
-    classifier: augment.Classifier,
-    values: torch.Tensor,
+    result: augment.AttackResult, classifier: augment.Classifier, values: torch.Tensor
 ) -> torch.Tensor:
     """Return the log-probability (N,) of the right class for poses (N, D)."""
     rows = torch.zeros(len(values), dtype=torch.int64)
