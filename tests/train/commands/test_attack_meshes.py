@@ -130,12 +130,12 @@ class TestARasterizerThatDoesNotStart:
         (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
         (
             ["meshes=[{mesh: a, props: [solid:cup]}]"],
-            r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'",
+            r"^meshes\[0\]\.props\[0\] is 'solid:cup'",
         ),
         (["meshes=[{mesh: a, props: [{mesh: b}]}]"], r"meshes\[0\].*at is not set"),
         (
             ["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
-            r"props\[0\]\.at=\[1\]: give two numbers",
+            r"props\[0\]\.at=\[1\]: give 2 numbers",
         ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
