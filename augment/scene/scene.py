@@ -44,7 +44,7 @@ MAX_VIEWS_WITHOUT_PROGRESS = 8
 # each example.
 NUMBERS_PER_LIGHT_VALUE = 12
 # An attack on the light keeps about so many numbers in memory for each pixel of all images.
-NUMBERS_PER_PIXEL = 10
+NUMBERS_PER_PIXEL = 8
 # An attack on the light also keeps about so many numbers for each pixel of the images that are
 # rendered at the same time.
 NUMBERS_PER_RENDERED_PIXEL = 16
