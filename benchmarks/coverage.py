@@ -107,7 +107,7 @@ TYPICAL = {
     "no gain": {"means": (0.5, -1.0), "gain": 0.0},
 }
 # No choice in the library was made with these numbers of objects and distributions, except for
-# the degrees of freedom and the end of a threshold above all scores.
+# the degrees of freedom, and the treatment of a threshold that may be above all scores.
 OTHER = {
     "heavy tails": {"shape": heavy_tails},
     "two modes": {"shape": two_modes},
