@@ -191,17 +191,17 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
 def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_other(
     run_sweep, folder_of, tmp_path, monkeypatch, capsys
 ):
-    fit = Run.fit
+    train = Run.train
 
     def broken(run):
         if run.settings.train.learning_rate == 0.5:
             raise ZeroDivisionError("a mistake of the program")
-        fit(run)
+        train(run)
 
     overrides = ["train.epochs=1", "train.learning_rate=0.05,0.5"]
     unlucky = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.5")
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "fit", broken)
+        patch.setattr(Run, "train", broken)
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
     assert "1 of 2 runs are finished\n" in printed
