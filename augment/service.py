@@ -314,8 +314,7 @@ class AugmentationService:
     def _scene_hash(self) -> Tensor:
         """Compute a SHA-256 hash (32 bytes) of labels, scene and image sizes.
 
-        Numbers are rounded first, so that the same settings have the same hash
-        on all machines.
+        Numbers are rounded first, so that the same settings have the same hash on all machines.
         """
         shown: list[object] = [self.labels.tolist(), list(self.positive_classes)]
         if self.images is not None:

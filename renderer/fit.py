@@ -360,11 +360,10 @@ class _Target(NamedTuple):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Fit a light to P pixels of the photograph by least squares.
 
-        A pixel that is clipped in the photograph may have been brighter. The fit
-        is repeated without the clipped pixels that the render makes brighter than 1. `transfer`
-        is the radiance under 49 lights with one coefficient of 1 each. The result is the light
-        (49, 3), the values (3, P) of its render, and the weighted differences (3, 49) from the
-        expected light.
+        A pixel that is clipped in the photograph may have been brighter. The fit is repeated
+        without the clipped pixels that the render makes brighter than 1. `transfer` is the radiance
+        under 49 lights with one coefficient of 1 each. The result is the light (49, 3), the values
+        (3, P) of its render, and the weighted differences (3, 49) from the expected light.
         """
         object_radiance = image - background
         is_clipped = image >= CLIPPED_VALUE
@@ -395,13 +394,12 @@ class _Target(NamedTuple):
     def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
         """Compute the weights of the smoothness penalty of a light.
 
-        The penalty is the weighted sum of the squared differences between the SH
-        coefficients and expected coefficients. The weight in band l is
-        proportional to 1 + (l (l + 1))², because -l (l + 1) is the eigenvalue of
-        the Laplacian on the sphere. It is also proportional to the squared
-        brightness of the object under uniform light. The fit therefore does not
-        depend on the scale of the albedo. Entry (j, k) of a normal matrix is the sum over pixels
-        of the radiance under coefficient j times that under k.
+        The penalty is the weighted sum of the squared differences between the SH coefficients and
+        expected coefficients. The weight in band l is proportional to 1 + (l (l + 1))², because -l
+        (l + 1) is the eigenvalue of the Laplacian on the sphere. It is also proportional to the
+        squared brightness of the object under uniform light. The fit therefore does not depend on
+        the scale of the albedo. Entry (j, k) of a normal matrix is the sum over pixels of the
+        radiance under coefficient j times that under k.
         """
         # Entry (0, 0) is the sum over pixels of the squared radiance under uniform light
         # (coefficient 0). The small summand keeps the sum above 0 if the object is black.
@@ -512,13 +510,11 @@ def _nonnegative_light(
 ) -> Float[Tensor, "49 C"]:
     """Minimize xᵀ S x / 2 - wᵀ x over all lights x without negative radiance.
 
-    The rows of a matrix R map a light x to its radiance in the directions of a
-    grid, so the constraint is R x ≥ 0. With the Cholesky decomposition S = L Lᵀ
-    and y = Lᵀ x, the problem is to find the point y of the cone
-    {y: R L⁻ᵀ y ≥ 0} that is nearest to L⁻¹ w. By Moreau's decomposition, this
-    point is L⁻¹ w + L⁻¹ Rᵀ m. Here m ≥ 0 is the vector that makes the length of
-    this sum as small as possible. SciPy's `nnls` (non-negative least squares)
-    finds m.
+    The rows of a matrix R map a light x to its radiance in the directions of a grid, so the
+    constraint is R x ≥ 0. With the Cholesky decomposition S = L Lᵀ and y = Lᵀ x, the problem is to
+    find the point y of the cone {y: R L⁻ᵀ y ≥ 0} that is nearest to L⁻¹ w. By Moreau's
+    decomposition, this point is L⁻¹ w + L⁻¹ Rᵀ m. Here m ≥ 0 is the vector that makes the length of
+    this sum as small as possible. SciPy's `nnls` (non-negative least squares) finds m.
     """
     # Matrix R that maps a light to its radiance in N directions, shape (N, 49).
     radiance_rows = _radiance_rows(grid)
@@ -560,8 +556,7 @@ def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[
 def _radiance_rows(grid: int) -> NDArray[Any]:
     """Compute the matrix that maps a light to its radiance above the smallest allowed radiance.
 
-    The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance
-    of the light.
+    The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance of the light.
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
@@ -574,9 +569,8 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
 def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Camera:
     """Change the width and the shift of a camera so that the mesh is as large as the mask.
 
-    The bounding box of the mesh in the image gets the center and the area of the
-    bounding box of the mask. The direction is kept. A perspective camera also gets another
-    distance.
+    The bounding box of the mesh in the image gets the center and the area of the bounding box of
+    the mask. The direction is kept. A perspective camera also gets another distance.
     """
     # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]

@@ -1,9 +1,7 @@
 """Triangle meshes with colors, and functions that normalize, divide and join meshes.
 
-World axes are right-handed with z up. Colors are stored as they are displayed
-(sRGB-encoded). Shading first decodes them to linear values.
-
-Shapes use these letters: a mesh has V vertices and F faces.
+World axes are right-handed with z up. Colors are stored as they are displayed (sRGB-encoded).
+Shading first decodes them to linear values. A mesh has V vertices and F faces.
 """
 
 from __future__ import annotations

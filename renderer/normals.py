@@ -136,9 +136,8 @@ class _AreaVectors(torch.autograd.Function):
     ) -> Float[Tensor, "3 F"]:
         """Compute the area vector u × v of each face from its edges u and v.
 
-        Edges in float64 are first divided by a power of two that all faces share.
-        Products of large edges then do not overflow. The area vectors become
-        smaller by the square of this power.
+        Edges in float64 are first divided by a power of two that all faces share. Products of large
+        edges then do not overflow. The area vectors become smaller by the square of this power.
         """
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
         # Positions of the corners of F faces,
@@ -285,9 +284,8 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
     """Compute a · b, and the rounding error of this product (Dekker 1971).
 
-    The binary digits of each factor are split into an upper and a lower half.
-    Products of two halves have no rounding error. The error is the exact product minus the
-    rounded one.
+    The binary digits of each factor are split into an upper and a lower half. Products of two
+    halves have no rounding error. The error is the exact product minus the rounded one.
     """
     rounded = a * b
     a_high, a_low = _halves(a)
@@ -379,9 +377,8 @@ def _groups_of_file(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Group corners by their normals in a file, and tell which corners have one, shape (F, 3) each.
 
-    `first` and `second` are the corners of neighboring faces (see `_neighbors`).
-    Corners of faces that only touch at a vertex are compared, too, in the order of
-    their normals.
+    `first` and `second` are the corners of neighboring faces (see `_neighbors`). Corners of faces
+    that only touch at a vertex are compared, too, in the order of their normals.
     """
     lengths = np.linalg.norm(file_normals.astype(np.float64), axis=-1)
     is_given = (lengths > 0) & np.isfinite(lengths)

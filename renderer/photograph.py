@@ -319,9 +319,8 @@ def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
 def _turned_to_mesh(camera: Camera) -> Camera:
     """Return a copy of a camera at the same place that looks at the center of the mesh.
 
-    The center of the mesh is the origin. A perspective camera is turned if it does
-    not show the origin in the center of its image. An orthographic camera is
-    shifted.
+    The center of the mesh is the origin. A perspective camera is turned if it does not show the
+    origin in the center of its image. An orthographic camera is shifted.
     """
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)

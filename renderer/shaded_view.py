@@ -142,8 +142,7 @@ class ShadedView:
     def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
         """Compute the radiance that shadows and bounces add to the P covered pixels.
 
-        It is negative in shadows, and None without environment light or without both
-        effects.
+        It is negative in shadows, and None without environment light or without both effects.
         """
         environment = self.light.environment
         if environment is None or self.indirect is None:

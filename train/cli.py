@@ -558,8 +558,7 @@ def _explain_choice(file: str) -> str:
 def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
     """Explain the error of a setting inside a group that is null.
 
-    For example, attack.geometry.radius cannot be set while attack.geometry is
-    null.
+    For example, attack.geometry.radius cannot be set while attack.geometry is null.
     """
     for word in words:
         key = word.partition("=")[0]

@@ -373,11 +373,7 @@ class ExperimentSettings(NetworkSettings):
         require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
 
     def _remove_generated_positives(self) -> None:
-        """Remove hard negatives whose name is a positive class.
-
-        For the label "orange", the hard negative "solid:orange" is removed. A
-        hard negative that is a mapping has a class of its own, and is kept.
-        """
+        """Remove hard negatives whose name is a positive class."""
         positives = {simplified(name) for name in label_names(self.label)}
         kept = []
         for item in self.hard_negatives:

@@ -80,10 +80,9 @@ class ExpectationOverTransformations:
     def _transformed(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
         """Transform each image at random.
 
-        A transformation shifts, rotates and scales the image, changes the
-        exposure, adds noise and compresses the image as JPEG. The quality of
-        the compression is the same for all images of a call. Everything else
-        differs between images.
+        A transformation shifts, rotates and scales the image, changes the exposure, adds noise and
+        compresses the image as JPEG. The quality of the compression is the same for all images of a
+        call. Everything else differs between images.
         """
         settings = self.settings
         # Two shifts, a rotation and a relative change of size for each image, shape (N, 4).

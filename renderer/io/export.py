@@ -183,10 +183,9 @@ def _material(mesh: Mesh, texture_id: int, gloss: list[float]) -> "PBRMaterial":
 def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     """Change the JSON object of a .glb file before trimesh writes the file.
 
-    All meshes become primitives of one glTF mesh. Colors, normals and specular
-    factors get their names in glTF, and the cameras are added. trimesh itself
-    would write colors with 8 bits, which is too coarse for dark linear colors. The JSON object is
-    changed in place.
+    All meshes become primitives of one glTF mesh. Colors, normals and specular factors get their
+    names in glTF, and the cameras are added. trimesh itself would write colors with 8 bits, which
+    is too coarse for dark linear colors. The JSON object is changed in place.
     """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
@@ -216,9 +215,8 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
     """Describe a camera as glTF does.
 
-    The principal point of a perspective camera in glTF is the image center. If
-    the camera has another one, the image in glTF is larger and contains the image
-    of the camera.
+    The principal point of a perspective camera in glTF is the image center. If the camera has
+    another one, the image in glTF is larger and contains the image of the camera.
     """
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):

@@ -66,12 +66,11 @@ def _nearest_in_box_and_sphere(
 ) -> Float[Tensor, "N ..."]:
     """Project each row of values onto the intersection of a box and an L2 ball.
 
-    Let v be a row and c the center of its ball. The projection is the point of the
-    box that is nearest to c + f (v - c), with a factor f from 0 to 1. (It is
-    1 / (1 + λ) with the Lagrange multiplier λ of the ball.) The squared distance of
-    this point from c is a concave and piecewise linear function of f². Newton's
-    method, which starts at f² = 0, therefore reaches the squared radius without
-    passing it.
+    Let v be a row and c the center of its ball. The projection is the point of the box that is
+    nearest to c + f (v - c), with a factor f from 0 to 1. (It is 1 / (1 + λ) with the Lagrange
+    multiplier λ of the ball.) The squared distance of this point from c is a concave and piecewise
+    linear function of f². Newton's method, which starts at f² = 0, therefore reaches the squared
+    radius without passing it.
     """
     offset = values - ball.center
     squared_radius = ball.radius**2

@@ -180,8 +180,7 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
 def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -> None:
     """Write an image with OpenImageIO.
 
-    A temporary file is written first and then renamed, so a reader never sees a
-    part of the file.
+    A temporary file is written first and then renamed, so a reader never sees a part of the file.
     """
     image = _openimageio().ImageBuf(texels.contiguous().numpy())
     with replacing(path) as temporary:
@@ -205,9 +204,8 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:
     """Read an environment map from an .hdr or .exr file.
 
-    The results are the texels, the names of the channels, and the chromaticities of red,
-    green, blue and white, 8 numbers. A cropped, mirrored or rotated image raises
-    `InputError`.
+    The results are the texels, the names of the channels, and the chromaticities of red, green,
+    blue and white, 8 numbers. A cropped, mirrored or rotated image raises `InputError`.
     """
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
@@ -237,11 +235,10 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
 def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     """Read what the header of an .hdr file says about its values, which OpenImageIO ignores.
 
-    The manual of Radiance (File Formats, "Picture Files") says that EXPOSURE and
-    COLORCORR are cumulative factors of the pixels. Indented lines are of other
-    pictures. Without PRIMARIES, maps of others than Radiance are Rec. 709. The results are
-    factors of red, green and blue, and the chromaticities of red, green, blue and white, 8
-    numbers.
+    The manual of Radiance (File Formats, "Picture Files") says that EXPOSURE and COLORCORR are
+    cumulative factors of the pixels. Indented lines are of other pictures. Without PRIMARIES, maps
+    of others than Radiance are Rec. 709. The results are factors of red, green and blue, and the
+    chromaticities of red, green, blue and white, 8 numbers.
     """
     factors = np.ones(3)
     chromaticities: Sequence[float] = REC_709

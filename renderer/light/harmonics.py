@@ -224,12 +224,11 @@ def gradient_matrices(degree: int) -> Float64[Tensor, "3 K K"]:
 def _set_gradients(matrices: Float[Tensor, "3 K K"], l: int, m: int) -> None:
     """Set the derivatives of the harmonics Y_lm and Y_l,-m in the matrices, in place.
 
-    A column of a matrix belongs to a harmonic of band l. Its rows hold the
-    coefficients of the harmonics of band l - 1 in its derivative. The derivative
-    of Y_lm with respect to z is a harmonic of the same order in band l - 1. The
-    derivatives with respect to x and y are sums of harmonics of the orders m - 1
-    and m + 1 in band l - 1 (ladder operators). The three matrices are the derivatives with
-    respect to x, y and z. l is at least 1, and m at least 0.
+    A column of a matrix belongs to a harmonic of band l. Its rows hold the coefficients of the
+    harmonics of band l - 1 in its derivative. The derivative of Y_lm with respect to z is a
+    harmonic of the same order in band l - 1. The derivatives with respect to x and y are sums of
+    harmonics of the orders m - 1 and m + 1 in band l - 1 (ladder operators). The three matrices are
+    the derivatives with respect to x, y and z. l is at least 1, and m at least 0.
     """
     norm = (2 * l + 1) / (2 * l - 1)
     # Factors of the harmonics of the orders m - 1 (down) and m + 1 (up) in band l - 1.

@@ -394,10 +394,9 @@ class _SolutionDerivative:
 def _differentiate(offset: Array, correction: Array, active_rows: Array) -> _SolutionDerivative:
     """Differentiate one channel of the solution of a `_QuadraticProgram` with respect to t.
 
-    With the matrix R of the M active constraints, the solution is
-    x = c + t (v − c) + Rᵀ μ, and R x = 0. The derivative of the multipliers μ is
-    therefore the solution μ' of the least squares problem Rᵀ μ' ≈ −(v − c). `offset` is v − c,
-    and `correction` is Rᵀ μ, from which μ is computed.
+    With the matrix R of the M active constraints, the solution is x = c + t (v − c) + Rᵀ μ, and R x
+    = 0. The derivative of the multipliers μ is therefore the solution μ' of the least squares
+    problem Rᵀ μ' ≈ −(v − c). `offset` is v − c, and `correction` is Rᵀ μ, from which μ is computed.
     """
     right_sides = np.stack([-offset, correction], axis=1)
     solution = np.linalg.lstsq(active_rows.T, right_sides)[0]

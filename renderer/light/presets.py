@@ -217,8 +217,7 @@ def mean_luminance(coefficients: Float[Tensor, "K 3"]) -> float:
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     """Read an environment map, and scale it to the mean luminance of the grace probe.
 
-    `roughness` is that of the smoothest surface, whose highlights must not get dark rings,
-    or None.
+    `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
     coefficients = project(read_panorama(path), degree)
     if roughness is not None:

@@ -144,10 +144,9 @@ class _FittedSky(torch.autograd.Function):
 def _library_fit() -> Tensor:
     """Load the polynomials of the sky that come with the library.
 
-    Each SH coefficient of a sky with the sun at azimuth 0 is a sum of products of
-    two Chebyshev polynomials, one of the zenith angle and one of 1 / turbidity. The axes
-    are: polynomial of the zenith angle, polynomial of 1 / turbidity, 28 SH coefficients
-    with order m ≥ 0, color.
+    Each SH coefficient of a sky with the sun at azimuth 0 is a sum of products of two Chebyshev
+    polynomials, one of the zenith angle and one of 1 / turbidity. The axes are: polynomial of the
+    zenith angle, polynomial of 1 / turbidity, 28 SH coefficients with order m ≥ 0, color.
     """
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 

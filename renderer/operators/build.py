@@ -330,11 +330,10 @@ def _box_filter(
 ) -> Float[Tensor, "C K P"]:
     """Compute the transfer matrix of a matte surface under an open sky, without shadows.
 
-    An entry for a pixel and an SH coefficient is the mean of albedo · A_l Y_lm(n)
-    over the samples of the pixel (box filter). A_l is the factor of the coefficient
-    in the irradiance (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the
-    normal of a sample. Sums are computed in float64. An `albedo` of None is 1 in a single
-    channel.
+    An entry for a pixel and an SH coefficient is the mean of albedo · A_l Y_lm(n) over the samples
+    of the pixel (box filter). A_l is the factor of the coefficient in the irradiance
+    (`harmonics.lambertian_factors`), Y_lm the harmonic, and n the normal of a sample. Sums are
+    computed in float64. An `albedo` of None is 1 in a single channel.
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
@@ -467,8 +466,7 @@ def _diffuse_transfer(
 ) -> Float[Tensor, "S K"]:
     """Compute the diffuse radiance of S samples with a transparent coat, for an albedo of 1.
 
-    The light passes the coat on its way to the diffuse layer below, and on its way
-    back.
+    The light passes the coat on its way to the diffuse layer below, and on its way back.
     """
     # Irradiance below the coat: one row for each sample, one column for each coefficient.
     irradiance = harmonics.basis(normals, degree) * gloss.factors_below_coat(degree).T

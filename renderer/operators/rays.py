@@ -251,8 +251,7 @@ class Rays:
     def _outermost(self) -> Tensor:
         """Positions of the H vertices on the convex hull of the mesh, float64, shape (H, 3).
 
-        If all vertices lie in a plane, there is no hull, and all vertices are
-        returned.
+        If all vertices lie in a plane, there is no hull, and all vertices are returned.
         """
         # Only imported when it is needed, because the import takes long.
         from scipy.spatial import ConvexHull, QhullError
@@ -265,12 +264,11 @@ class Rays:
     def _pixels_to_cast(self, surface: Surface) -> Tensor:
         """Find the pixels for which the mesh may block light.
 
-        A pixel is returned if one of its samples fulfills one of two conditions.
-        First, a vertex of the mesh lies above the plane of the face on which the
-        sample lies. Second, the shading normal differs from the normal of the face
-        by an angle a, so that the plane of the face blocks the fraction
-        (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`. All pixels
-        are returned if the test would need more than `MAX_COMPARISONS` comparisons and
+        A pixel is returned if one of its samples fulfills one of two conditions. First, a vertex of
+        the mesh lies above the plane of the face on which the sample lies. Second, the shading
+        normal differs from the normal of the face by an angle a, so that the plane of the face
+        blocks the fraction (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
+        All pixels are returned if the test would need more than `MAX_COMPARISONS` comparisons and
         would take longer than the rays.
         """
         fragments = surface.fragments

@@ -177,11 +177,10 @@ def _group_sides(
 ) -> Int[np.ndarray, " S"]:
     """Group the S sides (fronts and backs) of the faces of a mesh into patches.
 
-    The faces of the mesh are small. They are called pieces. Two sides belong to
-    the same patch if the centers of their pieces lie in the same cell of a cubic
-    grid, if the normals are equal after each component is rounded to -1, 0 or 1,
-    and if both sides are fronts or both are backs. The width of a cell is in world units.
-    The result is the index of the patch of each side.
+    The faces of the mesh are small. They are called pieces. Two sides belong to the same patch if
+    the centers of their pieces lie in the same cell of a cubic grid, if the normals are equal after
+    each component is rounded to -1, 0 or 1, and if both sides are fronts or both are backs. The
+    width of a cell is in world units. The result is the index of the patch of each side.
     """
     centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
     normals = pieces.face_normals()[piece_of_side]
@@ -304,11 +303,10 @@ class Transport:
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular reflectance of B pixels for light along their rays.
 
-        The specular reflection may be narrower than the angle between two of the
-        D ray directions. The reflectances of a pixel are therefore scaled so that
-        their sum over the directions is exact for uniform light. The first result is
-        multiplied by the albedo, because metals color reflections. The second has the color
-        of the light.
+        The specular reflection may be narrower than the angle between two of the D ray directions.
+        The reflectances of a pixel are therefore scaled so that their sum over the directions is
+        exact for uniform light. The first result is multiplied by the albedo, because metals color
+        reflections. The second has the color of the light.
         """
         to_camera = at_samples(surface.toward, sample_of_ray)
         normals = surface.normals[sample_of_ray]
@@ -366,11 +364,10 @@ def _radiosity(
 ) -> Float[Tensor, "N K _"]:
     """Compute the radiance that N patches send after `settings.bounces` bounces (radiosity).
 
-    After one bounce, patch i with albedo ρ_i sends the radiance
-    B_i = ρ_i / π S_i, where S_i is its irradiance from the sky. After each further
-    bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij is the irradiance of patch i
-    per unit radiance of patch j. The last axis of the result has size 1 if all patches are
-    gray.
+    After one bounce, patch i with albedo ρ_i sends the radiance B_i = ρ_i / π S_i, where S_i is its
+    irradiance from the sky. After each further bounce, it sends ρ_i / π (S_i + Σ_j F_ij B_j). F_ij
+    is the irradiance of patch i per unit radiance of patch j. The last axis of the result has size
+    1 if all patches are gray.
     """
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
     # Mean albedo: one row for each patch, one column for each color.

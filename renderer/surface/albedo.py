@@ -157,9 +157,8 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
 def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor, Tensor]]:
     """Find the two columns of texels, or the two rows, between which each of N points lies.
 
-    Columns and rows are both called lines. The pairs of index and weight are for the line
-    before and the line after a point. Indices are whole floating-point numbers in [0,
-    count).
+    Columns and rows are both called lines. The pairs of index and weight are for the line before
+    and the line after a point. Indices are whole floating-point numbers in [0, count).
     """
     # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5

@@ -314,9 +314,8 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     """Rotate functions on the sphere, one per column, by a matrix of SH coefficients.
 
-    A rotation does not mix coefficients of different degrees. The matrix is zero
-    outside one block per degree on its diagonal, so only the blocks are
-    multiplied.
+    A rotation does not mix coefficients of different degrees. The matrix is zero outside one block
+    per degree on its diagonal, so only the blocks are multiplied.
     """
     products: list[Tensor] = []
     for l in range(math.isqrt(len(coefficients))):
@@ -426,8 +425,7 @@ def _coat_coefficients() -> Tensor:
 def _cosine_to_argument(cosine: Tensor) -> Tensor:
     """Map cosines in [0, 1] to arguments of Chebyshev polynomials in [-1, 1].
 
-    Small cosines are spread over a wider range, because lobes change quickly at
-    grazing angles.
+    Small cosines are spread over a wider range, because lobes change quickly at grazing angles.
     """
     return 4 * cosine / (cosine + 1) - 1
 
@@ -495,11 +493,10 @@ def _table_like(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor
 def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     """Interpolate the lobe functions by Chebyshev polynomials T in the roughness and the cosine.
 
-    A lobe function is Σ_k Σ_p a_kp T_k(y) T_p(x). The argument y stands for the
-    roughness (see `_roughness_to_argument`), and x for the cosine (see
-    `_cosine_to_argument`). When a mirror turns by θ, the reflected light turns by
-    2 θ. A harmonic of degree l of this light therefore needs polynomials up to
-    degree 2 l in cos θ. The axes are the Fresnel term, the pair (l, m), k and p.
+    A lobe function is Σ_k Σ_p a_kp T_k(y) T_p(x). The argument y stands for the roughness (see
+    `_roughness_to_argument`), and x for the cosine (see `_cosine_to_argument`). When a mirror turns
+    by θ, the reflected light turns by 2 θ. A harmonic of degree l of this light therefore needs
+    polynomials up to degree 2 l in cos θ. The axes are the Fresnel term, the pair (l, m), k and p.
     """
     cosine_count = 2 * degree + EXTRA_POLYNOMIALS
     roughnesses = _argument_to_roughness(_chebyshev_nodes(ROUGHNESS_POLYNOMIALS))

@@ -354,10 +354,9 @@ class _IrradiancePolynomial:
     def evaluate(self, directions: Float[Tensor, "3 N"]) -> tuple[Tensor, Tensor]:
         """Compute the irradiance and its gradient at N unit normals n.
 
-        The irradiance is c + a · n + p(n), with the constant c, the vector a and the
-        polynomial p of this object. The irradiance has the shape (3 colors, N), and the
-        gradient (3 components, 3 colors, N). Only its tangential component is the
-        derivative.
+        The irradiance is c + a · n + p(n), with the constant c, the vector a and the polynomial p
+        of this object. The irradiance has the shape (3 colors, N), and the gradient (3 components,
+        3 colors, N). Only its tangential component is the derivative.
         """
         # A tensor of monomials with a name would stay in memory until the function
         # returns.
@@ -379,11 +378,10 @@ class _IrradiancePolynomial:
 def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Compute the matrices that map SH coefficients of a light to the gradient of irradiance.
 
-    The irradiance is a polynomial c + a · n + p(n) of the normal n. The constant c
-    comes from the harmonic of degree 0, the vector a from those of degree 1, and
-    the homogeneous polynomial p from those of even degree from 2 on. The gradient
-    is therefore a + ∇p(n). The shape is (3 components, monomials + 1, coefficients). The
-    last row gives a, and the others ∇p.
+    The irradiance is a polynomial c + a · n + p(n) of the normal n. The constant c comes from the
+    harmonic of degree 0, the vector a from those of degree 1, and the homogeneous polynomial p from
+    those of even degree from 2 on. The gradient is therefore a + ∇p(n). The shape is (3 components,
+    monomials + 1, coefficients). The last row gives a, and the others ∇p.
     """
     even_degree = _even_degree(degree)
     coefficient_count = (even_degree + 1) ** 2
@@ -409,11 +407,10 @@ def _even_degree(degree: int) -> int:
 def _gradients(degree: int) -> Tensor:
     """Compute the gradients of spherical harmonics that are extended to homogeneous polynomials.
 
-    The harmonic Y_k of degree l, with l of the same parity as `degree`, equals the
-    homogeneous polynomial |n|^degree Y_k(n / |n|) on the unit sphere (see
-    `harmonics.homogeneous_gradients`). Its gradient is a sum of monomials of
-    degree `degree` - 1. The shape is (3 components, monomials, (degree + 1)²). Columns are
-    zero for l = 0 and the other parity.
+    The harmonic Y_k of degree l, with l of the same parity as `degree`, equals the homogeneous
+    polynomial |n|^degree Y_k(n / |n|) on the unit sphere (see `harmonics.homogeneous_gradients`).
+    Its gradient is a sum of monomials of degree `degree` - 1. The shape is (3 components,
+    monomials, (degree + 1)²). Columns are zero for l = 0 and the other parity.
     """
     band = harmonics.bands(degree)
     # Each gradient as a sum of harmonics below `degree`. Axes: component of the gradient,

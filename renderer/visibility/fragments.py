@@ -376,9 +376,8 @@ def _distribute(
 ) -> Float[Tensor, "_ G"]:
     """Add up values at S samples for each corner of the faces that the samples show.
 
-    Each value is multiplied by the barycentric weight of the corner at the sample. The rows
-    of the result are D sums for the first corners, then D for the second and D for the
-    third ones.
+    Each value is multiplied by the barycentric weight of the corner at the sample. The rows of the
+    result are D sums for the first corners, then D for the second and D for the third ones.
     """
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
@@ -501,8 +500,7 @@ def _group_by_pixel(
 ) -> _CoveredSamples:
     """Find the pixels to which the S covered samples of an image belong.
 
-    The samples are ascending numbers, and all samples of the image are numbered pixel by
-    pixel.
+    The samples are ascending numbers, and all samples of the image are numbered pixel by pixel.
     """
     if samples == 1:
         # Sample numbers and pixel indices are the same if a pixel has one sample.

@@ -115,9 +115,8 @@ def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
 def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> int:
     """Find the first column of samples at or after the point at which a row crosses an edge.
 
-    All coordinates are in subsamples, which are 1 / 2^bits of a sample. The row
-    crosses the edge at x + (row_y - y) (to_x - x) / (to_y - y). This is divided by
-    2^bits and rounded up.
+    All coordinates are in subsamples, which are 1 / 2^bits of a sample. The row crosses the edge at
+    x + (row_y - y) (to_x - x) / (to_y - y). This is divided by 2^bits and rounded up.
     """
     # The operator // rounds down. The minus sign before it makes the result round up.
     return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << bits))

@@ -86,9 +86,8 @@ def _keys(
 ) -> Int[np.ndarray, " _"]:
     """Compute the smallest key of each sample of one view.
 
-    Each face has one key at a sample that it covers: its depth, and in the low
-    FACE_BITS bits its index. The smallest key therefore belongs to the nearest
-    face.
+    Each face has one key at a sample that it covers: its depth, and in the low FACE_BITS bits its
+    index. The smallest key therefore belongs to the nearest face.
     """
     positions, depths = to_fixed_point(points, resolution)
     keys = np.full(resolution * resolution, EMPTY_KEY)
@@ -174,10 +173,9 @@ def to_fixed_point(
 def _cull(triangles: Int[np.ndarray, "2 3 F"], resolution: int, closed: bool) -> _TriangleRows:
     """Find the triangles that can cover samples, and their rows.
 
-    By the top-left rule, a sample on an edge belongs to the triangle to the
-    right of the edge or, if the edge is horizontal, to the triangle below it.
-    A triangle therefore covers only samples whose x and y are at least its
-    smallest x and y, and less than its largest x and y.
+    By the top-left rule, a sample on an edge belongs to the triangle to the right of the edge or,
+    if the edge is horizontal, to the triangle below it. A triangle therefore covers only samples
+    whose x and y are at least its smallest x and y, and less than its largest x and y.
     """
     areas = _doubled_areas(triangles)
     # First column and first row of samples in the bounding box of each triangle, as the

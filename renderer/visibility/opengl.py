@@ -86,8 +86,7 @@ def device() -> str:
 def _context() -> Iterator[moderngl.Context]:
     """Create an OpenGL context for a `with` block, and check that it draws correctly.
 
-    Without an EGL device, or if the driver fails or renders wrong indices, it raises
-    `InputError`.
+    Without an EGL device, or if the driver fails or renders wrong indices, it raises `InputError`.
     """
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.

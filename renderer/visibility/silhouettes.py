@@ -302,12 +302,11 @@ class _MovingView:
     ) -> tuple[Tensor, Tensor]:
         """Compute the gradient with respect to movements of silhouette edges at K crossings.
 
-        A crossing is a place where a silhouette edge passes between two samples.
-        An edge with the unit normal n that moves by v moves along a row by
-        n · v / n_x. Its crossing with the row has the weight n_x², so that the
-        product is n_x (n · v). The results are the vertices at the first and then at the
-        second ends of the K edges, and the gradients with respect to their homogeneous
-        positions.
+        A crossing is a place where a silhouette edge passes between two samples. An edge with the
+        unit normal n that moves by v moves along a row by n · v / n_x. Its crossing with the row
+        has the weight n_x², so that the product is n_x (n · v). The results are the vertices at the
+        first and then at the second ends of the K edges, and the gradients with respect to their
+        homogeneous positions.
         """
         crossings = self.crossings
         # Component of the edge normal in the direction from the first to the second sample,
@@ -366,9 +365,8 @@ def _to_homogeneous(
 ) -> Float[Tensor, "N 3"]:
     """Convert gradients of N points from image positions to homogeneous positions.
 
-    The image position (x, y) has the homogeneous coordinates (x w, y w, w). With
-    the gradient (a, b) with respect to (x, y), the chain rule gives
-    (a, b, -(a x + b y)) / w.
+    The image position (x, y) has the homogeneous coordinates (x w, y w, w). With the gradient (a,
+    b) with respect to (x, y), the chain rule gives (a, b, -(a x + b y)) / w.
     """
     depth_gradient = -(gradients * places).sum(1, keepdim=True)
     return torch.cat([gradients, depth_gradient], dim=1) / depth
@@ -435,8 +433,7 @@ class _Silhouettes:
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
         """Find where visible silhouettes pass between samples that are neighbors along an axis.
 
-        `axis` is X for neighbors in a row, and the arrays are those of `Crossings`, in
-        order.
+        `axis` is X for neighbors in a row, and the arrays are those of `Crossings`, in order.
         """
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
@@ -523,12 +520,11 @@ def _cut_edges(
 ) -> tuple[np.ndarray, ...]:
     """Find where N edges cross rows of samples, or columns of samples.
 
-    Rows and columns are both called lines. For rows, y is the coordinate across
-    the lines, and x the coordinate along the lines. For columns, it is the other
-    way round. Coordinates are in units of samples. Line i has the coordinate i.
-    Crossings before the first sample or after the last sample of a line are left
-    out. The results are, for each of K crossings, the index of the edge, the index of
-    the line, the position on the edge from 0 (start) to 1 (end), and the index in the
+    Rows and columns are both called lines. For rows, y is the coordinate across the lines, and x
+    the coordinate along the lines. For columns, it is the other way round. Coordinates are in units
+    of samples. Line i has the coordinate i. Crossings before the first sample or after the last
+    sample of a line are left out. The results are, for each of K crossings, the index of the edge,
+    the index of the line, the position on the edge from 0 (start) to 1 (end), and the index in the
     line of the first sample at or after the crossing.
     """
     lower = np.minimum(start_across, end_across)

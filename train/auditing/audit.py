@@ -265,8 +265,7 @@ class _Plan:
     def score_in_normalized_light(self, out: Path) -> None:
         """Score each network with the remedy "normalized light" on the test images.
 
-        This remedy normalizes the colors of an image before the network
-        classifies it.
+        This remedy normalizes the colors of an image before the network classifies it.
         """
         for key, network in normalizing(self.networks).items():
             self._score(network, out / key)
@@ -423,9 +422,8 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
 def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
     """Check that an audit may write to a folder, because it is new or can be continued.
 
-    An audit of networks that the caller passes as objects is never continued.
-    config.yaml does not have their names, so the results may be about other
-    networks.
+    An audit of networks that the caller passes as objects is never continued. config.yaml does not
+    have their names, so the results may be about other networks.
     """
     # Files with these names are results of this audit, which continues with them.
     own_results: Collection[str] = ()

@@ -394,12 +394,7 @@ class _ScoredImage(NamedTuple):
 def _worst(
     networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
 ) -> dict[str, list[Picture]]:
-    """Make two galleries of the worst predictions of each network.
-
-    The first gallery has the images of the tested class with the lowest log-odds of this class. The
-    second gallery has the images of other objects with the highest log-odds. Each gallery has at
-    most WORST pictures, by its title.
-    """
+    """Make galleries of the WORST misses and false alarms, by log-odds of the class, by title."""
     galleries: dict[str, list[Picture]] = {}
     draw = partial(_draw_image, folders, networks)
     for network in networks:

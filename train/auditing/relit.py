@@ -136,11 +136,7 @@ def write_photographs_page(
 
 
 def _answer(scores: RelitScores) -> str:
-    """Write whether the predictions of a network depend on the light of a projector.
-
-    They do if less than a fraction of PASS_THRESHOLD of the photographs keeps
-    its class under random slides.
-    """
+    """Write whether fewer than PASS_THRESHOLD of the photographs keep their class."""
     kept = scores.kept(SLIDE)
     if kept.value is not None and kept.value < PASS_THRESHOLD:
         return "Its predictions depend on the light."

@@ -345,9 +345,8 @@ def _attack_mesh(
 ) -> MeshAttack:
     """Attack one mesh in the scene of the settings, or in a scene that a search finds.
 
-    The search looks for a scene in which the classifier recognizes the mesh.
-    There is no search if `scene.search` is 0, or if `attack.force` allows to
-    attack a misclassified mesh.
+    The search looks for a scene in which the classifier recognizes the mesh. There is no search if
+    `scene.search` is 0, or if `attack.force` allows to attack a misclassified mesh.
     """
     build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
     scene_settings = settings.scene

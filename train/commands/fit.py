@@ -79,11 +79,7 @@ def fit(settings: FitSettings) -> None:
 
 
 def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
-    """Compare the photograph with a render in the camera and lighting that were found.
-
-    Both images are written to comparison.png, side by side. The error is of the pixels in
-    out/mask.png, with images in `encoding`, "srgb" or "linear".
-    """
+    """Write photograph and render side by side, and return the error within out/mask.png."""
     photograph, rendered = render_attacked(attacked)
     write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.

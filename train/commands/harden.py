@@ -225,11 +225,7 @@ def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
 
 @contextmanager
 def _restores_torch() -> Iterator[None]:
-    """Restore the global state of torch at the end of the block, since training changes it.
-
-    The state is the number of threads, the random generators, and whether cuDNN
-    measures which algorithm is fastest.
-    """
+    """Restore threads, random generators and cuDNN's choices, which training changes."""
     threads = torch.get_num_threads()
     is_benchmarked = torch.backends.cudnn.benchmark
     try:

@@ -189,11 +189,7 @@ def _alternating_flips(images: TrainingImages, seed: int, epoch: int) -> Bool[Te
 
 
 def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round (part of an epoch) from a data set in memory.
-
-    A chunk of several batches is shifted and flipped in one call, which takes
-    less time than one call for each batch. `batch_size` is that of this process.
-    """
+    """Yield the batches of a round (part of an epoch) from a data set in memory."""
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
     device = pixels.device
@@ -234,11 +230,7 @@ def _batches_in_memory(images: TrainingImages, batch_size: int, draws: Draws) ->
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of a round (part of an epoch) from a data set on disk.
-
-    Worker processes read random crops of the images, and flip half of them.
-    Renders are in memory. They are shifted and flipped here.
-    """
+    """Yield the batches of a round (part of an epoch) from a data set on disk."""
     split, rows, renders = images
     device = split.labels.device
     seeds = cast(Tensor, draws.seeds)

@@ -158,11 +158,7 @@ def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> di
 
 
 def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
-    """Create a Mitsuba shape for each part of an object in the pose of a shot.
-
-    The object is scaled and rotated, and moved such that its lowest point
-    touches the table at z = 0.
-    """
+    """Create a Mitsuba shape for each part of an object in the pose of a shot."""
     positions_by_part = []
     for part in parts:
         positions = shot.scale * part.positions @ shot.rotation.T

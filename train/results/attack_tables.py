@@ -107,11 +107,7 @@ def _success(result: AttackResult) -> str:
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
-    """Describe the results of the checks of an attack in lines of text.
-
-    With noise, only an attack that succeeds in spite of it counts; without gradients, the budget is
-    a number of queries.
-    """
+    """Describe the results of the checks of an attack in lines of text."""
     unit = "step" if uses_gradients else "query"
     units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]

@@ -275,11 +275,7 @@ def _describe_images(compared: Compared) -> str:
 
 
 def _direction(change: compare.Difference) -> int:
-    """Return the sign of a difference, or 0 if its sign is not proven.
-
-    The sign is proven if the 95% interval does not contain 0. 1 is a proven increase, -1 a proven
-    decrease, 0 neither.
-    """
+    """Return the sign of a difference, or 0 if its 95% interval contains 0."""
     assert change.low is not None and change.high is not None
     return int(change.low > 0) - int(change.high < 0)
 
@@ -338,11 +334,7 @@ def _sentences(
 
 
 def _describe_false_positives(compared: Compared, change: compare.Difference) -> str:
-    """Say how the false-positive rate changed. A proven increase is called the price.
-
-    With several classes, the rate is a mean over the classes, and the images of
-    one class count as other objects for the others.
-    """
+    """Say how the false-positive rate changed. A proven increase is called the price."""
     original, hardened = compared.subjects
     before, after = f"{change.before:.0%}", f"{change.after:.0%}"
     is_worse = _direction(change) > 0
@@ -453,11 +445,7 @@ def _one_for_each_image(
 
 
 def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:
-    """Return whether a prediction is correct as far as the positive classes are concerned.
-
-    For an image of a positive class, this class must be predicted. For any other
-    image, none of the positive classes must be predicted.
-    """
+    """Return whether the positive class, or for another image no positive class, is predicted."""
     shown = prediction.photograph.label
     if shown in labels:
         return prediction.predicted == shown
@@ -465,12 +453,7 @@ def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:
 
 
 def _draw_images(pairs: Iterable[Pair], images: Path) -> list[ComparedImage]:
-    """Choose at most PICTURES images, and draw them with the predictions of both networks.
-
-    The images on whose log-odds the two networks differ most are preferred. Each
-    combination of a class and a source gets one image before any of them gets a
-    second one.
-    """
+    """Draw at most PICTURES images, first those on whose log-odds both networks differ most."""
     ordered = sorted(pairs, key=lambda pair: -abs(pair[1].log_odds - pair[0].log_odds))
     first_of_group: dict[tuple[str, str | None], Pair] = {}
     for pair in ordered:

@@ -415,11 +415,7 @@ def _compare_on(group: Scored) -> FirstScreen | None:
 
 
 def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> list[str]:
-    """List the positive classes whose test images show the same objects as the training images.
-
-    These are test images that the run has rendered itself, of classes for which
-    the library cannot generate other objects.
-    """
+    """List the positive classes whose rendered test images show objects of the training."""
     is_rendered_by_run = images == scored.run.folder / KEPT_ASIDE
     if not is_rendered_by_run:
         return []

@@ -351,11 +351,7 @@ def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
 
 
 def _tile(prediction: Prediction, image: Tensor, color: str) -> Tile:
-    """Enlarge an image, and add a colored frame and captions.
-
-    The first caption is the predicted class with its probability. If the
-    prediction is wrong, the second caption is the true class.
-    """
+    """Enlarge an image, and add a frame, its prediction and, if that is wrong, its true class."""
     pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
     enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
     lines = [f"{prediction.probability:.0%} {prediction.predicted}"]

@@ -220,11 +220,10 @@ def _describe(
 def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:
     """Write pictures that show photographs in each kind of light, side by side.
 
-    Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes
-    in only one kind of light come first, which is usually the gradient attack.
-    Photographs whose class changes in more kinds of light follow. Photographs
-    whose class never changes come last. Return the file name of each picture by the index of its
-    photograph.
+    Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes in only one kind of
+    light come first, which is usually the gradient attack. Photographs whose class changes in more
+    kinds of light follow. Photographs whose class never changes come last. Return the file name of
+    each picture by the index of its photograph.
     """
     # Each entry is about one kind of light: whether any slide changes the class of each
     # photograph, shape (N,).

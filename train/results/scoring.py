@@ -552,11 +552,7 @@ def _format_metric(metric: Estimate | None) -> str:
 
 
 def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:
-    """Yield the title and the metrics of each row of a table of scores.
-
-    The first row is about all images. Rows about each label follow, and then
-    rows about each mesh, each class or each source.
-    """
+    """Yield title and metrics of all images, each label, and each mesh, class or source."""
     yield "all", scores.overall
     yield from scores.by_label.items()
     groups = scores.by_mesh or scores.class_metrics or scores.by_source

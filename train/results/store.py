@@ -365,8 +365,7 @@ def _name_by_settings(run: RunSummary, varied: Mapping[str, str]) -> str:
 def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
     """List the networks with whose weights runs began, each network once.
 
-    Two networks are the same if they have the same settings and were scored on
-    the same images.
+    Two networks are the same if they have the same settings and were scored on the same images.
     """
     networks = {}
     for run in runs:
@@ -567,8 +566,7 @@ def _add(found: Findings, path: Path) -> None:
 def _walk(folder: Path) -> Iterator[Path]:
     """Yield a folder and all folders below it that hold a run, an attack or scores.
 
-    Sub-folders with the scores of a run are left out, because the run includes
-    these scores.
+    Sub-folders with the scores of a run are left out, because the run includes these scores.
     """
     files_of_run = {run_folder.METRICS, run_folder.FAILURE, run_folder.LAST, run_folder.BEST}
     files_of_others = {LINES, SUMMARY, PUBLISHED}

@@ -277,8 +277,7 @@ def choose_validation(
 def _default_fraction(data: DataSet) -> float:
     """Return the default fraction of the training images that validate the network.
 
-    It is VALIDATION, or less for data without labels, of which at most HELD_OUT
-    images validate.
+    It is VALIDATION, or less for data without labels, of which at most HELD_OUT images validate.
     """
     largest = 1.0 if data.labeled else HELD_OUT / len(data.train)
     return min(VALIDATION, largest)

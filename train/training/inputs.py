@@ -195,11 +195,7 @@ def _build_scene(
     device: torch.device,
     phases: Phases,
 ) -> Scene:
-    """Build the scene with the meshes and hard negatives of a run, and log the rasterizer.
-
-    If the run has several processes, the first one builds the scene before the
-    others, which then find its files.
-    """
+    """Build the scene with meshes and hard negatives, in the first process before the others."""
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.debug("rasterizer: %s", rasterizer.description)

@@ -361,9 +361,8 @@ class Trainer:
     def _saving_is_due(self) -> bool:
         """Return whether it is time to write a checkpoint within an epoch.
 
-        Without such checkpoints, a run that is killed would lose a whole epoch.
-        A run with several processes writes none, because the processes would
-        have to agree on the time.
+        Without such checkpoints, a run that is killed would lose a whole epoch. A run with several
+        processes writes none, because the processes would have to agree on the time.
         """
         if distributed.world_size() > 1:
             return False

@@ -40,11 +40,7 @@ def _cosine(done: float) -> float:
 
 
 def _one_cycle(done: float) -> float:
-    """Return the factor of the learning rate in the schedule "one_cycle".
-
-    The factor rises linearly from START_FACTOR to 1, and then falls linearly to
-    0. The schedule suits short trainings.
-    """
+    """Return the factor of the learning rate: linear from START_FACTOR to 1, and then to 0."""
     if done < WARMUP:
         return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
     return (1 - done) / (1 - WARMUP)

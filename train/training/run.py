@@ -241,8 +241,7 @@ class Run:
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network on the test images and on photographs.
 
-        If the data have no labels, the predictions of the initial network become
-        their labels.
+        If the data have no labels, the predictions of the initial network become their labels.
         """
         predictions = self._predict(model, self.data.test)
         self._initial_predictions = predictions
@@ -270,9 +269,8 @@ class Run:
     def _render_kept_aside(self) -> None:
         """Render test images of other objects and projected patterns than those of the training.
 
-        Nothing is rendered if the settings name photographs to score, if they
-        ask for no test renders, or if a resumed run has already rendered them
-        with the same settings.
+        Nothing is rendered if the settings name photographs to score, if they ask for no test
+        renders, or if a resumed run has already rendered them with the same settings.
         """
         if self.scored_folders or not self.settings.evaluate.laboratory_setups:
             return
@@ -288,11 +286,7 @@ class Run:
         self.scored_folders = {LABORATORY: folder}
 
     def _score(self) -> dict[str, float]:
-        """Score the selected network, and the one after the last epoch, on the test images.
-
-        Afterwards, `self.trainer.selected` has the weights of the selected network. "test/epoch" is
-        the epoch that it is from.
-        """
+        """Score the network after the last epoch and the selected one, whose weights remain."""
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
         last = selected = evaluate(trainer.selected, test)["accuracy"]
