@@ -77,6 +77,7 @@ def save_light(
         >>> import norm_balls as nb
         >>> light = nb.load_light("grace")
         >>> nb.save_light("light.json", light)
+        0.0
         >>> torch.equal(nb.load_light("light.json"), light)
         True
         >>> nb.save_light("light.hdr", light) < 0.01
