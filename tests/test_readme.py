@@ -10,6 +10,7 @@ from PIL import Image
 from torch import nn
 from torch.utils.data import Dataset
 
+import norm_balls
 import renderer
 from renderer.image import to_bytes
 
@@ -48,6 +49,7 @@ def test_every_block_of_python_is_run_here():
         "Your own cameras",
         "Many lights and views",
         "Load",
+        "Photographs",
     }
 
 
@@ -88,6 +90,17 @@ def test_load_block_recognizes_an_orange(folder):
     )
     Image.fromarray(to_bytes(image[0]).permute(1, 2, 0).numpy()).save(folder / "orange.jpg")
     assert run("Load")["predicted"] == "orange"
+
+
+def test_photographs_block_publishes_a_network_with_its_threshold(folder):
+    for name, color in (("orange", (230, 120, 40)), ("cup", (90, 90, 200))):
+        for index in range(20):
+            path = folder / "lab" / name / f"{index}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (32, 32), tuple(value - 3 * index for value in color)).save(path)
+    run("Photographs", nb=norm_balls)
+    (point,) = norm_balls.load_run("published/best").operating_points
+    assert point.label == "orange"
 
 
 def test_attack_block_fools_the_installed_network_in_three_views(folder):
