@@ -51,7 +51,8 @@ class SharedProblem:
         self.start = problem.start[:1]
         self.group_size = problem.group_size
         # The steps and the norm-ball are those of the first example.
-        self.take_step = problem.take_step
+        self.scale_gradient = problem.scale_gradient
+        self.search_scale = problem.search_scale
         self.project = problem.project
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
