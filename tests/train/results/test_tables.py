@@ -33,7 +33,7 @@ def split_cells(line: str) -> list[str]:
 @pytest.mark.parametrize("width", [45, 60, 80, 300])
 def test_a_table_fits_the_terminal_and_every_cell_is_in_its_row_and_column(monkeypatch, width):
     monkeypatch.setattr(sys, "stdout", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda: os.terminal_size((width, 24)))
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((width, 24)))
     metrics = ["auc", "recall", "false positives"]
     networks = ("before", "after")
     table_rows = [[name, *(f"{metric} of {name}" for metric in metrics)] for name in networks]
