@@ -10,15 +10,21 @@ fraction of intervals that contain the true metric and, in brackets, their mean 
 - *images*: the intervals of the library over images, and the truth for the drawn objects.
 
 The truth is the metric of a population whose effects and noise are equally spaced quantiles.
+
+    python -m benchmarks.coverage --like out/predictions.csv --label orange
+
+tells how large and how skewed effects and noise are in a table of predictions with a column `mesh`.
 """
 
 import argparse
+import csv
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri, stdtrit
+from scipy.stats import skew
 
 from train.results.intervals import (
     Jackknife,
@@ -265,6 +271,24 @@ def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {name: np.concatenate(item, axis=-1).mean(axis=-1) for name, item in rows.items()}
 
 
+def describe(path: str, label: str) -> Table:
+    """Measure the effects of objects and the noise of images on the log-odds of a label."""
+    objects: dict[tuple[bool, str], list[float]] = {}
+    with open(path, newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            key = (row["label"] == label, row["mesh"])
+            objects.setdefault(key, []).append(float(row[f"{label}_log_odds"]))
+    rows = []
+    for is_positive, kind in ((True, label), (False, "other")):
+        scores = [values for (group, _), values in objects.items() if group == is_positive]
+        means = np.array([np.mean(values) for values in scores])
+        noise = np.concatenate([values - np.mean(values) for values in scores])
+        numbers = (means.std(ddof=1) / noise.std(), skew(means, bias=False), skew(noise))
+        rows.append([kind, str(len(scores)), *(f"{number:.2f}" for number in numbers)])
+    header = ["kind", "objects", "effect / noise", "skewness of effects", "of noise"]
+    return Table("effects", header, rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure each setup, and print a table.
 
@@ -276,7 +300,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--draws", type=int, default=2000, help="test sets of each setup")
     parser.add_argument("--only", default="", help="text in the titles of the setups to measure")
+    parser.add_argument("--like", help="predictions.csv whose effects to describe instead")
+    parser.add_argument("--label", default="orange", help="positive class in this table")
     options = parser.parse_args(arguments)
+    if options.like:
+        print(describe(options.like, options.label))
+        return
     rows = []
     for seed, setup in enumerate(SETUPS):
         title = f"{setup.name}, {setup.objects[0]} and {setup.objects[1]}"
