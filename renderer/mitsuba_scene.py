@@ -190,7 +190,7 @@ class Part:
         normals: Unit normals of the corners, shape (F, 3, 3).
         uvs: Texture coordinates of the corners as in `Mesh`, shape (F, 3, 2).
         colors: Linear colors of the corners, shape (F, 3, 3).
-        texture: Texture, uint8, shape (H, W, 3). None for faces without a
+        texture: Texture, shape (H, W, 3), uint8, or linear floats. None for faces without a
             texture.
         gloss: Roughness, metallic and specular factor of all faces, shape (3,).
             None for a matte mesh.
@@ -202,7 +202,7 @@ class Part:
     normals: Float[np.ndarray, "F 3 3"]
     uvs: Float[np.ndarray, "F 3 2"]
     colors: Float[np.ndarray, "F 3 3"]
-    texture: UInt8[np.ndarray, "H W 3"] | None
+    texture: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"] | None
     gloss: Float[np.ndarray, " 3"] | None = None
     factors: UInt8[np.ndarray, "_ _ 2"] | None = None
 

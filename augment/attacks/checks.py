@@ -345,7 +345,7 @@ class Successes:
         problem: SceneProblem,
         values: Float[Tensor, "A D"],
         examples: Int[Tensor, " A"],
-        images: Float[Tensor, "A V 3 H W"],
+        images: Float[Tensor, "A V _ H W"],
     ) -> None:
         """Add the examples that meet the criterion with some attack values.
 

@@ -26,7 +26,7 @@ def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Mo
 
 
 def add_sensor_noise(
-    images: Float[Tensor, "A V 3 H W"],
+    images: Float[Tensor, "A V _ H W"],
     deviation: float,
     examples: Int[Tensor, " A"],
     *key: int | str,

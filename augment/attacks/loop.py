@@ -71,7 +71,7 @@ class Minimum(ShortRepr):
     """
 
     values: Float[Tensor, "E D"]
-    images: Float[Tensor, "E V 3 H W"]
+    images: Float[Tensor, "E V _ H W"]
     steps: Int[Tensor, " E"]
     queries: Int[Tensor, " E"]
     backward_passes: Int[Tensor, " E"]

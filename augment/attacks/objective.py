@@ -292,13 +292,13 @@ class Objective:
         noise_margin = self._noise_margin(torch.stack(overconfident).any(0))
         return (smallest >= noise_margin * (largest - smallest)).all(1)
 
-    def logits(self, images: Float[Tensor, "E V 3 H W"]) -> Float[Tensor, "E V C"]:
+    def logits(self, images: Float[Tensor, "E V _ H W"]) -> Float[Tensor, "E V C"]:
         """Compute the logits of all views, batch by batch."""
         return compute_outputs(self.model, images, self.settings.batch_size)
 
     def fooled_in_views(
         self,
-        images: Float[Tensor, "E V 3 H W"],
+        images: Float[Tensor, "E V _ H W"],
         predicted: Int[Tensor, "E V"],
         examples: Int[Tensor, " E"],
     ) -> Bool[Tensor, "E V"]:

@@ -84,7 +84,7 @@ class Evaluation:
     candidates: Float[Tensor, "N P D"]
     costs: Float[Tensor, "N P"]
     values: Float[Tensor, "N D"]
-    images: Float[Tensor, "N V 3 H W"]
+    images: Float[Tensor, "N V _ H W"]
     score: Score
     gradient: Float[Tensor, "N D"] | None
 
