@@ -19,11 +19,12 @@ from tests import shapes
 # others in each run.
 settings.register_profile("same", derandomize=True, max_examples=40, deadline=None)
 settings.register_profile("search", max_examples=1200, deadline=None)
+# Other conftest.py, which are read after this one, already import the packages.
+shapes.install()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose how property tests draw their examples, and check the annotated shapes."""
-    shapes.install()
+    """Choose how property tests draw their examples."""
     settings.load_profile("search" if config.option.markexpr == "slow" else "same")
 
 
