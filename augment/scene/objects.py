@@ -429,14 +429,14 @@ class Conditions(ShortRepr):
             addition of `albedo`, shape (A, F).
     """
 
-    light: Float[Tensor, "*A coefficients 3"]
-    vertices: Float[Tensor, "*A N 3"] | None = None
-    albedo: Float[Tensor, "*A F 3"] | None = None
-    pixels: Float[Tensor, "*A V 3 size size"] | None = None
-    positions: Float[Tensor, "*A L 3"] | None = None
-    cameras: Float[Tensor, "*A 3"] | None = None
-    gloss: Float[Tensor, "*A F 3"] | Float[Tensor, "*A 1 3"] | None = None
-    hue: Float[Tensor, "*A F"] | None = None
+    light: Float[Tensor, "... coefficients 3"]
+    vertices: Float[Tensor, "... N 3"] | None = None
+    albedo: Float[Tensor, "... F 3"] | None = None
+    pixels: Float[Tensor, "... V 3 size size"] | None = None
+    positions: Float[Tensor, "... L 3"] | None = None
+    cameras: Float[Tensor, "... 3"] | None = None
+    gloss: Float[Tensor, "... F 3"] | Float[Tensor, "... 1 3"] | None = None
+    hue: Float[Tensor, "... F"] | None = None
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
