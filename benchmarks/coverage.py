@@ -17,9 +17,9 @@ tells how large and how skewed effects and noise are in a table of predictions w
 """
 
 import argparse
-import csv
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from train.results.intervals import (
     weighted_means,
 )
 from train.results.metrics import ROC_METRICS
+from train.results.predictions import read_predictions
 from train.results.tables import Table
 
 METRICS = (*ROC_METRICS, "recall", "FPR", "top-1")
@@ -271,13 +272,12 @@ def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {name: np.concatenate(item, axis=-1).mean(axis=-1) for name, item in rows.items()}
 
 
-def describe(path: str, label: str) -> Table:
+def describe(path: Path, label: str) -> Table:
     """Measure the effects of objects and the noise of images on the log-odds of a label."""
-    objects: dict[tuple[bool, str], list[float]] = {}
-    with open(path, newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            key = (row["label"] == label, row["mesh"])
-            objects.setdefault(key, []).append(float(row[f"{label}_log_odds"]))
+    objects: dict[tuple[bool, str | None], list[float]] = {}
+    for prediction in read_predictions(path, label):
+        key = (prediction.positive, prediction.photograph.mesh)
+        objects.setdefault(key, []).append(prediction.log_odds)
     rows = []
     for is_positive, kind in ((True, label), (False, "other")):
         scores = [values for (group, _), values in objects.items() if group == is_positive]
@@ -300,7 +300,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--draws", type=int, default=2000, help="test sets of each setup")
     parser.add_argument("--only", default="", help="text in the titles of the setups to measure")
-    parser.add_argument("--like", help="predictions.csv whose effects to describe instead")
+    parser.add_argument("--like", type=Path, help="describe the effects in this predictions.csv")
     parser.add_argument("--label", default="orange", help="positive class in this table")
     options = parser.parse_args(arguments)
     if options.like:

@@ -394,7 +394,7 @@ class _ScoredImage(NamedTuple):
 def _worst(
     networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
 ) -> dict[str, list[Picture]]:
-    """Make galleries of the WORST misses and false alarms, by log-odds of the class, by title."""
+    """Make two galleries of each network: its WORST misses and its WORST false alarms."""
     galleries: dict[str, list[Picture]] = {}
     draw = partial(_draw_image, folders, networks)
     for network in networks:

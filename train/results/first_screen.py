@@ -445,7 +445,7 @@ def _one_for_each_image(
 
 
 def _is_correct(prediction: Prediction, labels: Sequence[str]) -> bool:
-    """Return whether the positive class, or for another image no positive class, is predicted."""
+    """Return whether an image of a positive class gets this class, and another image gets none."""
     shown = prediction.photograph.label
     if shown in labels:
         return prediction.predicted == shown

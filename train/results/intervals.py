@@ -219,7 +219,7 @@ def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.
 def _half_width(
     a: np.ndarray, b: np.ndarray, correlation: np.ndarray, is_open: np.ndarray
 ) -> np.ndarray:
-    """Half width of a difference whose parts have the half widths a and b.
+    """Compute the half width of a difference whose parts have the half widths a and b.
 
     If the threshold of a recall may be above all scores (`is_open`), the recall has no lower limit.
     Its distance is then no error that partly cancels, and the distances are added.
@@ -229,7 +229,7 @@ def _half_width(
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Jackknife covariance of two statistics, from their values without each of k units."""
+    """Compute the jackknife covariance of two statistics from their values without each unit."""
     count = one.shape[-1]
     deviations = (x - x.mean(axis=-1, keepdims=True) for x in (one, other))
     return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
