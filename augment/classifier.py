@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.losses import log_odds
 from augment.network import (
     Network,
     Remembered,
@@ -433,3 +432,12 @@ def remembering(classifier: Classifier) -> Classifier:
     remembered = Classifier(network, classifier.size, classifier.classes, classifier.name)
     remembered.operating_points = classifier.operating_points
     return remembered
+
+
+def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " N"]:
+    """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
+
+    The result is finite even if p rounds to 0 or 1.
+    """
+    others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
+    return logits[:, label] - others.logsumexp(dim=1)

@@ -17,13 +17,19 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import distributed
-from augment.attacks.eot import preprocessed_model
-from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.loop import minimize
+from augment.attacks.objective import (
+    NO_CLASS,
+    Criterion,
+    Objective,
+    is_correct,
+    label_loss,
+    preprocessed_model,
+    require_known,
+)
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import LogitNetwork
-from augment.losses import NO_CLASS, is_correct, label_loss, require_known
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
@@ -107,7 +113,7 @@ class AugmentationService:
         scene: Scene of E examples with one view each. None if nothing is
             rendered.
         labels: Labels of the examples, shape (E,), int64. They may be
-            complementary, see `augment.losses`.
+            complementary, see `augment.attacks.objective`.
         seed: Seed of all random numbers.
         phases: Timer of the attacks.
         positive_classes: Classes that the network must tell from all others. The
@@ -400,8 +406,7 @@ class AugmentationService:
         # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, shard)
         # Replace the result of this process by the results of all processes.
-        parts = [getattr(result, item.name) for item in fields(result)]
-        result = Minimum(*[self._gather(part, shard) for part in parts])
+        result = result.map(lambda part: self._gather(part, shard))
         if self.settings.warm_start:
             self._last_values = result.values
         max_steps = attack.max_steps * (1 + attack.restarts)

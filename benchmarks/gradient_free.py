@@ -17,7 +17,7 @@ from torch import Tensor
 
 import norm_balls as nb
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.losses import logit_gap
+from augment.attacks.objective import logit_gap
 
 FRUIT = ("orange", "apple", "pear", "sweet_pepper")
 TITLES = {GRADIENT: "gradient", RANDOM_SEARCH: "random search", CMA_ES: "CMA-ES"}

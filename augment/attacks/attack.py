@@ -13,9 +13,8 @@ from torch import Tensor
 
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import final_images
-from augment.attacks.eot import NOISE_DRAWS, preprocessed_model
 from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import NOISE_DRAWS, Criterion, Objective, preprocessed_model
 from augment.attacks.problem import (
     SceneProblem,
     build_problem,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.eot import as_jpeg
+from augment.attacks.objective import as_jpeg
 from augment.attacks.result import CHECKED, AttackResult, predictions, require_result, warnings
 from augment.progress import progress
 from renderer.errors import InputError, as_folder, as_list, require_choice, require_kind

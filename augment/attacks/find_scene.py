@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.eot import preprocessed_model
+from augment.attacks.objective import preprocessed_model
 from augment.attacks.problem import build_problem, source_labels
 from augment.classifier import Classifier
 from augment.network import compute_outputs

@@ -11,16 +11,15 @@ Whether a success counts is decided after the loop (`Objective.fooled_in_views`)
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.attacks.eot import NOISE_DRAWS
-from augment.attacks.objective import Objective, Score
+from augment.attacks.objective import NOISE_DRAWS, Objective, Rows, Score
 from augment.attacks.optimizers import (
     CMAES,
     Evaluation,
@@ -33,6 +32,8 @@ from augment.network import frozen_eval_mode
 from augment.progress import progress
 from renderer.short_repr import ShortRepr
 
+# Fields of a `Minimum` that belong to the returned candidate.
+FOUND = ("values", "images", "success", "cost", "predicted")
 # Optimizers by their names in the settings.
 OPTIMIZERS: dict[str, type[Optimizer]] = {
     GRADIENT: Gradient,
@@ -42,7 +43,7 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
 
 
 @dataclass(frozen=True, repr=False)
-class Minimum(ShortRepr):
+class Minimum(Rows, ShortRepr):
     """Values that `minimize` found for E examples, with their images and costs.
 
     A candidate is a vector of D values that was evaluated. For each example, one candidate is
@@ -90,31 +91,26 @@ class Minimum(ShortRepr):
         is_zero = torch.zeros_like(score.is_success)
         if evaluation.gradient is not None:
             is_zero = evaluation.gradient.abs().amax(1) == 0
-        return cls(
-            values=evaluation.values.clone(),
-            images=evaluation.images.clone(),
+        nothing = {"success": zeros.bool(), "cost": torch.full_like(score.cost, torch.inf)}
+        minimum = cls(
+            **evaluation.found | nothing,
             steps=zeros,
-            queries=zeros.clone(),
-            backward_passes=zeros.clone(),
+            queries=zeros,
+            backward_passes=zeros,
             success_before=score.is_success,
-            success=zeros.bool(),
             cost_before=score.cost,
-            cost=torch.full_like(score.cost, torch.inf),
-            predicted=score.predicted.clone(),
             zero_gradient=is_zero,
         )
+        # Each tensor is changed in place.
+        return minimum.map(torch.clone)
 
     def record(
-        self, rows: Int[Tensor, " N"], evaluation: Evaluation, is_kept: Bool[Tensor, " N"]
+        self, rows: Int[Tensor, " N"], found: Mapping[str, Tensor], is_kept: Bool[Tensor, " N"]
     ) -> None:
-        """Make the best evaluated candidates of some examples their present results."""
+        """Make candidates the present results of some examples, where the mask is true."""
         kept = is_kept.nonzero()[:, 0]
-        score = evaluation.score
-        self.values[rows[kept]] = evaluation.values[kept]
-        self.images[rows[kept]] = evaluation.images[kept]
-        self.success[rows[kept]] = score.is_success[kept]
-        self.cost[rows[kept]] = score.cost[kept]
-        self.predicted[rows[kept]] = score.predicted[kept]
+        for name, candidates in found.items():
+            getattr(self, name)[rows[kept]] = candidates[kept]
 
     def add_restart(self, rows: Int[Tensor, " A"], restart: Minimum) -> None:
         """Add an attack on some examples from other initial values.
@@ -124,17 +120,8 @@ class Minimum(ShortRepr):
         """
         for name in ("steps", "queries", "backward_passes"):
             getattr(self, name)[rows] += getattr(restart, name)
-        for name in ("values", "images", "success", "cost", "predicted"):
-            getattr(self, name)[rows[restart.success]] = getattr(restart, name)[restart.success]
-
-    @classmethod
-    def join(cls, groups: list[Minimum]) -> Minimum:
-        """Return the result of several groups of examples, one after the other."""
-        if len(groups) == 1:
-            return groups[0]
-        return cls(
-            *(torch.cat([getattr(part, item.name) for part in groups]) for item in fields(cls))
-        )
+        found = {name: getattr(restart, name) for name in FOUND}
+        self.record(rows, found, restart.success)
 
 
 @torch.no_grad()
@@ -252,7 +239,7 @@ def minimize_from(
             # with a success takes only successes of lower cost.
             is_cheaper = score.is_success & (score.cost < result.cost[active])
             is_first = ~result.success[active] & (score.is_success | is_accepted)
-            result.record(active, evaluation, is_finished | is_cheaper | is_first)
+            result.record(active, evaluation.found, is_finished | is_cheaper | is_first)
             passes = candidates.shape[1] * objective.passes_per_candidate
             result.steps[active] = step
             result.queries[active] += passes + noisy_count

@@ -7,42 +7,74 @@ class c. The cost is that of the paper's equation 1, summed over the views:
     cost = Σ −CE(f(I), s) + CE(f(I), t)
 
 An example succeeds when the predictions reach its criterion in every view. It is finished when the
-logit gap (`augment.losses.logit_gap`) is also at least `AttackSettings.margin` in every view. If
-the settings ask for it, or if the network is overconfident (`augment.losses.is_overconfident`), the
-gap must also be larger than its changes by the noise of a sensor.
+logit gap (`logit_gap`) is also at least `AttackSettings.margin` in every view. If the settings ask
+for it, or if the network is overconfident (`is_overconfident`), the gap must also be larger than
+its changes by the noise of a sensor.
+
+A label is the index of a class. A complementary label says that an image does not show a class. It
+is the number −1 − class. If there are several positive classes, the argument `absent` contains the
+other classes that images with a complementary label do not show, either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from PIL import Image
 from torch import Tensor, nn
 
-from augment.attacks.eot import (
-    NOISE_DRAWS,
-    ExpectationOverTransformations,
-    add_sensor_noise,
-    preprocessed_model,
-)
-from augment.losses import NO_CLASS, adversarial_cost, is_overconfident, logit_gap
-from augment.network import BatchSize, compute_outputs
+from augment.network import BatchSize, Network, Quantization, compute_outputs, straight_through
 from augment.progress import Phases
 from augment.random_streams import generator
+from renderer.errors import require_range
+from renderer.image import clamp, to_bytes, to_unit
 
 if TYPE_CHECKING:
-    from augment.attack_settings import AttackSettings
+    from augment.attack_settings import AttackSettings, EOTSettings
 
+# Index that stands for "no class" in attacks without a source or a target class. It differs from
+# all labels.
+NO_CLASS = -(10**9)
+# A network is overconfident where its log-odds exceed this number. Networks rarely do so, unless
+# their logits are multiplied by a factor.
+OVERCONFIDENT = 50.0
 # Gradients below this number are not scaled before they enter the network.
 MIN_GRADIENT = 1e-30
+# Number of noisy versions of an image that `add_sensor_noise` yields. An attack counts as a success
+# only if the classifier is wrong in all of them.
+NOISE_DRAWS = 3
+
+
+class Rows:
+    """Base of data classes whose tensors have one row for each example."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Return a copy with changed tensors."""
+        tensors = {name: item for name, item in vars(self).items() if isinstance(item, Tensor)}
+        changed = {name: change(tensor) for name, tensor in tensors.items()}
+        return replace(self, **changed)  # type: ignore[type-var]
+
+    def select(self, rows: Tensor | slice) -> Self:
+        """Return some of the rows."""
+        return self.map(lambda tensor: tensor[rows])
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Return the rows of several parts, one after the other."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True)
-class Criterion:
+class Criterion(Rows):
     """Source and target class of each view of an attack on a classifier.
 
     An attack lowers the confidence in the source class of each view and raises
@@ -62,18 +94,6 @@ class Criterion:
     source: Int[Tensor, "*E V"]
     target: Int[Tensor, "*E V"] | None = None
 
-    def select(self, examples: Tensor | slice) -> Criterion:
-        """Return the criterion of some of the examples."""
-        if self.target is None:
-            return Criterion(self.source[examples])
-        return Criterion(self.source[examples], self.target[examples])
-
-    def flatten(self) -> Criterion:
-        """Return the classes of all V views of all E examples as one list, shape (E · V,)."""
-        if self.target is None:
-            return Criterion(self.source.flatten())
-        return Criterion(self.source.flatten(), self.target.flatten())
-
     @property
     def view_count(self) -> int:
         """Number V of views of each example."""
@@ -92,11 +112,7 @@ class Criterion:
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, " ..."]) -> Bool[Tensor, " ..."]:
-        """Return a mask of the views that reach the criterion.
-
-        A view reaches it if its predicted class is the target class or, without
-        a target, is not the source class.
-        """
+        """Return a mask of the views that reach the criterion."""
         is_misclassified = predicted != self.source
         if self.target is None:
             return is_misclassified
@@ -106,18 +122,18 @@ class Criterion:
 
 
 @dataclass(frozen=True)
-class Score:
+class Score(Rows):
     """Cost, logit gap and predicted classes of N examples, or of N single images.
 
     The cost of an example is the sum over its views, and its gap is the smallest gap of its views.
 
     Attributes:
         cost: Cost that the attack lowers.
-        gap: By how much the criterion is reached, see `augment.losses.logit_gap`.
+        gap: By how much the criterion is reached, see `logit_gap`.
         predicted: Predicted classes of the images before any random transformation. Shape (N, V)
             for examples with V views, (N,) for single images.
         is_success: Whether the predictions reach the criterion, in all views of an example.
-        is_overconfident: See `augment.losses.is_overconfident`; in any view of an example.
+        is_overconfident: See `is_overconfident`; in any view of an example.
     """
 
     cost: Float[Tensor, " N"]
@@ -126,22 +142,12 @@ class Score:
     is_success: Bool[Tensor, " N"]
     is_overconfident: Bool[Tensor, " N"]
 
-    @classmethod
-    def join(cls, parts: Sequence[Score]) -> Score:
-        """Return the scores of several parts of the examples or images as one."""
-        return cls(
-            *(torch.cat([getattr(part, item.name) for part in parts]) for item in fields(cls))
-        )
-
     def of_examples(self, view_count: int) -> Score:
         """Combine the scores of single images. The views of an example follow each other."""
-        by_view = [getattr(self, item.name).unflatten(0, (-1, view_count)) for item in fields(self)]
-        cost, gap, predicted, is_success, is_extreme = by_view
+        cost, gap, predicted, is_success, is_extreme = (
+            tensor.unflatten(0, (-1, view_count)) for tensor in vars(self).values()
+        )
         return Score(cost.sum(1), gap.amin(1), predicted, is_success.all(1), is_extreme.any(1))
-
-    def select(self, rows: Tensor) -> Score:
-        """Return the scores of some of the examples or images."""
-        return Score(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 class Objective:
@@ -168,9 +174,7 @@ class Objective:
         self.settings = settings
         self.seed = seed
         self.phases = phases or Phases()
-        self._expectation = ExpectationOverTransformations(
-            settings.eot, generator(seed, "expectation")
-        )
+        self._transformations = generator(seed, "expectation")
         self._batch_size = BatchSize(settings.batch_size)
 
     def select(self, examples: Tensor | slice) -> Objective:
@@ -195,7 +199,7 @@ class Objective:
         Return also the gradients of the costs with respect to the images, if they are needed.
         """
         all_images = images.flatten(0, 1)
-        criterion = self.criterion.flatten()
+        criterion = self.criterion.map(torch.flatten)
         gradients = torch.empty_like(all_images) if needs_gradient else None
 
         def score_batch(rows: slice) -> Score:
@@ -215,7 +219,9 @@ class Objective:
         batch = batch.detach().requires_grad_(gradients is not None)
         # The network may compute in half precision.
         logits = self.model(batch).to(batch.dtype)
-        expected = self._expectation(self.model, batch, logits)
+        expected = average_transformed(
+            self.model, batch, logits, self.settings.eot, self._transformations
+        )
         cost = criterion.cost(expected)
         if gradients is not None:
             (logit_gradient,) = torch.autograd.grad(cost.sum(), expected)
@@ -258,11 +264,9 @@ class Objective:
 
     def _noise_margin(self, is_overconfident: Tensor) -> Tensor:
         """Return how many times the range of the gaps with noise the smallest gap must be."""
-        return torch.where(
-            is_overconfident,
-            self.settings.overconfident_noise_margin,
-            self.settings.applied_noise_margin,
-        )
+        settings = self.settings
+        margins = settings.overconfident_noise_margin, settings.applied_noise_margin
+        return torch.where(is_overconfident, *margins)
 
     @torch.no_grad()
     def is_robust(
@@ -276,25 +280,30 @@ class Objective:
         """
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
-        noisy_versions = add_sensor_noise(
-            images, self.settings.sensor_noise, examples, self.seed, "noise margin"
-        )
-        gaps = []
-        overconfident = []
-        for version in (images, *noisy_versions):
-            batches = version.flatten(0, 1).split(self.settings.batch_size)
-            logits = torch.cat([self.model(batch) for batch in batches])
-            logits_of_views = logits.unflatten(0, version.shape[:2])
-            gaps.append(self.criterion.gap(logits_of_views))
-            overconfident.append(is_overconfident(logits_of_views))
+        noise = self.settings.sensor_noise
+        versions = add_sensor_noise(images, noise, examples, self.seed, "noise margin")
+        logits = [self.logits(version) for version in (images, *versions)]
         # Smallest and largest logit gap of each view, each of shape (E, V).
-        smallest, largest = torch.stack(gaps).aminmax(dim=0)
-        noise_margin = self._noise_margin(torch.stack(overconfident).any(0))
-        return (smallest >= noise_margin * (largest - smallest)).all(1)
+        smallest, largest = torch.stack([*map(self.criterion.gap, logits)]).aminmax(dim=0)
+        is_extreme = torch.stack([*map(is_overconfident, logits)]).any(0)
+        return (smallest >= self._noise_margin(is_extreme) * (largest - smallest)).all(1)
 
     def logits(self, images: Float[Tensor, "E V _ H W"]) -> Float[Tensor, "E V C"]:
         """Compute the logits of all views, batch by batch."""
         return compute_outputs(self.model, images, self.settings.batch_size)
+
+    def judge(
+        self, images: Float[Tensor, "E V _ H W"], examples: Int[Tensor, " E"]
+    ) -> tuple[Float[Tensor, "E V C"], Bool[Tensor, "E V"], Bool[Tensor, " E"]]:
+        """Decide about images that an attack found.
+
+        Return the logits, a mask of the views that count as a success (`fooled_in_views`), and a
+        mask of the examples that reach the criterion without sensor noise.
+        """
+        logits = self.logits(images)
+        predicted = logits.argmax(2)
+        fooled_in_views = self.fooled_in_views(images, predicted, examples)
+        return logits, fooled_in_views, self.criterion.reached(predicted)
 
     def fooled_in_views(
         self,
@@ -312,18 +321,243 @@ class Objective:
         is_fooled = self.criterion.reached_in_views(predicted)
         # Noise is tested only in examples with a view that is fooled without noise.
         tested = torch.nonzero(is_fooled.any(1)).squeeze(1)
-        if not self.settings.sensor_noise or not len(tested):
+        noise = self.settings.sensor_noise
+        if not noise or not len(tested):
             return is_fooled
         criterion = self.criterion.select(tested)
-        noisy_versions = add_sensor_noise(
-            images[tested.to(images.device)],
-            self.settings.sensor_noise,
-            examples.to(tested.device)[tested],
-            self.seed,
-            "sensor noise",
-        )
-        for noisy_images in noisy_versions:
+        shown = images[tested.to(images.device)]
+        keys = examples.to(tested.device)[tested]
+        for noisy_images in add_sensor_noise(shown, noise, keys, self.seed, "sensor noise"):
             noisy_predicted = self.logits(noisy_images).argmax(2).to(is_fooled.device)
             # A view must be fooled in every draw of the noise.
             is_fooled[tested] &= criterion.reached_in_views(noisy_predicted)
         return is_fooled
+
+
+def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
+    """Return a classifier that rounds images to 8 bits, if `settings.quantized` asks for it."""
+    return Network(classifier, [Quantization()]) if settings.quantized else classifier
+
+
+def add_sensor_noise(
+    images: Float[Tensor, "A V _ H W"],
+    deviation: float,
+    examples: Int[Tensor, " A"],
+    *key: int | str,
+) -> Iterator[Tensor]:
+    """Add sensor noise to images and round them to 8 bits, as a camera does.
+
+    This is repeated `NOISE_DRAWS` times with different noise. The noise of an example depends only
+    on the key and on the index of the example. The deviation is in units of 1/255, and the noisy
+    images are rounded to 8 bits.
+    """
+    generators = [generator(*key, example) for example in examples.tolist()]
+    for _ in range(NOISE_DRAWS):
+        noise = [torch.randn(images.shape[1:], generator=draws) for draws in generators]
+        noisy = images + deviation / 255 * torch.stack(noise).to(images)
+        yield to_unit(to_bytes(clamp(noisy))).to(images)
+
+
+def average_transformed(
+    model: nn.Module,
+    images: Float[Tensor, "N _ H W"],
+    logits: Float[Tensor, "N C"],
+    settings: EOTSettings,
+    draws: torch.Generator,
+) -> Float[Tensor, "N C"]:
+    """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
+
+    The log-probabilities of each image and of its transformed copies are averaged. Gradients ignore
+    the JPEG compression (straight-through estimator). With 0 transformations, the given logits are
+    returned as they are.
+    """
+    if not settings.draws:
+        return logits
+    log_probabilities = [logits.log_softmax(1)]
+    for _ in range(settings.draws):
+        transformed_logits = model(_transformed(images, settings, draws)).to(logits.dtype)
+        log_probabilities.append(transformed_logits.log_softmax(1))
+    return torch.stack(log_probabilities).mean(0)
+
+
+def _transformed(
+    images: Float[Tensor, "N 3 H W"], settings: EOTSettings, draws: torch.Generator
+) -> Float[Tensor, "N 3 H W"]:
+    """Transform each image at random.
+
+    A transformation shifts, rotates and scales the image, changes the exposure, adds noise and
+    compresses the image as JPEG. The quality of the compression is the same for all images of a
+    call. Everything else differs between images.
+    """
+
+    def uniform(*shape: int) -> Tensor:
+        return 2 * torch.rand(*shape, generator=draws) - 1
+
+    # Two shifts, a rotation and a relative change of size for each image, shape (N, 4).
+    moved = _moved(images, (settings.jitter * uniform(len(images), 4)).to(images))
+    # Change of the exposure in stops. One stop doubles the exposure.
+    stops = settings.exposure * uniform(len(images), 1, 1, 1)
+    exposed = clamp(moved * (2**stops).to(images))
+    noise = settings.noise * torch.randn(images.shape, generator=draws)
+    noisy = clamp(exposed + noise.to(images))
+    quality = int(torch.randint(settings.jpeg, 101, (), generator=draws))
+    return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), quality).to(exact))
+
+
+def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "... 3 H W"]:
+    """Compress images as JPEG and decompress them. The quality is from 1 to 100."""
+    decompressed = []
+    for image in to_bytes(images).flatten(0, -4):
+        file = io.BytesIO()
+        # pillow has the channels last.
+        Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
+        with Image.open(file) as read:
+            decompressed.append(torch.from_numpy(np.array(read)).permute(2, 0, 1))
+    return to_unit(torch.stack(decompressed)).view(images.shape)
+
+
+def _moved(
+    images: Float[Tensor, "N 3 H W"], movements: Float[Tensor, "N 4"]
+) -> Float[Tensor, "N 3 H W"]:
+    """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
+
+    Each new pixel takes its value from a position in the given image. The movement is that of these
+    positions, so the content of the image moves in the opposite direction. The four numbers of a
+    movement are the shift across and the shift down as fractions of the image size, the rotation in
+    radians, and g. Distances from the center are multiplied by 1 + g.
+    """
+    across, down, angle, growth = movements.unbind(1)
+    cos = (1 + growth) * angle.cos()
+    sin = (1 + growth) * angle.sin()
+    # `affine_grid` uses coordinates from -1 to 1. A shift by the whole image is therefore 2.
+    matrices = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1).view(-1, 2, 3)
+    grid = F.affine_grid(matrices, list(images.shape), align_corners=False)
+    return F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+
+
+def adversarial_cost(
+    logits: Float[Tensor, "N classes"],
+    source: Int[Tensor, " N"],
+    target: Int[Tensor, " N"] | None = None,
+) -> Float[Tensor, " N"]:
+    """Compute the cost that an attack decreases.
+
+    It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy. Without a target,
+    the cost and its gradient round to 0 if the log-odds o of the source are large. Where they
+    exceed 50, o − 50 is therefore added. The attack lowers the probability of the source class and
+    raises that of the target class. `NO_CLASS` omits a term of an image, and a target of None omits
+    it for all images.
+    """
+    # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
+    require_known(source.clamp(min=0), logits)
+    odds = _log_odds(logits, source)
+    is_added = odds > OVERCONFIDENT
+    if target is not None:
+        is_added = is_added & (target == NO_CLASS)
+    cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
+    cost = torch.where(source == NO_CLASS, 0, cost)
+    if target is not None:
+        cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
+    return cost
+
+
+def _log_odds(logits: Tensor, classes: Tensor) -> Tensor:
+    """Compute the log-odds of a class of each image, where NO_CLASS stands for any class.
+
+    Their log σ is the logarithm of the probability. Its gradient is accurate even if the
+    probability rounds to 1. The gradient of `cross_entropy` then loses the term of the class.
+    """
+    columns = torch.where(classes == NO_CLASS, 0, classes)[:, None]
+    other_logits = logits.scatter(1, columns, -torch.inf)
+    return logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
+
+
+def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ..."]:
+    """Return a mask of the images with a class of log-odds above 50 or below −50."""
+    lowest, highest = logits.aminmax(dim=-1)
+    return highest - lowest > OVERCONFIDENT
+
+
+def logit_gap(
+    logits: Float[Tensor, "... classes"],
+    source: Int[Tensor, " ..."],
+    target: Int[Tensor, " ..."] | None = None,
+) -> Float[Tensor, " ..."]:
+    """Compute by how much logits reach the aim of an attack.
+
+    With a target class, the logit gap is the logit of the target minus the largest other logit.
+    Without one, it is the largest logit of the other classes minus the logit of the source class.
+    It is positive if the attack succeeds, and negative if it does not. A target of `NO_CLASS`
+    stands for no target of an image, and None for none of all images.
+    """
+    if target is None:
+        target = torch.full_like(source, NO_CLASS)
+    has_target = target != NO_CLASS
+    # Class whose logit is compared with the others, shape (..., 1).
+    compared_class = torch.where(has_target, target, source)[..., None]
+    compared_logit = logits.gather(-1, compared_class)[..., 0]
+    largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
+    difference = compared_logit - largest_other
+    return torch.where(has_target, difference, -difference)
+
+
+def complementary_label(label: int) -> int:
+    """Return the complementary label of a class. It says that images do not show the class."""
+    return -1 - label
+
+
+def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "_ classes"]) -> None:
+    """Check that every label has a logit. Labels may be complementary."""
+    require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
+
+
+def label_loss(
+    logits: Float[Tensor, "N classes"],
+    labels: Int[Tensor, " N"],
+    label_smoothing: float = 0.0,
+    absent: Sequence[int] = (),
+) -> Float[Tensor, " N"]:
+    """Compute the loss of each image by its label.
+
+    An image of class c has the label c. Its loss is the cross entropy. An image that does not
+    show class c has the complementary label −1 − c. Its loss is −log(1 − p), where p is the sum
+    of the probabilities of c and of the classes `absent`.
+    """
+    classes = _class_of(labels)
+    # Set the logits of the classes that are not shown to -∞. Only the logits of the other
+    # classes remain.
+    other_logits = logits.scatter(1, classes[:, None], -torch.inf)
+    for index in absent:
+        other_logits[:, index] = -torch.inf
+    # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
+    complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
+    cross_entropy = F.cross_entropy(
+        logits, classes, reduction="none", label_smoothing=label_smoothing
+    )
+    return torch.where(labels < 0, complementary, cross_entropy)
+
+
+def is_correct(
+    predicted: Int[Tensor, " N"], labels: Int[Tensor, " N"], absent: Sequence[int] = ()
+) -> Bool[Tensor, " N"]:
+    """Return a mask of the predictions that agree with the labels.
+
+    A label that is a class demands the prediction of this class. The complementary label
+    −1 − c says that the image does not show class c. It demands a prediction that is neither c
+    nor one of the classes `absent`.
+    """
+    is_complementary = labels < 0
+    is_class_of_label = predicted == _class_of(labels)
+    is_absent = torch.zeros_like(is_class_of_label)
+    for index in absent:
+        is_absent = is_absent | (predicted == index)
+    return torch.where(
+        is_complementary,
+        ~is_class_of_label & ~is_absent,
+        is_class_of_label,
+    )
+
+
+def _class_of(labels: Tensor) -> Tensor:
+    """Return the class c of each label, which is c or, if it is complementary, −1 − c."""
+    return torch.where(labels < 0, -1 - labels, labels)

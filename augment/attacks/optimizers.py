@@ -88,6 +88,17 @@ class Evaluation:
     score: Score
     gradient: Float[Tensor, "N D"] | None
 
+    @property
+    def found(self) -> dict[str, Tensor]:
+        """Return what is recorded of the best candidates, by the names in `Minimum`."""
+        return {
+            "values": self.values,
+            "images": self.images,
+            "success": self.score.is_success,
+            "cost": self.score.cost,
+            "predicted": self.score.predicted,
+        }
+
 
 class Optimizer(ABC):
     """Search for attack values of low cost, for each of A examples by itself.

@@ -5,17 +5,16 @@ import pytest
 import torch
 from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.losses import (
+from augment.attacks.objective import (
     NO_CLASS,
     adversarial_cost,
     complementary_label,
     is_correct,
-    kl_divergence,
     label_loss,
-    log_odds,
     logit_gap,
-    ranking_loss,
 )
+from augment.classifier import log_odds
+from train.training.losses import kl_divergence, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 ROWS = torch.arange(6)

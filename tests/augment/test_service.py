@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.attack_settings import StepSettings
+from augment.attacks.objective import complementary_label
 from augment.augmentation_settings import (
     AugmentationSettings,
     RandomLightSettings,
     TrainingAttackSettings,
     VariationSettings,
 )
-from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.objects import Conditions

@@ -20,13 +20,11 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
-from augment.attacks.eot import preprocessed_model
 from augment.attacks.files import require_renderers, save
 from augment.attacks.find_scene import find_scene
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import NO_CLASS, Criterion, Objective, preprocessed_model
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, predictions, warnings
 from augment.classifier import Classifier
-from augment.losses import NO_CLASS
 from augment.network import compute_outputs
 from augment.random_streams import generator
 from augment.scene.build import build_scene

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_names
-from augment.losses import log_odds
+from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_names, log_odds
 from augment.network import compute_outputs
 from renderer.errors import InputError, as_folder, require_choice, require_kind, require_whole
 from renderer.io.files import atomic_write, remove_unfinished

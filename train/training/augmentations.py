@@ -6,7 +6,7 @@ adversarial attacks on pixels (PGD). "relight" shows the images in the light of 
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,9 +17,8 @@ from augment import distributed
 from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize_from
 from augment.attacks.norm_ball import NormBalls
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Criterion, Objective, label_loss
 from augment.attacks.optimizers import Gradient
-from augment.losses import label_loss
 from augment.photographs import RelitPhotographs
 from augment.projected_light import draw_projected_light
 from augment.random_streams import generator, stream_seed
@@ -143,14 +142,6 @@ class _LossOfLabels(Criterion):
     """
 
     absent: Sequence[int] = ()
-
-    def select(self, examples: Tensor | slice) -> Criterion:
-        """Return the criterion of some of the examples."""
-        return replace(self, source=self.source[examples])
-
-    def flatten(self) -> Criterion:
-        """Return the labels as one list."""
-        return replace(self, source=self.source.flatten())
 
     def cost(self, logits: Tensor) -> Tensor:
         """Return the negative loss of each image."""

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
-from augment.losses import kl_divergence
 from augment.network import compute_outputs
 from augment.progress import progress
 from augment.projected_light import relight_photographs
@@ -16,6 +15,7 @@ from augment.random_streams import stream_seed
 from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
+from train.training.losses import kl_divergence
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
 # 1 the weights after it.

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from augment import distributed
+from augment.attacks.objective import complementary_label
 from augment.classifier import class_index
-from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from augment.losses import is_correct, kl_divergence, label_loss, ranking_loss
+from augment.attacks.objective import is_correct, label_loss
+from augment.classifier import log_odds
 from renderer.image import to_unit
 from train.train_settings import TrainSettings
 
@@ -104,3 +106,35 @@ class TrainingLoss:
             of_renders = kl_divergence(logits[:, is_other], targets[:, is_other]) * rendered
             divergences = divergences + of_renders
         return divergences
+
+
+def ranking_loss(
+    logits: Float[Tensor, "N classes"], labels: Int[Tensor, " N"], label: int
+) -> Tensor:
+    """Compute the pairwise ranking loss of a class (RankNet, Burges et al. 2005).
+
+    It is low if the images of the class have higher log-odds than all other images. It is the mean
+    of log(1 + exp(n − p)) over all pairs of an image of the class, with log-odds p, and an image of
+    another class, with log-odds n. Up to a factor, it is a smooth upper bound of 1 − AUC. Labels
+    are classes, and the loss is 0 if there is no pair.
+    """
+    odds = log_odds(logits, label)
+    is_of_class = labels == label
+    # Rows are images of the class, columns are images of other classes, shape (N, N).
+    is_pair = is_of_class[:, None] & ~is_of_class[None, :]
+    losses = F.softplus(odds[None, :] - odds[:, None]) * is_pair
+    return losses.sum() / is_pair.sum().clamp(min=1)
+
+
+def kl_divergence(
+    logits: Float[Tensor, "N classes"], predictions: Float[Tensor, "N classes"]
+) -> Float[Tensor, " N"]:
+    """Compute the distillation loss (Hinton et al. 2015) at temperature 1.
+
+    It is the Kullback–Leibler divergence Σ q log(q / p), summed over the classes, where p are the
+    probabilities of the student and q are those of the teacher.
+    """
+    student = logits.log_softmax(1)
+    teacher = predictions.log_softmax(1)
+    terms = F.kl_div(student, teacher, reduction="none", log_target=True)
+    return terms.sum(1)

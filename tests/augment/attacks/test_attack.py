@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import PARAMETER_NAMES
-from augment.losses import adversarial_cost
+from augment.attacks.objective import adversarial_cost
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 from renderer.light.nonnegative import project_nonnegative

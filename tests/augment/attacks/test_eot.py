@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import EOTSettings
-from augment.attacks import eot
-from augment.attacks.eot import ExpectationOverTransformations, as_jpeg
+from augment.attacks import objective
+from augment.attacks.objective import as_jpeg, average_transformed
 from augment.network import Network, Quantization
 from augment.random_streams import generator
 
@@ -40,9 +40,9 @@ def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list
     """
     nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
     chosen = EOTSettings(**nothing | settings)
-    expectation = ExpectationOverTransformations(chosen, generator(seed))
     means = Means()
-    return expectation(means, images, means(images)), means.seen
+    mean = average_transformed(means, images, means(images), chosen, generator(seed))
+    return mean, means.seen
 
 
 def test_a_model_is_given_bytes_and_its_derivative_ignores_the_rounding():
@@ -80,7 +80,7 @@ def test_all_images_but_the_first_are_changed_and_stay_images():
 @pytest.fixture
 def without_jpeg(monkeypatch) -> None:
     """Leave the images uncompressed, so that each other change can be measured."""
-    monkeypatch.setattr(eot, "as_jpeg", lambda images, quality: images)
+    monkeypatch.setattr(objective, "as_jpeg", lambda images, quality: images)
 
 
 def test_exposures_change_by_up_to_the_number_of_stops(without_jpeg):

@@ -9,12 +9,16 @@ from scipy.stats import norm
 from torch import Tensor
 
 import augment
-from augment.attacks.eot import NOISE_DRAWS, add_sensor_noise
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import (
+    NO_CLASS,
+    NOISE_DRAWS,
+    Criterion,
+    Objective,
+    add_sensor_noise,
+)
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import TrainingAttackSettings
-from augment.losses import NO_CLASS
 from augment.service import Renders
 
 SIZE = 8

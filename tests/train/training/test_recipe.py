@@ -10,13 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
 from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.augmentations import PGD, Baseline
-from train.training.losses import TrainingLoss
+from train.training.losses import TrainingLoss, ranking_loss
 from train.training.recipe import (
     SCHEDULE_FACTORS,
     build_optimizer,
