@@ -40,7 +40,7 @@ from augment.scene.vary import vary
 from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
-from renderer.light.presets import perturb
+from renderer.light.files import perturb
 
 # Largest number of successfully attacked renders that are kept for figures each time that the
 # renders of a training run are made.

@@ -37,7 +37,7 @@ from augment import AugmentationService, AugmentationSettings, StepSettings
 from augment.augmentation_settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 from train.checkpoints import load_run
 from train.device import GraphedNetwork, MixedPrecision, choose_precision, set_deterministic
 

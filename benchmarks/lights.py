@@ -43,9 +43,8 @@ from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, t
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
-from renderer.light.lamps import Lamps
-from renderer.light.presets import load_light
-from renderer.light.projector import Projector
+from renderer.light.files import load_light
+from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.operators import rays
@@ -54,7 +53,7 @@ from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.solids import solid
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 CAMERA = OrthographicCamera(math.degrees(0.9), math.degrees(0.6), 2.2)
 # Number of views over which the time of building an operator is averaged.

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks import reference
 from renderer.camera import Camera
 from renderer.mesh import Mesh
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ from benchmarks.whole_steps import measure_many_views, measure_whole_steps
 from renderer.light.basis import DEGREE
 from renderer.mesh import Mesh
 from renderer.settings import RASTERIZERS
-from renderer.visibility.rasterizer import Rasterizer, choose
+from renderer.visibility import Rasterizer, choose
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 # Degrees of the spherical harmonics that are compared.

@@ -21,16 +21,16 @@ from benchmarks.common import Row, relative_error
 from renderer.camera import OrthographicCamera
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import DEGREE, Harmonics
+from renderer.light.files import probe
 from renderer.light.harmonics import basis
-from renderer.light.presets import probe
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
+from renderer.visibility import Rasterizer
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import Rasterizer
 
 # Samples per side of a pixel in training with the paper's settings.
 SAMPLES = 8

@@ -23,7 +23,7 @@ from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.operators.stack import TransferOperators
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 # Number of views that one call renders, and their pixels per side.
 MANY_VIEWS_COUNT = 100

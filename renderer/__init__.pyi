@@ -10,10 +10,10 @@ from renderer.io.export import export_mesh as export_mesh
 from renderer.io.meshes import load_mesh as load_mesh
 from renderer.light import harmonics as harmonics
 from renderer.light import skylight as skylight
+from renderer.light.files import load_light as load_light
 from renderer.light.files import save_light as save_light
 from renderer.light.lamps import Lamps as Lamps
-from renderer.light.presets import load_light as load_light
-from renderer.light.projector import Projector as Projector
+from renderer.light.lamps import Projector as Projector
 from renderer.mesh import Mesh as Mesh
 from renderer.mesh import normalize as normalize
 from renderer.mesh import subdivide as subdivide

@@ -43,8 +43,8 @@ from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
 from renderer.surface.albedo import NO_TEXTURE, face_albedo, surface_albedo
 from renderer.surface.gloss import Gloss
+from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import choose
 
 # Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair with its
 # coefficients.

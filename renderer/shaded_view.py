@@ -20,8 +20,7 @@ from renderer.camera import Camera
 from renderer.image import decode
 from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
-from renderer.operators.lamp_paths import LocalLightView
-from renderer.operators.rays import Rays
+from renderer.operators.rays import LocalLightView, Rays
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss
 from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance

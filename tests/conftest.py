@@ -122,7 +122,7 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 @pytest.fixture
 def rasterized(monkeypatch) -> list[int]:
     """Return a list that grows by the number of views with each rasterization."""
-    from renderer.visibility.rasterizer import Rasterizer
+    from renderer.visibility import Rasterizer
 
     view_counts = []
     rasterize = Rasterizer.rasterize

@@ -40,7 +40,7 @@ import augment
 import renderer
 from augment.attack_settings import EOTSettings
 from augment.scene.objects import Conditions
-from renderer.light.presets import directional
+from renderer.light.files import directional
 from renderer.light.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")

@@ -24,8 +24,7 @@ from augment.progress import Phases
 from augment.scene.objects import Conditions
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
-from renderer.light.lamps import Lamps
-from renderer.light.projector import Projector
+from renderer.light.lamps import Lamps, Projector
 from tests.helpers import bright_or_dark
 from train import load_run
 from train.results.scoring import Predictor, evaluate_photographs, score

@@ -14,7 +14,7 @@ from augment.network import Network
 from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
-from renderer.visibility.rasterizer import Rasterizer, choose
+from renderer.visibility import Rasterizer, choose
 from train import console
 from train.user_errors import keyed
 

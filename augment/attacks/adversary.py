@@ -33,16 +33,15 @@ from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
-from renderer.light.files import read_light, save_light
+from renderer.light.files import load_light, read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
-from renderer.light.presets import load_light
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.short_repr import ShortRepr
 from renderer.surface.albedo import with_added_albedo
 from renderer.surface.gloss import Gloss
-from renderer.visibility.rasterizer import Rasterizer, choose
+from renderer.visibility import Rasterizer, choose
 
 # Names of files in the folder of an adversary, and of the images before and after the attack.
 DESCRIPTION = "adversary.json"

@@ -21,7 +21,7 @@ from renderer.io.files import atomic_write
 from renderer.io.images import Tile, draw_grid, tiles_of, write_image
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 # `save` also classifies the attacked images after JPEG compression with this quality.
 JPEG_QUALITY = 90

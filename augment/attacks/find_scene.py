@@ -18,7 +18,7 @@ from augment.progress import progress
 from augment.scene.scene import Scene
 from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
-from renderer.light.presets import PROBES, UNIFORM, load_light
+from renderer.light.files import PROBES, UNIFORM, load_light
 
 # `_with_random_camera` draws the polar angle of a camera from the range `POLAR`, in degrees, and
 # the width of the visible region from the range `WIDTH`, in world units.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from augment.attack_settings import StepSettings
 from renderer.errors import InputError
-from renderer.light.ball import Ball, nearest_in_box
+from renderer.vectors import Ball, nearest_in_box
 
 # If a parameter has no radius, a search without gradients begins with random changes that are as
 # long as this many steps.

@@ -40,14 +40,14 @@ from renderer.errors import (
 )
 from renderer.io.images import gray_or_image
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
+from renderer.light.files import load_light
 from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
-from renderer.light.presets import load_light
 from renderer.light.ringing import highlight_error, required_degree
 from renderer.mesh import Mesh, require_mesh, select_faces, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.gloss import Gloss, smallest_roughness
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings

@@ -8,7 +8,7 @@ each further light costs a matrix product.
 Each view of moved vertices is rasterized again. The shadows and bounces of environment light take
 long to compute. `FrozenTransport` keeps them for one shape, and they are used again while the
 vertices are within `NEAR` of this shape. The shadows of projector and lamps are always those of
-the moved shape itself (`renderer.operators.lamp_paths`).
+the moved shape itself (`renderer.operators.rays`).
 """
 
 from __future__ import annotations
@@ -34,16 +34,15 @@ from renderer.image import background_term
 from renderer.light.basis import Basis, split_light
 from renderer.mesh import Mesh
 from renderer.operators.apply import TransferOperator
-from renderer.operators.lamp_paths import LocalLightView
-from renderer.operators.rays import Rays, Surface
+from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import PIXELS_PER_STACK, OperatorStack, Rows
 from renderer.settings import ImageSettings
 from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.surface.albedo import paint_faces, surface_albedo
 from renderer.surface.gloss import Gloss
+from renderer.visibility import Rasterizer
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import Rasterizer
 
 
 class Layer(NamedTuple):

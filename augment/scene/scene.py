@@ -33,7 +33,7 @@ from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.operators.stack import OperatorStack, ScatterLayers
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 # Largest total number of pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
@@ -119,8 +119,7 @@ class Scene:
         require_kind("camera_effects", camera_effects, Callable | None, effects)
         if not hasattr(rasterizer, "rasterize"):
             raise InputError(
-                f"rasterizer is {describe(rasterizer)}: "
-                "give renderer.visibility.rasterizer.choose(name)",
+                f"rasterizer is {describe(rasterizer)}: give renderer.visibility.choose(name)",
             )
         self.objects = as_list("objects", objects, SceneObject, "a list of scene objects")
         examples = as_list("examples", examples, Example, "a list of examples")

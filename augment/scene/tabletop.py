@@ -27,8 +27,7 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.harmonics import bands, cache_tensors, degree_of
 from renderer.mesh import Mesh
-from renderer.operators.lamp_paths import unoccluded
-from renderer.operators.rays import NO_FACE, Rays, sphere
+from renderer.operators.rays import NO_FACE, Rays, sphere, unoccluded
 from renderer.settings import ImageSettings
 
 # Number of directions of the sky that are traced from each point of the table or the wall, to find

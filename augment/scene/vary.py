@@ -33,8 +33,8 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
 from renderer.light.basis import harmonics_of, split_light
+from renderer.light.files import directional, load_light
 from renderer.light.harmonics import degree_of
-from renderer.light.presets import directional, load_light
 from renderer.operators.rays import Rays
 from renderer.surface.gloss import Gloss
 from renderer.vectors import rotation_matrices

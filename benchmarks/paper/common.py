@@ -26,7 +26,7 @@ from augment.scene.objects import Example, SceneObject, load_object
 from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 from train.checkpoints import load_network
 
 # Meshes whose shape is attacked are subdivided until they have more vertices

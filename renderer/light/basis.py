@@ -25,7 +25,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_whole
-from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.harmonics import (
     basis,
     degree_of,
@@ -34,7 +33,7 @@ from renderer.light.harmonics import (
     nonzero_coefficients,
 )
 from renderer.settings import MAX_DEGREE
-from renderer.vectors import unit
+from renderer.vectors import Ball, nearest_in_box, unit
 
 
 class EnvironmentPart(NamedTuple):

@@ -58,10 +58,9 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from torch import Tensor
 
-from renderer.light.ball import Ball
 from renderer.light.harmonics import bands, cache_tensors, gradient_matrices, monomial_coefficients
 from renderer.light.ringing import irradiance_weights, nonnegative_window, shortest
-from renderer.vectors import tangent_axes
+from renderer.vectors import Ball, tangent_axes
 
 Array = NDArray[Any]
 

@@ -7,7 +7,7 @@ sky.
 
 Radiance is linear Rec. 709 RGB in kcd/m²: (1, 1, 1) is white of 1000 cd/m². The
 mean luminance of a clear day's sky over the sphere is about 5. That of the
-probes in `presets` is about 0.1.
+probes of `load_light` is about 0.1.
 
 The SH coefficients of a sky with the sun at azimuth 0 are polynomials in the
 zenith angle and in 1 / turbidity, which were fitted once by

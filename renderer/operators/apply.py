@@ -15,8 +15,8 @@ axes of a batch of lights.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -29,13 +29,35 @@ from torch.nn.functional import linear
 from renderer.errors import MAX_MAGNITUDE, InputError, as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
-from renderer.operators.sparse import SparseTransfer
 from renderer.settings import ImageSettings
 
-# Fields of `TransferOperator` with tensors that `TransferOperator.to` moves to a device.
-TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")
 # Number of color channels.
 COLORS = 3
+
+
+class SparseTransfer(NamedTuple):
+    """The N nonzero entries of a matrix from light coefficients to pixel radiance.
+
+    Attributes:
+        function: Index of the basis function (lamp, or pixel of a projector) whose
+            light each entry describes, int64, shape (N,).
+        pixel: Index of the covered pixel of each entry, int64, shape (N,).
+        weight: Radiance of the pixel per unit of the function's coefficient, in
+            C = 1 or 3 color channels, shape (N, C).
+    """
+
+    function: Int[Tensor, " N"]
+    pixel: Int[Tensor, " N"]
+    weight: Float[Tensor, "N C"]
+
+    def to(self, device: torch.device | str) -> SparseTransfer:
+        """Return a copy of the entries on another device."""
+        return SparseTransfer(*(field.to(device) for field in self))
+
+
+def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer:
+    """Concatenate the nonzero entries of several transfer matrices, in their order."""
+    return SparseTransfer(*map(torch.cat, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -245,21 +267,14 @@ class TransferOperator:
         clamped_values = unclamped.clamp(0, 1)
         # 1 for values in [0, 1], including the limits. Only these have a gradient.
         is_unclamped = unclamped.eq_(clamped_values)
-        encoded = (
-            clamped_values if self._is_linear else encode(clamped_values, self.settings.encoding)
-        )
-        canvas = background.images
-        pixel_index = self._pixels_by_color
-        image_shape: tuple[int, ...] = self._image_shape
-        if lights.ndim > 2:
-            batch_shape = lights.shape[:-2]
-            canvas = canvas.expand(*batch_shape, -1, -1)
-            pixel_index = pixel_index.expand(*batch_shape, -1, -1)
-            image_shape = (*batch_shape, *image_shape)
+        encoded = encode(clamped_values, self.settings.encoding)
+        batch_shape = lights.shape[:-2]
+        canvas = background.images.expand(*batch_shape, -1, -1)
         images = canvas.clone(memory_format=torch.contiguous_format)
         # `scatter_` takes half the time of `index_copy_` on a CPU.
-        images.scatter_(-1, pixel_index, encoded)
-        return images.view(image_shape), is_unclamped, clamped_values
+        images.scatter_(-1, self._pixels_by_color.expand(*batch_shape, -1, -1), encoded)
+        size = self.settings.size
+        return images.view(*batch_shape, COLORS, size, size), is_unclamped, clamped_values
 
     def _gradient_of_images(
         self,
@@ -271,14 +286,10 @@ class TransferOperator:
 
         The last two arguments are the last two results of `_images`.
         """
-        flat_gradient = image_gradient.flatten(-2)
-        pixel_index = self._pixels_by_color
-        if is_unclamped.ndim > 2:
-            pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
+        pixel_index = self._pixels_by_color.expand(*is_unclamped.shape[:-2], -1, -1)
         # `gather` is faster than `index_select`, most of all for three axes.
-        pixel_gradient = flat_gradient.gather(-1, pixel_index)
-        if not self._is_linear:
-            pixel_gradient = encode_gradient(clamped_values, pixel_gradient, self.settings.encoding)
+        pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
+        pixel_gradient = encode_gradient(clamped_values, pixel_gradient, self.settings.encoding)
         gradient = self._light_gradient(pixel_gradient.mul_(is_unclamped))
         # Checking the few numbers of the result is fast. If one is not finite,
         # `require_bounded` checks the gradient of all pixels and raises the error.
@@ -298,7 +309,7 @@ class TransferOperator:
         """
         if not lights.is_floating_point():
             require_bounded(lights=lights)
-        if lights.shape[-2:] != self._light_shape:
+        if lights.shape[-2:] != (self.basis.size, COLORS):
             raise InputError(
                 f"lights has shape {tuple(lights.shape)}, but {self.basis} needs the shape "
                 f"(..., {self.basis.size}, 3): give lights of this basis"
@@ -311,16 +322,13 @@ class TransferOperator:
 
     def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 P"]:
         """Compute `radiance` without autograd or checks."""
-        dtype = self.transfer.dtype
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
-        used_lights = lights.index_select(-2, self.nonzero)
-        # A call of `to` that converts nothing takes notable time for small images.
-        if lights.dtype != dtype:
-            used_lights = used_lights.to(dtype)
-        if self._shared is not None:
-            radiance = (used_lights.mT @ self._shared).mul_(self.albedo)
-            if self._white is not None:
-                radiance.add_(used_lights.mT @ self._white)
+        used_lights = lights.index_select(-2, self.nonzero).to(self.transfer.dtype)
+        shared, *white = self._channels
+        if len(white) < 2:
+            radiance = (used_lights.mT @ shared).mul_(self.albedo)
+            if white:
+                radiance.add_(used_lights.mT @ white[0])
         else:
             radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
         if self.sparse is not None:
@@ -329,22 +337,20 @@ class TransferOperator:
             # each entry, one column for each color.
             contributions = light_of_entry * self.sparse.weight
             radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
-        return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
+        return radiance.to(lights.dtype)
 
     def _light_gradient(
         self, radiance_gradient: Float[Tensor, "... 3 P"]
     ) -> Float[Tensor, "... coefficients 3"]:
         """Compute `light_gradient` without checks."""
-        upstream = radiance_gradient
-        dtype = self.transfer.dtype
-        if upstream.dtype != dtype:
-            upstream = upstream.to(dtype)
+        upstream = radiance_gradient.to(self.transfer.dtype)
         # Compute the gradient with respect to the K used coefficients, shape (..., 3, K). The
         # function `linear(a, b)` of torch is a bᵀ.
-        if self._shared is not None:
-            used_gradient = linear(upstream * self.albedo, self._shared)
-            if self._white is not None:
-                used_gradient = used_gradient + linear(upstream, self._white)
+        shared, *white = self._channels
+        if len(white) < 2:
+            used_gradient = linear(upstream * self.albedo, shared)
+            if white:
+                used_gradient = used_gradient + linear(upstream, white[0])
         else:
             used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._placement @ used_gradient.mT
@@ -354,9 +360,7 @@ class TransferOperator:
             # light. One row for each entry: the gradient that it adds to its coefficient.
             contributions = gradient_of_entry * self.sparse.weight
             gradient = gradient.index_add(-2, self.sparse.function, contributions)
-        return (
-            gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
-        )
+        return gradient.to(radiance_gradient.dtype)
 
     def _prepare_background(
         self, background: float | Tensor, lights: Float[Tensor, "... coefficients 3"]
@@ -367,26 +371,14 @@ class TransferOperator:
         result for a gray value and a single light is cached for the next call,
         because optimizations call `image` many times with the same background.
         """
-        is_gray = isinstance(background, float | int)
-        if not is_gray or lights.ndim > 2:
-            images = as_background(background, self.settings.size, lights)
-            return self._prepare_background_images(images, lights)
         key = (background, lights.dtype, lights.device)
-        # Other threads may replace the cached pair meanwhile.
-        cached = self._background_cache.get("last")
-        if cached is None or cached[0] != key:
-            images = as_background(background, self.settings.size, lights)
-            prepared = self._prepare_background_images(images, lights)
-            cached = key, prepared
-            self._background_cache["last"] = cached
-        return cached[1]
-
-    def _prepare_background_images(
-        self, images: Float[Tensor, "... 3 size size"], lights: Float[Tensor, "... coefficients 3"]
-    ) -> _PreparedBackground:
-        """Flatten background images, and compute what they add to the covered pixels."""
-        flat_images = images.flatten(-2)
-        at_pixels = flat_images.index_select(-1, self.pixels)
+        is_kept = isinstance(background, float | int) and lights.ndim <= 2
+        # Other threads may replace the pair meanwhile.
+        last_key, last = self._last_background.get("pair", (None, None))
+        if is_kept and last is not None and last_key == key:
+            return last
+        images = as_background(background, self.settings.size, lights).flatten(-2)
+        at_pixels = images.index_select(-1, self.pixels)
         if self.settings.encoding != "linear":
             # Repeat the background for each light before it is decoded, as `composite` does.
             # The decoding computes powers, whose last bit depends on the position of a
@@ -394,7 +386,10 @@ class TransferOperator:
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
         coverage = self.coverage.to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
-        return _PreparedBackground(images=flat_images, term=term)
+        prepared = _PreparedBackground(images=images, term=term)
+        if is_kept:
+            self._last_background["pair"] = key, prepared
+        return prepared
 
     def to(self, device: torch.device | str) -> TransferOperator:
         """Return a copy of the operator on another device.
@@ -408,16 +403,19 @@ class TransferOperator:
         device = as_device(device)
         if device == self.transfer.device:
             return self
-        sparse = self.sparse and self.sparse.to(device)
-        tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        return replace(self, **tensors, sparse=sparse)
+        moved: dict[str, Any] = {
+            field.name: getattr(self, field.name).to(device)
+            for field in fields(self)
+            if isinstance(getattr(self, field.name), Tensor | SparseTransfer)
+        }
+        return replace(self, **moved)
 
     @property
     def by_channel(self) -> Tensor:
         """Transfer matrix in three color channels, which include the albedo, shape (3, K, P)."""
-        if self._shared is None:
-            return self.transfer
         shared, *white = self.transfer
+        if len(white) == 2:
+            return self.transfer
         colored = shared * self.albedo[:, None]
         return colored + white[0] if white else colored
 
@@ -425,34 +423,18 @@ class TransferOperator:
     # images of 32² pixels.
 
     @cached_property
-    def _shared(self) -> Tensor | None:
-        """Channel of `transfer` that all colors share, shape (K, P), or None."""
-        return self.transfer[0] if len(self.transfer) < COLORS else None
+    def _channels(self) -> list[Tensor]:
+        """Channels of `transfer`, shape (K, P) each.
+
+        One is shared by all colors. A second one of specular reflection is added to all. Three
+        are those of the colors.
+        """
+        return list(self.transfer)
 
     @cached_property
-    def _white(self) -> Tensor | None:
-        """Channel of specular reflection that is added to all colors, shape (K, P), or None."""
-        return self.transfer[1] if len(self.transfer) == 2 else None
-
-    @cached_property
-    def _background_cache(self) -> dict[str, tuple[Any, _PreparedBackground]]:
-        """Cache for the background of the last call ("last"): its arguments and the result."""
+    def _last_background(self) -> dict[str, tuple[Any, _PreparedBackground]]:
+        """Key of the last gray background, and what was prepared for it ("pair")."""
         return {}
-
-    @cached_property
-    def _is_linear(self) -> bool:
-        """Whether images have linear values, which are not encoded as sRGB."""
-        return self.settings.encoding == "linear"
-
-    @cached_property
-    def _image_shape(self) -> tuple[int, int, int]:
-        """Shape of one image, (3, size, size)."""
-        return COLORS, self.settings.size, self.settings.size
-
-    @cached_property
-    def _light_shape(self) -> tuple[int, int]:
-        """Shape of one light, (coefficients, 3)."""
-        return self.basis.size, COLORS
 
     @cached_property
     def _pixels_by_color(self) -> Tensor:
@@ -522,61 +504,19 @@ class _Image(torch.autograd.Function):
         return images
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, upstream: Float[Tensor, "... 3 size size"]) -> tuple[Tensor, None, None]:
         """Compute the gradient with respect to the lights."""
-        # `_backward_once` raises an error if a second derivative is computed. Its decorator
-        # takes notable time, so it only runs if the caller set create_graph=True.
-        if torch.is_grad_enabled():
-            return _Image._backward_once(ctx, upstream)
-        return _Image._backward(ctx, upstream)
-
-    @staticmethod
-    def _backward(
-        ctx: Any, upstream: Float[Tensor, "... 3 size size"]
-    ) -> tuple[Tensor, None, None]:
-        """Compute the gradient with respect to the lights, without a check for second derivatives.
-
-        A second derivative through this function would be wrong, without an error.
-        """
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped_values)
         return gradient, None, None
-
-    # The same function, but a second derivative through it raises an error.
-    _backward_once = staticmethod(once_differentiable(_backward))
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
     """Check that the result of a user's function `loss_gradient` has the shape of the images."""
-    is_tensor = isinstance(image_gradient, Tensor)
-    if not is_tensor or image_gradient.shape != images.shape:
-        given = f"the shape {tuple(image_gradient.shape)}"
-        if not is_tensor:
-            given = f"the type {type(image_gradient).__name__}"
-        raise InputError(
-            f"loss_gradient returned a value of {given}: "
-            f"return a tensor in the shape of the images, {tuple(images.shape)}"
-        )
-
-
-def apply_transfer(
-    lights: Float[Tensor, "... B K 3"],
-    transfer: Float[Tensor, "... C K P"],
-    albedo: Float[Tensor, "... 3 P"],
-) -> Float[Tensor, "... B 3 P"]:
-    """Compute the radiance of P pixels under B lights, with one or more transfer matrices.
-
-    The lights are the left factor of the matrix product, which is several times
-    faster on a CPU. With three channels, each color has its own, and `albedo` is not used.
-    A single channel is shared by all colors, and multiplied by `albedo`. A second channel
-    is specular reflection, which is added.
-    """
-    if transfer.shape[-3] == COLORS:
-        # Multiply a matrix (B, K) and a matrix (K, P) for each color.
-        return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
-    shared, *white = transfer.unbind(-3)
-    # One row for each pair of a light and a color, so that one matrix product computes all.
-    light_rows = lights.mT.flatten(-3, -2)
-    radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
-    if white:
-        radiance = radiance + (light_rows @ white[0]).unflatten(-2, (-1, COLORS))
-    return radiance
+    if isinstance(image_gradient, Tensor) and image_gradient.shape == images.shape:
+        return
+    given = getattr(image_gradient, "shape", type(image_gradient).__name__)
+    raise InputError(
+        f"loss_gradient returned {given}: return a tensor in the shape of the images, "
+        f"{tuple(images.shape)}"
+    )

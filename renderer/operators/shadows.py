@@ -345,7 +345,7 @@ def build_transport(
     """Prepare the computation of shadows and bounces of environment light.
 
     The shadows of lamps and projectors are not included. They are computed in
-    `renderer.operators.lamp_paths`. The result is None without shadows and bounces, or
+    `renderer.operators.rays`. The result is None without shadows and bounces, or
     without environment light. Bounces with local lights raise `InputError`.
     """
     if basis.local_lights and settings.bounces:

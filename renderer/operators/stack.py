@@ -14,8 +14,13 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor
 from renderer.image import as_background, background_term, clamp, encode
-from renderer.operators.apply import TransferOperator, apply_transfer, require_image_gradient
-from renderer.operators.sparse import SparseTransfer, concatenate_entries
+from renderer.operators.apply import (
+    COLORS,
+    SparseTransfer,
+    TransferOperator,
+    concatenate_entries,
+    require_image_gradient,
+)
 
 # Operators of small images are copied into common tensors (a stack) until their images have
 # this many pixels in total. Larger stacks are not faster.
@@ -25,8 +30,6 @@ PIXELS_PER_STACK = 2**16
 FEWEST_STACKED = 8
 # Type of an index that selects some images of a batch.
 Rows = slice | Tensor
-# Number of color channels.
-COLORS = 3
 
 
 class TransferOperators(Sequence[TransferOperator]):
@@ -145,16 +148,26 @@ class TransferOperators(Sequence[TransferOperator]):
             )
         # One entry along the first axis for each view.
         view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
-        size = first.settings.size
-        image_shape = (*view_lights.shape[:-2], COLORS, size, size)
-        background_images = as_background(background, size, lights)
-        if background_images.ndim > 3:
-            background_images = _broadcast_background(background_images, image_shape)
+        image_shape = (*view_lights.shape[:-2], COLORS, first.settings.size, first.settings.size)
+        backgrounds = as_background(background, first.settings.size, lights)
+        if backgrounds.ndim > 3:
+            try:
+                backgrounds = backgrounds.expand(image_shape)
+            except RuntimeError as error:
+                given = tuple(backgrounds.shape)
+                raise InputError(
+                    f"background has the shape {given}, which does not broadcast to the shape "
+                    f"{image_shape} of the rendered images: give one background image, or one per "
+                    "view and light"
+                ) from error
         operators_in_stack = min(len(self), self._operators_per_stack)
-        # Only `_image_by_image` gives a gradient with respect to the background.
-        if operators_in_stack < FEWEST_STACKED or background_images.requires_grad:
-            return self._image_by_image(view_lights, background_images)
-        return self._stacked_images(view_lights, background_images, image_shape)
+        if operators_in_stack >= FEWEST_STACKED and not backgrounds.requires_grad:
+            return self._stacked_images(view_lights, backgrounds.flatten(-2))
+        # Only single operators give a gradient with respect to the background.
+        if backgrounds.ndim == 3:
+            backgrounds = backgrounds.expand(len(self), -1, -1, -1)
+        views = zip(self, view_lights, backgrounds, strict=True)
+        return torch.stack([operator.image(light, behind) for operator, light, behind in views])
 
     def image_and_gradient(
         self,
@@ -220,71 +233,50 @@ class TransferOperators(Sequence[TransferOperator]):
                 stacks.append(OperatorStack(operators, operator_of_image, device))
         return stacks
 
-    def _image_by_image(
-        self, lights: Float[Tensor, "V ... coefficients 3"], background: Tensor
-    ) -> Float[Tensor, "V ... 3 size size"]:
-        """Render all V views in a loop over the operators.
-
-        A background has the shape (3, size, size), or that of the result.
-        """
-        size = self._operators[0].settings.size
-        if background.ndim == 3:
-            background = background.expand(len(self), COLORS, size, size)
-        images_by_view = []
-        for operator, view_lights, view_background in zip(self, lights, background, strict=True):
-            images_by_view.append(operator.image(view_lights, view_background))
-        return torch.stack(images_by_view)
-
     def _stacked_images(
         self,
         view_lights: Float[Tensor, "V ... coefficients 3"],
-        background: Tensor,
-        image_shape: Sequence[int],
+        backgrounds: Float[Tensor, "*lights 3 pixels"],
     ) -> Float[Tensor, "V ... 3 size size"]:
         """Render all V views, with one batched matrix product for each stack of operators."""
-        encoding = self._operators[0].settings.encoding
+        settings = self._operators[0].settings
         # One light for each image. All images of the first view come first.
         lights = view_lights.flatten(0, -3).to(self._operators[0].transfer.dtype)
         lights_per_view = len(lights) // len(self)
-        # One background for each image, or a single one. The last axis has all pixels.
-        backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
-        first_image = 0
+        # One background for each image, or a single one.
+        backgrounds = backgrounds.reshape(-1, *backgrounds.shape[-2:])
         targets = []
         covered_values = []
+        first_image = 0
         for stack in self._stacks:
-            operator_count = len(stack.shown)
             # Index of the operator that each image shows: 0, 0, ..., 1, 1, ...
-            operator_of_image = torch.arange(operator_count).repeat_interleave(lights_per_view)
+            operator_of_image = stack.shown.repeat_interleave(lights_per_view)
             rows = slice(first_image, first_image + len(operator_of_image))
             first_image = rows.stop
-            stack_backgrounds = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
-            # Merge the axes of images and colors, because torch selects from two axes ten
-            # times as fast as from three.
-            at_pixels = stack_backgrounds.flatten(0, 1).index_select(1, stack.pixels)
-            at_pixels = at_pixels.unflatten(0, (-1, COLORS))
-            coverage = stack.coverage[operator_of_image.to(background.device)].to(background)
+            behind_images = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
+            at_pixels = _select_pixels(behind_images, stack.pixels)
+            coverage = stack.coverage[operator_of_image.to(backgrounds.device)].to(backgrounds)
             # Linear background, times the fraction of each pixel that shows no mesh.
-            behind = background_term(coverage, at_pixels, encoding)
-            radiance = stack.radiance(lights[rows], operator_of_image).to(background.dtype)
+            behind = background_term(coverage, at_pixels, settings.encoding)
+            radiance = stack.radiance(lights[rows], operator_of_image).to(backgrounds.dtype)
             targets.append((rows, stack.pixels))
-            covered_values.append(encode(clamp(radiance + behind), encoding))
+            covered_values.append(encode(clamp(radiance + behind), settings.encoding))
+        # All other pixels keep the background.
         canvas = backgrounds.expand(len(lights), -1, -1)
         canvas = canvas.clone(memory_format=torch.contiguous_format)
-        # All other pixels keep the background.
-        return ScatterLayers.apply(canvas, targets, *covered_values).view(image_shape)
+        images = ScatterLayers.apply(canvas, targets, *covered_values)
+        return images.view(*view_lights.shape[:-2], COLORS, settings.size, settings.size)
 
 
-def _broadcast_background(images: Float[Tensor, "... 3 size size"], shape: Sequence[int]) -> Tensor:
-    """Broadcast background images to the shape of the rendered images."""
-    try:
-        return images.expand(shape)
-    except RuntimeError as error:
-        given = tuple(images.shape)
-        raise InputError(
-            f"background has the shape {given}, which does not broadcast to the shape "
-            f"{tuple(shape)} of the rendered images: give one background image, or one per view "
-            "and light"
-        ) from error
+def _select_pixels(
+    images: Float[Tensor, "N 3 pixels"], pixels: Int[Tensor, " P"]
+) -> Float[Tensor, "N 3 P"]:
+    """Select the same pixels from all images.
+
+    The axes of images and colors are merged, because torch selects from two axes ten times as
+    fast as from three.
+    """
+    return images.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, COLORS))
 
 
 class ScatterLayers(torch.autograd.Function):
@@ -319,12 +311,7 @@ class ScatterLayers(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Float[Tensor, "N 3 pixels"]) -> tuple[Tensor | None, ...]:
         """Compute the gradients with respect to the new values of the overwritten pixels."""
-        gradients = []
-        for rows, pixels in ctx.targets:
-            # Merge the axes of images and colors, because torch selects from two axes ten
-            # times as fast as from three.
-            layer_gradient = upstream[rows].flatten(0, 1).index_select(1, pixels)
-            gradients.append(layer_gradient.unflatten(0, (-1, COLORS)))
+        gradients = (_select_pixels(upstream[rows], pixels) for rows, pixels in ctx.targets)
         return None, None, *gradients
 
 
@@ -369,8 +356,9 @@ class OperatorStack:
         transfer = like.new_zeros(shape)
         albedo = like.new_ones(len(operators), COLORS, len(pixels))
         coverage = like.new_zeros(len(operators), 1, len(pixels))
-        sparse_parts: list[SparseTransfer] = []
-        entry_counts = []
+        # Nonzero entries of the further rows of each operator.
+        self._sparse: list[SparseTransfer] = []
+        no_entries = SparseTransfer(pixels[:0], pixels[:0], like.new_empty(0, COLORS))
         for index, operator in enumerate(operators):
             # Rows and columns of the common tensors for the coefficients and the pixels of
             # this operator.
@@ -384,15 +372,8 @@ class OperatorStack:
                 # Three color channels, which include the albedo. The factors `albedo` stay 1.
                 transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
-            if operator.sparse is not None:
-                stack_pixel = columns[operator.sparse.pixel]
-                sparse_parts.append(operator.sparse._replace(pixel=stack_pixel))
-            entry_counts.append(0 if operator.sparse is None else len(operator.sparse.function))
-        sparse = concatenate_entries(sparse_parts)
-        self._sparse = sparse and sparse.to(device)
-        # Operator i has the sparse entries from `_first_entry[i]` to
-        # `_first_entry[i + 1]` - 1.
-        self._first_entry = F.pad(torch.tensor(entry_counts).cumsum(0), (1, 0))
+            entries = operator.sparse or no_entries
+            self._sparse.append(entries._replace(pixel=columns[entries.pixel]).to(device))
         self.shown = shown
         self.pixels = pixels.to(device)
         self.transfer = transfer.to(device)
@@ -412,67 +393,73 @@ class OperatorStack:
         the CPU.
         """
         operator_of_image = self.shown[images]
-        operators, image_to_row, images_per_row = torch.unique(
-            operator_of_image, return_inverse=True, return_counts=True
-        )
-        slot_count = max(images_per_row.tolist(), default=0)
-        slot_of_image = _rank_in_row(image_to_row, images_per_row)
+        operators, row = operator_of_image.unique(return_inverse=True)
+        # True where a row (image) shows a column (operator).
+        is_shown = operator_of_image[:, None] == operators
+        # Among the images that show the same operator, the slot is the number of earlier ones.
+        slot = (is_shown.cumsum(0) * is_shown).sum(1) - 1
+        slot_count = max(slot.tolist(), default=-1) + 1
         # Cell of each image in the table. The cells are numbered row by row.
-        cell = image_to_row * slot_count + slot_of_image
-        has_gaps = len(cell) != len(operators) * slot_count
-        is_ordered = not has_gaps and bool((cell.diff() == 1).all())
+        cell = row * slot_count + slot
+        cell_count = len(operators) * slot_count
+        is_ordered = torch.equal(cell, torch.arange(cell_count))
         operators = operators.to(lights.device, non_blocking=True)
         cell = cell.to(lights.device, non_blocking=True)
         # Axes: image, coefficient that changes a pixel, color.
         used_lights = lights.index_select(1, self._coefficients)
-        light_table = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
-        light_table = light_table.index_copy(0, cell, used_lights)
+        light_table = used_lights.new_zeros(cell_count, *used_lights.shape[1:])
         # Axes: operator, slot for one of its images, coefficient, color.
+        light_table = light_table.index_copy(0, cell, used_lights)
         light_table = light_table.unflatten(0, (len(operators), slot_count))
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]
         albedo = self.albedo if shows_all_operators else self.albedo[operators]
         # Axes: cell of the table, color, pixel.
-        radiance = apply_transfer(light_table, transfer, albedo).flatten(0, 1)
+        radiance = _apply_transfer(light_table, transfer, albedo).flatten(0, 1)
         if not is_ordered:
             radiance = radiance.index_select(0, cell)
-        if self._sparse is None:
-            return radiance
-        entries, image_of_entry = self._select_entries(self._sparse, operator_of_image)
-        return radiance + entries.radiance(lights, image_of_entry, len(self.pixels))
+        if any(len(entries.pixel) for entries in self._sparse):
+            radiance = radiance + self._sparse_radiance(lights, operator_of_image)
+        return radiance
 
-    def _select_entries(
-        self, sparse: SparseTransfer, operator_of_image: Int[Tensor, " A"]
-    ) -> tuple[SparseTransfer, Tensor]:
-        """Select the nonzero matrix entries of the operators that A images show.
-
-        The entries of the first image come first. The second result is the index of the
-        image of each entry, from 0 to A - 1.
-        """
-        first_in_stack = self._first_entry[operator_of_image]
-        entry_count = self._first_entry[operator_of_image + 1] - first_in_stack
-        image_of_entry = torch.arange(len(operator_of_image)).repeat_interleave(entry_count)
-        # All entries of an image follow each other, in `sparse` and in the result. The two
-        # positions of an entry therefore differ by the same number for all entries.
-        first_in_result = entry_count.cumsum(0) - entry_count
-        offset_of_image = first_in_stack - first_in_result
-        position_in_stack = torch.arange(len(image_of_entry)) + offset_of_image[image_of_entry]
-        position_in_stack = position_in_stack.to(self.pixels.device, non_blocking=True)
-        image_of_entry = image_of_entry.to(self.pixels.device, non_blocking=True)
-        selected = SparseTransfer(*(field[position_in_stack] for field in sparse))
-        return selected, image_of_entry
+    def _sparse_radiance(
+        self, lights: Float[Tensor, "A coefficients 3"], operator_of_image: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A 3 P"]:
+        """Compute the radiance of A images that the nonzero entries of further rows add."""
+        parts = [self._sparse[operator] for operator in operator_of_image.tolist()]
+        entries = concatenate_entries(parts)
+        entry_counts = torch.tensor([len(part.function) for part in parts])
+        image_of_entry = torch.arange(len(parts)).repeat_interleave(entry_counts).to(lights.device)
+        # Row of the coefficient of each entry, if the coefficients of all images are
+        # written below each other.
+        light_row = image_of_entry * lights.shape[1] + entries.function
+        contributions = lights.flatten(0, 1).index_select(0, light_row) * entries.weight
+        pixel_count = len(self.pixels)
+        # One row for each pixel of each image, one column for each color.
+        zeros = contributions.new_zeros(len(lights) * pixel_count, COLORS)
+        radiance = zeros.index_add(0, image_of_entry * pixel_count + entries.pixel, contributions)
+        return radiance.unflatten(0, (len(lights), pixel_count)).mT
 
 
-def _rank_in_row(
-    item_to_row: Int[Tensor, " A"], items_per_row: Int[Tensor, " rows"]
-) -> Int[Tensor, " A"]:
-    """For each of A items, count the earlier items in the same row of a table.
+def _apply_transfer(
+    lights: Float[Tensor, "O B K 3"],
+    transfer: Float[Tensor, "O C K P"],
+    albedo: Float[Tensor, "O 3 P"],
+) -> Float[Tensor, "O B 3 P"]:
+    """Compute the radiance of P pixels under B lights for each of O transfer matrices.
 
-    For example, items in the rows 1, 0, 1 have the ranks 0, 0, 1.
+    The lights are the left factor of the matrix product, which is several times
+    faster on a CPU. With three channels, each color has its own, and `albedo` is not used.
+    A single channel is shared by all colors, and multiplied by `albedo`. A second channel
+    is specular reflection, which is added.
     """
-    # Sort the items by row. The items of a row keep their order.
-    sorted_items = item_to_row.argsort(stable=True)
-    first_of_row = items_per_row.cumsum(0) - items_per_row
-    sorted_ranks = torch.arange(len(item_to_row)) - first_of_row[item_to_row[sorted_items]]
-    # Write the ranks back in the original order of the items.
-    return torch.empty_like(item_to_row).index_copy_(0, sorted_items, sorted_ranks)
+    shared, *white = transfer.unbind(1)
+    if len(white) == 2:
+        # Multiply a matrix (B, K) and a matrix (K, P) for each color.
+        return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
+    # One row for each pair of a light and a color, so that one matrix product computes all.
+    light_rows = lights.mT.flatten(-3, -2)
+    radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
+    if white:
+        radiance = radiance + (light_rows @ white[0]).unflatten(-2, (-1, COLORS))
+    return radiance

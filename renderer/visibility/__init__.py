@@ -1,1 +1,111 @@
-"""Visible surfaces: rasterizers, the samples of each face, and silhouette edges."""
+"""Rasterizers, which find the nearest face at each sample of an image.
+
+There are three: opengl, numpy and numba.
+
+Each module of this package has a function
+
+    rasterize(points, faces, resolution, closed) -> ids
+
+with these arguments:
+
+- points: The V vertices as N views project them, float64, shape (N, V, 3). The
+  image is [-1, 1] in x (to the right) and y (up). The third coordinate is the
+  depth, which is smaller for nearer points. Surfaces outside the depths [-1, 1)
+  are clipped.
+- faces: Vertex indices of the faces, shape (F, 3).
+- resolution: Number R of samples per side of an image. The sample in row i and
+  column j lies at x = (2 j + 1) / R - 1 and y = 1 - (2 i + 1) / R.
+- closed: False draws faces from both sides. True promises that the mesh is
+  watertight, that it lies within the range of depths, and that its faces are
+  counter-clockwise seen from outside. Faces that are clockwise in the image are
+  then left out. The same samples are covered with True and False. The face of a
+  sample can only differ where a face that is seen from behind is as near as the
+  nearest face up to rounding, such as along silhouettes.
+
+The result is the index of the nearest face at each sample, or -1 if there is
+none, int32, shape (N, R, R). Row 0 is at the top. If two faces have the same
+depth, the face with the lower index is returned.
+
+All rasterizers round vertices to 1/256 of a sample. A sample at the common edge
+of two faces is therefore covered by exactly one of them. NumPy and numba give
+the same results. OpenGL rounds depths differently.
+"""
+
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from renderer.errors import InputError, require_choice, require_memory
+from renderer.settings import RASTERIZERS
+from renderer.visibility import opengl
+
+# `Rasterizer.rasterize` clips projected points to a square around the image center. This
+# is the side of the square in samples. Products of fixed-point coordinates then fit into
+# int64.
+SPAN = 2**21
+# Bytes for each sample of the view that is shaded, at least. A face index has 4 more in each view.
+SHADED_BYTES = 40
+
+
+@dataclass(frozen=True)
+class Rasterizer:
+    """One of the rasterizers of this package.
+
+    Attributes:
+        name: Name of its module in this package.
+        description: Name with the version or the device, for log lines.
+    """
+
+    name: str
+    description: str
+
+    def rasterize(
+        self,
+        points: Float[np.ndarray, "N V 3"],
+        faces: Int[np.ndarray, "F 3"],
+        resolution: int,
+        closed: bool = False,
+    ) -> Int[np.ndarray, "N R R"]:
+        """Find the nearest face at each sample of N images, or -1.
+
+        x and y of the points are in [-1, 1] in the image, and the third coordinate is the
+        depth. `closed` leaves out faces that are seen from behind.
+        """
+        lowest = points.min(initial=0)
+        highest = points.max(initial=0)
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            raise ValueError("points has NaN or infinite values: give finite values")
+        # Larger coordinates would not fit into the integers of the rasterizers.
+        limit = SPAN / resolution
+        if max(-lowest, highest) > limit:
+            points = np.clip(points, -limit, limit)
+        needed = (4 * len(points) + SHADED_BYTES) * int(resolution) ** 2
+        name = f"{len(points)} views of {resolution} samples per side"
+        require_memory(name, needed, torch.device("cpu"))
+        module = import_module(f"renderer.visibility.{self.name}")
+        return module.rasterize(points, faces, resolution, closed)
+
+
+def choose(rasterizer: str = "auto") -> Rasterizer:
+    """Choose a rasterizer that works on this machine.
+
+    "auto" chooses numba if it is installed, and numpy otherwise, so that images are the
+    same on every machine.
+    """
+    require_choice("rasterizer", rasterizer, RASTERIZERS)
+    if rasterizer == "opengl":
+        return Rasterizer("opengl", f"opengl ({opengl.device()})")
+    if rasterizer == "numpy":
+        return Rasterizer("numpy", "numpy")
+    try:
+        # Only imported when it is needed, because it also imports numba, which takes 0.5 s.
+        from renderer.visibility import numba
+
+        return Rasterizer("numba", f"numba ({numba.VERSION})")
+    except InputError:
+        if rasterizer == "numba":
+            raise
+    return Rasterizer("numpy", "numpy (numba is faster: pip install numba)")

@@ -23,7 +23,7 @@ from torch.autograd.function import once_differentiable
 from renderer.camera import Camera
 from renderer.errors import require_finite
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 # Number of samples that are interpolated at once. Their values fit into the cache of the
 # processor.

@@ -39,7 +39,7 @@ def rasterize(
 ) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
-    The docstring of the package `renderer.visibility.rasterizer` defines the
+    The docstring of the package `renderer.visibility` defines the
     coordinates and the rounding. Samples without a face get -1.
     """
     # Unsigned indices are faster: compiled code checks signed indices for negative values.

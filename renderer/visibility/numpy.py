@@ -54,7 +54,7 @@ def rasterize(
 ) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
-    The docstring of the package `renderer.visibility.rasterizer` defines the
+    The docstring of the package `renderer.visibility` defines the
     coordinates and the rounding. Samples without a face get -1.
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)

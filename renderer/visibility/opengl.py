@@ -61,7 +61,7 @@ def rasterize(
 ) -> Int[np.ndarray, "N R R"]:
     """Find the nearest face at each sample of each view.
 
-    The docstring of the package `renderer.visibility.rasterizer` defines the
+    The docstring of the package `renderer.visibility` defines the
     coordinates and the rounding. Samples without a face get -1.
     """
     # Sort the corners, so that two faces with the same corners in another order get exactly

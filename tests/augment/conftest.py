@@ -17,10 +17,10 @@ import augment
 from augment.scene.objects import Example, SceneObject
 from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
-from renderer.light.presets import ambient
+from renderer.light.files import ambient
 from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 SIZE = 6
 ANGLES = (51.6, 17.2), (74.5, 108.9), (63.0, 200.5)  # polar angles and azimuths in degrees

@@ -24,7 +24,7 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
-from renderer.light.presets import probe
+from renderer.light.files import probe
 from renderer.solids import solid
 
 EPS32 = torch.finfo(torch.float32).eps

@@ -23,7 +23,7 @@ from benchmarks import (
     whole_steps,
 )
 from renderer.operators import shadows as precomputed
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 PNG_SIGNATURE = b"\x89PNG"
 

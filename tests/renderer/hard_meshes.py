@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from renderer.mesh import Mesh, concatenate
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 
 NO_FACE = -1
 

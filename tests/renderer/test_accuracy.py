@@ -30,8 +30,8 @@ from torch import Tensor
 
 from renderer.camera import OrthographicCamera
 from renderer.light.basis import Harmonics
+from renderer.light.files import ambient
 from renderer.light.harmonics import basis
-from renderer.light.presets import ambient
 from renderer.mesh import Mesh, normalize
 from renderer.operators import rays
 from renderer.operators.build import build_operators
@@ -39,8 +39,8 @@ from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.surface.shading import radiance
+from renderer.visibility import Rasterizer, choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import Rasterizer, choose
 
 CAMERA = OrthographicCamera(polar=57.3, azimuth=28.6, width=2.2)
 TOWARDS = CAMERA.axes()[2]

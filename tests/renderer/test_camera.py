@@ -19,8 +19,8 @@ from renderer.mesh import Mesh
 from renderer.operators.rays import Surface
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
+from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import choose
 
 EPS = np.finfo(np.float64).eps
 # Corners of the cube [-1, 1]³.

@@ -31,8 +31,8 @@ from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.surface.shading import irradiance, normals_in_sight, radiance
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
 CAMERA = OrthographicCamera(0, 0, 2.0)

@@ -14,8 +14,8 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fit import FINAL_GRID, MIN_RADIANCE_RATIO, FittedScene, _nonnegative_light, fit_scene
 from renderer.light.environment import to_map, write_map
+from renderer.light.files import load_light
 from renderer.light.harmonics import basis
-from renderer.light.presets import load_light
 from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
 

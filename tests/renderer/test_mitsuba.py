@@ -26,7 +26,7 @@ from renderer.operators import rays
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.solids import solid
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 pytest.importorskip("mitsuba")
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
+from renderer.light.files import load_light
 from renderer.light.harmonics import basis
-from renderer.light.presets import load_light
 from renderer.mesh import Mesh, normalize
 from renderer.mitsuba_scene import (
     SCENE,
@@ -29,7 +29,7 @@ from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.vectors import unit_vectors
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 pytest.importorskip("mitsuba")
 drjit = pytest.importorskip("drjit")

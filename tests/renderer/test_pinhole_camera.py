@@ -12,8 +12,8 @@ from renderer.errors import InputError
 from renderer.operators.rays import Surface
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 from tests.renderer.test_camera import RASTERIZERS, open_torus
 
 SIZE = 64

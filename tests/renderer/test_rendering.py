@@ -13,13 +13,12 @@ import renderer
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
-from renderer.light.lamps import Lamps
-from renderer.light.presets import ambient, load_light
-from renderer.light.projector import Projector
+from renderer.light.files import ambient, load_light
+from renderer.light.lamps import Lamps, Projector
 from renderer.operators.build import build_operators
 from renderer.rendering import light_sphere
 from renderer.settings import ENCODINGS, NORMALS, ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

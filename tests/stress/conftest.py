@@ -18,8 +18,8 @@ from PIL import Image
 import norm_balls as nb
 from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
+from renderer.light.files import probe
 from renderer.light.lamps import Lamps
-from renderer.light.presets import probe
 from tests.helpers import save_colored_noise
 
 ROOT = Path(__file__).parents[2]

@@ -26,7 +26,7 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from renderer.light.presets import UNIFORM, load_light
+from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.auditing import page

@@ -47,10 +47,10 @@ from renderer.image import to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
-from renderer.light.presets import UNIFORM, load_light, perturb
+from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 # Number of images that a classifier classifies in one pass.
 BATCH = 16

@@ -32,7 +32,7 @@ from augment.scene.objects import SceneObject, add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.visibility.rasterizer import Rasterizer
+from renderer.visibility import Rasterizer
 from train.checkpoints import load_chosen, load_network
 from train.class_names import class_name, class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings

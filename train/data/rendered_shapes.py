@@ -22,11 +22,11 @@ from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
 from renderer.errors import require_memory
 from renderer.image import to_bytes
-from renderer.light.presets import ambient, directional
+from renderer.light.files import ambient, directional
 from renderer.mesh import Mesh, normalize
 from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 from train import console
 from train.data.cache import TensorCache, content_hash, source_key
 from train.data.sets import DataSet, Split

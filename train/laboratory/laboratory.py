@@ -26,7 +26,7 @@ from renderer.io.images import read_image, write_image
 from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
-from renderer.light.presets import PROBES, load_light
+from renderer.light.files import PROBES, load_light
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.solids import HARD_NEGATIVES

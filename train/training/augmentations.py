@@ -24,7 +24,7 @@ from augment.projected_light import draw_projected_light
 from augment.random_streams import generator, stream_seed
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
-from renderer.light.ball import Ball, nearest_in_box
+from renderer.vectors import Ball, nearest_in_box
 from train.train_settings import TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of

@@ -13,14 +13,14 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis, parts_of
+from renderer.light.files import mean_luminance
 from renderer.light.lamps import LOCAL_LIGHTS
-from renderer.light.presets import mean_luminance
 from renderer.light.ringing import nonnegative_window
 from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
 from renderer.settings import TURBIDITY
+from renderer.vectors import Ball, nearest_in_box
 
 
 class LightParameter(Parameter):

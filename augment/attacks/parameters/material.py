@@ -15,8 +15,8 @@ from augment.attack_settings import MaterialSettings
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
-from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS
+from renderer.vectors import Ball, nearest_in_box
 
 # The four attack values of an attack on the material are roughness, metallic, specular factor and
 # hue. `GLOSS` selects the first three, and `HUE` the last.

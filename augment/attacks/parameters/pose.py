@@ -18,8 +18,7 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
-from renderer.light.ball import Ball, nearest_in_box
-from renderer.vectors import rotation_matrices
+from renderer.vectors import Ball, nearest_in_box, rotation_matrices
 
 # An attack on the pose changes a vector of values. The following constants are positions in it:
 # of the rotation vector of the object, of its shift along x and y, of the logarithm of its scale,

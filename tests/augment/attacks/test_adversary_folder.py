@@ -19,7 +19,7 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh, normalize
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # Each has a test of its own.
 CHANGE_TEXTURES = {"material", "albedo"}

@@ -11,8 +11,8 @@ from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.objective import adversarial_cost
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
+from renderer.light.files import directional
 from renderer.light.nonnegative import project_nonnegative
-from renderer.light.presets import directional
 
 SHARED = {"views": 2, "shared": True}
 TWO_BACKGROUNDS = {"backgrounds": [0.4, 0.5]}

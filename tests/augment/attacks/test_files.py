@@ -15,7 +15,7 @@ from augment.attacks.files import LINES, SIDE, figure
 from augment.attacks.result import AttackResult, warnings
 from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
-from renderer.light.presets import load_light
+from renderer.light.files import load_light
 from renderer.mitsuba_scene import mitsuba_map
 
 CLASSES = ("orange", "lime", "sky", "night")

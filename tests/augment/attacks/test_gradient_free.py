@@ -8,8 +8,8 @@ from torch import nn
 
 import augment
 from augment.attacks.problem import SceneProblem
+from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
-from renderer.light.presets import load_light
 
 OPTIMIZERS = ["random_search", "cma_es"]
 BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]

@@ -16,7 +16,7 @@ from torch import Tensor
 from augment.attack_settings import NORMS, StepSettings
 from augment.attacks.norm_ball import project, sample, scale_gradient
 from renderer.errors import InputError
-from renderer.light.ball import nearest_in_box
+from renderer.vectors import nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
 DTYPES = [torch.float32, torch.float64]

@@ -19,8 +19,8 @@ from augment.scene.vary import vary
 from augment.settings import ObjectSettings, PropSettings
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
+from renderer.light.files import directional, load_light, probe
 from renderer.light.harmonics import quadrature
-from renderer.light.presets import directional, load_light, probe
 from renderer.light.ringing import required_degree
 from renderer.mesh import Mesh
 from renderer.solids import solid

@@ -12,16 +12,16 @@ import torch
 from augment.scene.build import build_scene
 from renderer.camera import Camera
 from renderer.light.environment import read_map, write_map
+from renderer.light.files import mean_luminance, probe
 from renderer.light.harmonics import equirectangular
-from renderer.light.presets import mean_luminance, probe
 from renderer.mesh import Mesh, normalize
 from renderer.operators.build import build_operators
 from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 
 HDRI = Path(__file__).parents[4] / "shared" / "data" / "hdri"
 SIZE = 32

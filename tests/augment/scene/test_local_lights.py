@@ -20,7 +20,7 @@ from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.operators.build import build_operators
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 SIZE = 16
 BOTH = torch.arange(2)  # indices of both examples
@@ -225,7 +225,7 @@ def test_a_table_receives_the_projection_and_the_shadow():
 
 def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator(monkeypatch):
     """Examples are left out, repeated, and in another order."""
-    monkeypatch.setattr("renderer.operators.sparse.SMALL_MATRIX_SIZE", 0)
+    monkeypatch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
     shown = scene(projector=ProjectorSettings(pixels=16, power=2.0))
     examples = torch.tensor([1, 0, 0, 1])
     draws = torch.Generator().manual_seed(0)

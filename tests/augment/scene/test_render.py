@@ -15,7 +15,7 @@ from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS
 from renderer.solids import solid
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

@@ -25,11 +25,11 @@ from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
 from renderer.io.images import gray_or_image
 from renderer.light.environment import to_map, write_map
-from renderer.light.presets import ambient, probe
+from renderer.light.files import ambient, probe
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps

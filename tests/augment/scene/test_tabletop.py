@@ -11,8 +11,8 @@ import renderer
 from augment.scene import tabletop
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.basis import HARMONICS
+from renderer.light.files import ambient, probe
 from renderer.light.lamps import Lamps
-from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh, concatenate, normalize
 from renderer.operators.rays import Rays
 from renderer.settings import ImageSettings

@@ -25,8 +25,7 @@ from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.images import read_image
 from renderer.light.basis import HARMONICS
-from renderer.light.files import save_light
-from renderer.light.presets import ambient, load_light, probe
+from renderer.light.files import ambient, load_light, probe, save_light
 from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
 

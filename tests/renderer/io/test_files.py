@@ -27,7 +27,7 @@ from renderer.io.files import (
 from renderer.io.images import write_image
 from renderer.light.environment import read_panorama, write_map
 from renderer.light.harmonics import equirectangular
-from renderer.light.projector import Projector
+from renderer.light.lamps import Projector
 from train import checkpoints
 
 DRAWS = torch.Generator().manual_seed(0)

@@ -9,8 +9,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.light.basis import Harmonics, SumBasis, parts_of, split_light
 from renderer.light.environment import read_map
-from renderer.light.lamps import Lamps
-from renderer.light.projector import Projector
+from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, write_mitsuba_scene
 from renderer.settings import ImageSettings

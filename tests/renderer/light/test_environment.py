@@ -11,8 +11,8 @@ from oracles import draw
 
 from renderer.errors import InputError
 from renderer.light.environment import negative_fraction, read_map, to_map, write_map
+from renderer.light.files import load_light
 from renderer.light.harmonics import project
-from renderer.light.presets import load_light
 
 EPS = torch.finfo(torch.float64).eps
 # Rounding error of a .hdr file relative to the largest channel of a texel.

@@ -12,11 +12,11 @@ from oracles import draw, random_directions
 from scipy import optimize
 from torch import Tensor
 
-from renderer.light.ball import Ball
+from renderer.light.files import ambient, load_light
 from renderer.light.harmonics import basis, lambertian_factors, project, quadrature
 from renderer.light.nonnegative import TOLERANCE, nearest_nonnegative, project_nonnegative
-from renderer.light.presets import ambient, load_light
 from renderer.light.ringing import nonnegative_window
+from renderer.vectors import Ball
 
 HDRI = Path(__file__).parents[4] / "shared/data/hdri"
 GRACE = load_light("grace").double()

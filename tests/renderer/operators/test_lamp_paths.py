@@ -15,18 +15,16 @@ from renderer import mitsuba_scene
 from renderer.camera import OrthographicCamera
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SumBasis
 from renderer.light.environment import write_map
-from renderer.light.lamps import Lamps
-from renderer.light.projector import Projector
+from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.lamp_paths import local_radiance, unoccluded
-from renderer.operators.rays import Rays, Surface
+from renderer.operators.rays import Rays, Surface, local_radiance, unoccluded
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 
 CAMERA = OrthographicCamera(51.6, 22.9, 2.2)
 PROJECTOR = Projector(pixels=7, polar=28.6, azimuth=91.7, distance=3.0, fov=35.0)
@@ -296,9 +294,9 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
-    monkeypatch.setattr("renderer.operators.sparse.SMALL_MATRIX_SIZE", 0)
+    monkeypatch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(mesh, basis, samples=2)
-    monkeypatch.setattr("renderer.operators.sparse.SPARSE_FRACTION", 0)
+    monkeypatch.setattr("renderer.operators.build.SPARSE_FRACTION", 0)
     dense = operator_of(mesh, basis, samples=2)
     assert sparse.sparse is not None
     assert dense.sparse is None
@@ -314,7 +312,7 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 
 def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(monkeypatch):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
-    monkeypatch.setattr("renderer.operators.sparse.SMALL_MATRIX_SIZE", 0)
+    monkeypatch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(ball(), basis, samples=2)
     assert len(sparse.nonzero) == len(HARMONICS.nonzero)
     dense_count = Projector(16).size * len(sparse.pixels)

@@ -14,13 +14,13 @@ import renderer
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS, Basis, SumBasis
-from renderer.light.projector import Projector
+from renderer.light.lamps import Projector
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.operators.stack import TransferOperators
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 VIEW_COUNT = 5
 SIZE = 8

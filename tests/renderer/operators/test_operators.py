@@ -17,7 +17,7 @@ from renderer.mesh import Mesh
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS, ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
 # The image of this camera has +y to the right and -x up, from -1 to 1.

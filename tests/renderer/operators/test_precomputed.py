@@ -19,8 +19,8 @@ from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
+from renderer.light.files import ambient, load_light
 from renderer.light.harmonics import nonzero_coefficients
-from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
@@ -28,7 +28,7 @@ from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import ImageSettings
-from renderer.visibility.rasterizer import choose
+from renderer.visibility import choose
 
 ABOVE = OrthographicCamera(0, 0, 2.0)
 EPS32 = torch.finfo(torch.float32).eps

@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
-from renderer.light.presets import load_light
+from renderer.light.files import load_light
 from renderer.mesh import Mesh, concatenate, normalize
 from renderer.operators.rays import DIRECTIONS, Rays, Surface, sphere
 from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.solids import solid
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 
 ABOVE = OrthographicCamera(0, 0, 2.0)
 SIZE = 4

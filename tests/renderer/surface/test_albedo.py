@@ -19,8 +19,8 @@ from renderer.surface.albedo import (
     surface_albedo,
     with_added_albedo,
 )
+from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 # Camera whose image shows x to the right and y up, from -1 to 1.

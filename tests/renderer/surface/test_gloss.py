@@ -23,25 +23,23 @@ from torch import Tensor
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import Basis, Harmonics, LightPaths, LocalBasis, SplitLight
+from renderer.light.files import load_light
 from renderer.light.harmonics import bands, basis, lambertian_factors
-from renderer.light.lamps import Lamps
-from renderer.light.presets import load_light
-from renderer.light.projector import Projector
+from renderer.light.lamps import Lamps, Projector
 from renderer.light.ringing import AMPLITUDE, highlight_window, required_degree
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.lamp_paths import local_radiance
-from renderer.operators.rays import Rays
+from renderer.operators.rays import Rays, local_radiance
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
 from renderer.solids import solid, sphere
 from renderer.surface.gloss import Gloss, SampleGloss
+from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from renderer.visibility.rasterizer import choose
 
 [CAMERA] = orbit_cameras(1, 2.2)
 [NEARBY] = orbit_cameras(1, 2.2, fov=40.0)

@@ -25,8 +25,8 @@ from renderer.settings import MAX_DEGREE, ImageSettings
 from renderer.surface import shading
 from renderer.surface.albedo import surface_albedo
 from renderer.surface.shading import radiance
+from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 # Poles and directions on the equator, with both signs of zero.

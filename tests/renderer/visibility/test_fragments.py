@@ -10,8 +10,8 @@ import trimesh
 
 from renderer.camera import OrthographicCamera
 from renderer.settings import ImageSettings
+from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
-from renderer.visibility.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")

@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import renderer.visibility
 from renderer.errors import InputError
-from renderer.visibility import opengl
-from renderer.visibility.rasterizer import SPAN, Rasterizer, choose
+from renderer.visibility import SPAN, Rasterizer, choose, opengl
 
 HAS_NUMBA = find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not HAS_NUMBA, reason="numba is not installed")

@@ -13,8 +13,8 @@ from torch import Tensor
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
+from renderer.light.files import ambient, load_light
 from renderer.light.lamps import Lamps
-from renderer.light.presets import ambient, load_light
 from renderer.mesh import concatenate
 from renderer.pinhole import PinholeCamera
 from renderer.solids import SOLIDS

@@ -16,7 +16,7 @@ from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
-from renderer.light.presets import load_light
+from renderer.light.files import load_light
 from train.auditing import audit, lights
 from train.auditing.audit import run_audit
 from train.auditing.lights import (

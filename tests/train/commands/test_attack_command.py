@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from renderer.io.meshes import load_mesh
-from renderer.light.presets import load_light
+from renderer.light.files import load_light
 from train.cli import USER_ERROR
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"

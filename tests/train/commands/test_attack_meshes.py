@@ -11,7 +11,7 @@ from augment.attacks.result import AttackResult
 from augment.classifier import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
-from renderer.light.presets import probe
+from renderer.light.files import probe
 from renderer.visibility import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run

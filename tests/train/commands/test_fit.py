@@ -20,8 +20,8 @@ from renderer.image import decode, encode, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_image
 from renderer.light.environment import to_map, write_map
+from renderer.light.files import load_light
 from renderer.light.harmonics import equirectangular, project
-from renderer.light.presets import load_light
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings

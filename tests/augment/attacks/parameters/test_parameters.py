@@ -23,9 +23,9 @@ from augment.scene.scene import Scene
 from renderer.camera import orbit_cameras
 from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
+from renderer.light.files import directional, mean_luminance
 from renderer.light.harmonics import irradiance_error, nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
-from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import ZENITH, coefficients
 from renderer.operators.build import build_operators
 from renderer.settings import TURBIDITY

@@ -10,8 +10,8 @@ from oracles import random_directions
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import write_map
+from renderer.light.files import PROBES, ambient, directional, load_light, perturb, probe
 from renderer.light.harmonics import basis, equirectangular, nonzero_coefficients
-from renderer.light.presets import PROBES, ambient, directional, load_light, perturb, probe
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps
