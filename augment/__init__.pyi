@@ -23,7 +23,7 @@ from augment.augmentation_settings import VariationSettings as VariationSettings
 from augment.classifier import Classifier as Classifier
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
-from augment.projected_light import relight_photographs as relight_photographs
+from augment.photographs import relight_photographs as relight_photographs
 from augment.scene.build import build_scene as build_scene
 from augment.scene.objects import Conditions as Conditions
 from augment.scene.objects import Example as Example

@@ -1,15 +1,24 @@
-"""The function `attack_photographs`, which attacks a network through the light on photographs.
+"""Photographs in the light of a projector, and the attack on a network through this light.
 
-No mesh and no label is needed: the class of a photograph is what the network
-predicts for it unchanged.
+A photograph is treated as a flat print, whose linear values are its albedo. A projector shows a
+slide (a picture) on it. The light is multiplied by the shading of a random smooth surface and, in
+attacks, by smooth factors (gain). Weak ambient light is added, and a camera exposes the result:
+
+    radiance = albedo · (slide · gain · shading + ambient)
+
+There are no shadows, no reflections and no depth. No mesh and no label is needed: the class of a
+photograph is what the network predicts for it unchanged.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
@@ -20,7 +29,7 @@ from augment.attack_settings import (
     RelightingSettings,
     StepSettings,
 )
-from augment.attacks.loop import Minimum, minimize
+from augment.attacks.loop import minimize
 from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.optimizers import Gradient, Optimizer
@@ -34,8 +43,8 @@ from augment.plain_networks import (
     gradient_flags_kept,
 )
 from augment.progress import progress
-from augment.projected_light import ProjectedLight, draw_projected_light, require_photographs
 from augment.random_streams import generator
+from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
 from renderer.errors import (
     MAX_MAGNITUDE,
     MAX_SCALE,
@@ -44,12 +53,11 @@ from renderer.errors import (
     require_kind,
     require_whole,
 )
-from renderer.image import decode, to_bytes, to_unit
+from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.short_repr import ShortRepr
 
-# A photograph is lit by a projector that shows a picture, the slide. These are the names of three
-# lights: the slide as it is, the slide multiplied by the best of several random factors, and the
-# slide multiplied by factors that gradient descent finds.
+# Names of three lights: the slide as it is, the slide multiplied by the best of several random
+# factors, and the slide multiplied by factors that gradient descent finds.
 SLIDE = "slide"
 RANDOM = "random"
 ADVERSARIAL = "adversarial"
@@ -59,6 +67,175 @@ UNCHANGED = "unchanged"
 # Total length of all steps of an attack, in units of the radius of the norm-ball. It is more than
 # the diameter, so that the steps can cross the ball from any start (Madry et al. 2018).
 TRAVELED_RADII = 2.5
+# A random smooth surface interpolates random heights at a grid of this number of points per side.
+SURFACE_NODES = 4
+# Largest standard deviation of the random heights of a surface, in units of half the width of the
+# image.
+MAX_STEEPNESS = 0.3
+# Largest angle in degrees between the light of the projector and the normal of a flat print.
+MAX_POLAR = 60.0
+# Smallest and largest ambient light, in units of the light of a white slide.
+AMBIENT = (0.01, 0.1)
+# Smallest and largest random change of the exposure, in stops.
+STOPS = (-1.0, 0.5)
+# The exposure divides by the mean luminance of an image, but at least by this, so that black images
+# stay dark.
+DARKEST = 1e-6
+
+
+class ProjectedLight(NamedTuple):
+    """Light of a projector on B photographs, and the exposure of the camera that sees them.
+
+    Attributes:
+        slide: Picture that the projector shows on each photograph, as linear light in [0, 1].
+        shading: Cosine between the light and the normal of the surface, by which the slide is
+            multiplied, in [0, 1].
+        ambient: Light that is the same everywhere.
+        stops: Exposure in stops. At 0, the mean luminance is that of the unchanged photograph.
+    """
+
+    slide: Float[Tensor, "B 3 H W"]
+    shading: Float[Tensor, "B 1 H W"]
+    ambient: Float[Tensor, "B 1 1 1"]
+    stops: Float[Tensor, "B 1 1 1"]
+
+    def to(self, device: torch.device | str) -> ProjectedLight:
+        """Return a copy whose tensors are on a device."""
+        return ProjectedLight(*(values.to(device) for values in self))
+
+    def select(self, photographs: Int[Tensor, " A"]) -> ProjectedLight:
+        """Return the light on some of the photographs."""
+        return ProjectedLight(*(values[photographs] for values in self))
+
+    def light(
+        self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
+
+        Logarithms of gains are interpolated linearly between the centers of the cells. None stands
+        for no gain.
+        """
+        slide = self.slide
+        if log_gain is not None:
+            size = slide.shape[-2:]
+            slide = slide * F.interpolate(log_gain, size, mode="bilinear").exp()
+        return slide * self.shading + self.ambient
+
+    def expose(
+        self,
+        albedo: Float[Tensor, "B 3 H W"],
+        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute images (sRGB) of linear photographs in the light of the projector.
+
+        The camera exposes an image such that its mean luminance is 2^stops times that of the
+        photograph, before values above 1 are clamped. The result is differentiable in `log_gain`.
+        """
+        radiance = albedo * self.light(log_gain)
+        mean_before = luminance(albedo).mean((2, 3), keepdim=True)
+        mean_after = luminance(radiance).mean((2, 3), keepdim=True)
+        exposure = 2**self.stops * mean_before / mean_after.clamp(min=DARKEST)
+        return encode(clamp(exposure * radiance), "srgb")
+
+
+def draw_shading(
+    count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 1 size size"]:
+    """Draw the shading of random smooth surfaces in light from random directions.
+
+    It is the cosine between normal and light, or 0 if the surface faces away.
+    """
+    # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
+    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
+    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
+    # Height of each pixel, shape (count, 1, size, size).
+    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
+    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / size.
+    slope_down, slope_right = torch.gradient(height[:, 0], spacing=2 / size, dim=(1, 2))
+    polar = math.radians(MAX_POLAR) * tilt
+    azimuth = 2 * math.pi * turn
+    # Components of the unit vector towards the light. The one along the view is polar.cos().
+    to_right = polar.sin() * azimuth.cos()
+    to_bottom = polar.sin() * azimuth.sin()
+    length = (1 + slope_right**2 + slope_down**2).sqrt()
+    # Product of the light's vector with the normal (-slope_right, -slope_down, 1) / length.
+    cosine = (polar.cos() - to_right * slope_right - to_bottom * slope_down) / length
+    return cosine.clamp(min=0)[:, None]
+
+
+def draw_projected_light(
+    count: int,
+    size: int,
+    draws: torch.Generator,
+    photographs: UInt8[Tensor, "N 3 H W"] | None = None,
+) -> ProjectedLight:
+    """Draw the random light of a projector: slide, shading, ambient light and exposure.
+
+    Slides show photographs only if some are given.
+    """
+    slide = draw_slides(count, size, draws, photographs)
+    shading = draw_shading(count, size, draws)
+    # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
+    ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
+    return ProjectedLight(
+        slide=slide,
+        shading=shading,
+        ambient=AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient,
+        stops=STOPS[0] + (STOPS[1] - STOPS[0]) * stops,
+    )
+
+
+def relight_photographs(
+    photographs: Tensor,
+    seed: int = 0,
+    *,
+    slides: Tensor | None = None,
+) -> Tensor:
+    """Show photographs in the light of a projector with random slides.
+
+    This models a flat print in the light of a projector, with the shading of a
+    random smooth surface. It needs neither meshes nor labels.
+
+    Args:
+        photographs: Square photographs, sRGB of 8 bits, uint8, shape
+            (N, 3, size, size).
+        seed: Seed of all random draws.
+        slides: Photographs that the projector may show as slides, uint8, shape
+            (M, 3, H, W). None for generated slides only.
+
+    Returns:
+        Photographs in the light of the projector, uint8, shape
+        (N, 3, size, size).
+
+    Raises:
+        InputError: If the photographs have another dtype or shape.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> photographs = torch.full((2, 3, 8, 8), 128, dtype=torch.uint8)
+        >>> nb.relight_photographs(photographs, seed=1).shape
+        torch.Size([2, 3, 8, 8])
+    """
+    require_photographs("photographs", photographs)
+    if slides is not None:
+        require_photographs("slides", slides)
+    require_whole("seed", seed)
+    count, _, size, _ = photographs.shape
+    light = draw_projected_light(count, size, generator(seed, "relight"), slides)
+    return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
+
+
+def require_photographs(name: str, photographs: Tensor) -> None:
+    """Check that a value is a tensor of square photographs of 8 bits."""
+    require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
+    shape = tuple(photographs.shape)
+    is_square = len(shape) == 4 and shape[1] == 3 and shape[2] == shape[3]
+    if photographs.dtype != torch.uint8 or not is_square or not shape[0]:
+        raise InputError(
+            f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
+            "give uint8 of shape (N, 3, size, size)",
+        )
 
 
 class RelitPhotographs(NormBalls):
@@ -209,7 +386,7 @@ class PhotographAttackResult(ShortRepr):
             return chosen
         projected = _draw_lights(self.photographs, [photograph], slide, self.seed)
         log_gain = self.log_gain[light][photograph, slide][None]
-        return to_bytes(projected.apply(to_unit(chosen[None]), log_gain))[0]
+        return to_bytes(projected.expose(decode(to_unit(chosen[None]), "srgb"), log_gain))[0]
 
 
 def attack_photographs(
@@ -282,139 +459,99 @@ def attack_photographs(
                 f"photographs have {size} pixels per side, "
                 f"but the network takes {classifier.size}: resize them",
             )
-        attack = _PhotographAttack(classifier, photographs, settings, success_settings, seed)
-        return attack.run()
+        return _attack(classifier, photographs, settings, success_settings, seed)
 
 
-class _PhotographAttack:
-    """Attack a network through projected light on photographs, one batch after the other."""
+def _attack(
+    classifier: Classifier,
+    photographs: UInt8[Tensor, "N 3 size size"],
+    settings: RelightingSettings,
+    success: AttackSettings,
+    seed: int,
+) -> PhotographAttackResult:
+    """Attack all photographs with all slides, one batch after the other."""
+    device = device_of(classifier)
+    has_gradients = classifier.is_differentiable(torch.empty(0, device=device))
+    lights = LIGHTS if has_gradients else LIGHTS[:-1]
+    shape = (len(photographs), settings.slides)
+    shape_of_gains = (*shape, 3, settings.cells, settings.cells)
+    result = PhotographAttackResult(
+        classifier=classifier,
+        photographs=photographs,
+        settings=settings,
+        seed=seed,
+        source=torch.empty(len(photographs), dtype=torch.int64),
+        predicted={light: torch.empty(shape, dtype=torch.int64) for light in lights},
+        changed={light: torch.zeros(shape, dtype=torch.bool) for light in lights},
+        log_gain={light: torch.zeros(shape_of_gains) for light in lights},
+    )
+    batches = torch.arange(len(photographs)).split(success.batch_size)
+    quantizing = Network(classifier, [Quantization()])
+    with frozen_eval_mode(classifier):
+        for rows in progress(batches, "relighting photographs", len(batches)):
+            images = to_unit(photographs[rows]).to(device)
+            with torch.no_grad():
+                result.source[rows] = quantizing(images).argmax(1).cpu()
+            for slide in range(settings.slides):
+                _attack_slide(result, success, images, rows, slide)
+    return result
 
-    def __init__(
-        self,
-        classifier: Classifier,
-        photographs: UInt8[Tensor, "N 3 size size"],
-        settings: RelightingSettings,
-        success_settings: AttackSettings,
-        seed: int,
-    ):
-        """Prepare the attack."""
-        self.classifier = classifier
-        self.photographs = photographs
-        self.settings = settings
-        self.success_settings = success_settings
-        self.seed = seed
-        self.device = device_of(classifier)
-        self.model = Network(classifier, [Quantization()])
-        has_gradients = classifier.is_differentiable(torch.empty(0, device=self.device))
-        self.lights = LIGHTS if has_gradients else LIGHTS[:-1]
 
-    def run(self) -> PhotographAttackResult:
-        """Attack all photographs with all slides, which are pictures that a projector shows."""
-        count = len(self.photographs)
-        shape = (count, self.settings.slides)
-        cells = self.settings.cells
-        self.source = torch.empty(count, dtype=torch.int64)
-        self.predicted = {name: torch.empty(shape, dtype=torch.int64) for name in self.lights}
-        self.changed = {name: torch.zeros(shape, dtype=torch.bool) for name in self.lights}
-        self.log_gain = {name: torch.zeros(*shape, 3, cells, cells) for name in self.lights}
-        batches = torch.arange(count).split(self.success_settings.batch_size)
-        with frozen_eval_mode(self.classifier):
-            for rows in progress(batches, "relighting photographs", len(batches)):
-                with torch.no_grad():
-                    logits = self.model(self._load(rows))
-                self.source[rows] = logits.argmax(1).cpu()
-                for slide in range(self.settings.slides):
-                    self._attack_slide(rows, slide)
-        return PhotographAttackResult(
-            classifier=self.classifier,
-            photographs=self.photographs,
-            settings=self.settings,
-            seed=self.seed,
-            source=self.source,
-            predicted=self.predicted,
-            changed=self.changed,
-            log_gain=self.log_gain,
-        )
+def _attack_slide(
+    result: PhotographAttackResult,
+    success: AttackSettings,
+    images: Float[Tensor, "B 3 size size"],
+    rows: Int[Tensor, " B"],
+    slide: int,
+) -> None:
+    """Attack a batch of photographs with one slide each, and record what is found in the result.
 
-    def _load(self, rows: Int[Tensor, " A"]) -> Float[Tensor, "A 3 size size"]:
-        """Return photographs as images in [0, 1] on the device of the network."""
-        return to_unit(self.photographs[rows]).to(self.device)
-
-    def _attack_slide(self, rows: Int[Tensor, " B"], slide: int) -> None:
-        """Attack a batch of photographs with one slide (a picture of the projector) each.
-
-        First, each photograph is shown in the light of its slide. If it keeps its class, random
-        search and gradient descent look for factors of the slide that change the class.
-        """
-        problem = self._problem(rows, slide)
-        # Treat each photograph as an example of one view: the second axis has length 1.
-        criterion = Criterion(self.source[rows].to(self.device)[:, None])
-        examples = torch.arange(len(rows), device=self.device)
-        for light in self.lights:
-            objective = Objective(self.classifier, criterion, self._search_settings(light))
-            found = minimize(problem, objective, examples=examples, optimizer=OPTIMIZERS[light])
-            # If factors are searched, the records of the other lights are replaced later.
-            lights = self.lights if light == SLIDE else [light]
-            self._record(lights, rows, slide, criterion, found)
-            if light == SLIDE:
-                is_kept = ~self.changed[SLIDE][rows, slide]
-                rows = rows[is_kept]
-                examples = examples[is_kept.to(self.device)]
-                criterion = criterion.select(is_kept.to(self.device))
-            if not len(rows):
-                return
-
-    def _problem(self, rows: Int[Tensor, " B"], slide: int) -> RelitPhotographs:
-        """Show photographs in the light of a slide each.
-
-        Each photograph has random numbers of its own, so that its light and its factors do not
-        depend on the other photographs.
-        """
-        indices = rows.tolist()
-        return RelitPhotographs(
-            decode(self._load(rows), "srgb"),
-            _draw_lights(self.photographs, indices, slide, self.seed).to(self.device),
-            self.settings.cells,
-            self.settings.radius,
-            self.settings.steps,
-            [generator(self.seed, "factors", index, slide) for index in indices],
-        )
-
-    def _search_settings(self, light: str) -> AttackSettings:
-        """Return settings of a search that uses all passes, since no search reaches its margin.
-
-        The slide as it is takes no step.
-        """
-        return replace(
-            self.success_settings,
+    First, each photograph is shown in the light of its slide. If it keeps its class, random
+    search and gradient descent look for factors of the slide that change the class. Each photograph
+    has random numbers of its own, which do not depend on the other photographs.
+    """
+    settings = result.settings
+    indices = rows.tolist()
+    problem = RelitPhotographs(
+        decode(images, "srgb"),
+        _draw_lights(result.photographs, indices, slide, result.seed).to(images.device),
+        settings.cells,
+        settings.radius,
+        settings.steps,
+        [generator(result.seed, "factors", index, slide) for index in indices],
+    )
+    # Treat each photograph as an example of one view: the second axis has length 1.
+    source = result.source[rows].to(images.device)[:, None]
+    examples = torch.arange(len(rows), device=images.device)
+    for light in result.changed:
+        criterion = Criterion(source)
+        # No search reaches this margin, so each uses all passes. The slide as it is takes no step.
+        search = replace(
+            success,
             optimizer=RANDOM_SEARCH if light == RANDOM else GRADIENT,
-            max_steps=0 if light == SLIDE else self.settings.steps,
-            max_queries=self.settings.passes,
+            max_steps=0 if light == SLIDE else settings.steps,
+            max_queries=settings.passes,
             margin=MAX_SCALE,
             sensor_noise=0.0,
         )
-
-    def _record(
-        self,
-        lights: Sequence[str],
-        rows: Int[Tensor, " A"],
-        slide: int,
-        criterion: Criterion,
-        found: Minimum,
-    ) -> None:
-        """Record predictions of photographs in the result, and whether they hold with noise.
-
-        `lights` are keys of the results: "slide", "random" or "adversarial".
-        """
-        # Index of the sensor noise, which differs for each pair of a photograph and a slide.
-        noise_indices = rows * self.settings.slides + slide
-        objective = Objective(self.classifier, criterion, self.success_settings, self.seed)
-        is_changed = objective.fooled_in_views(found.images, found.predicted, noise_indices)
-        for light in lights:
-            self.predicted[light][rows, slide] = found.predicted[:, 0].cpu()
-            self.changed[light][rows, slide] = is_changed[:, 0].cpu()
-            log_gain = found.values.cpu().view_as(self.log_gain[light][rows, slide])
-            self.log_gain[light][rows, slide] = log_gain
+        objective = Objective(result.classifier, criterion, search)
+        found = minimize(problem, objective, examples=examples, optimizer=OPTIMIZERS[light])
+        # The sensor noise differs for each pair of a photograph and a slide.
+        noise_indices = rows * settings.slides + slide
+        noisy = Objective(result.classifier, criterion, success, result.seed)
+        is_changed = noisy.fooled_in_views(found.images, found.predicted, noise_indices)[:, 0]
+        # If factors are searched, the records of the other lights are replaced later.
+        for name in result.changed if light == SLIDE else [light]:
+            result.predicted[name][rows, slide] = found.predicted[:, 0].cpu()
+            result.changed[name][rows, slide] = is_changed.cpu()
+            log_gain = found.values.cpu().view_as(result.log_gain[name][rows, slide])
+            result.log_gain[name][rows, slide] = log_gain
+        if light == SLIDE:
+            source = source[~is_changed]
+            examples = examples[~is_changed]
+            rows = rows[~is_changed.cpu()]
+            if not len(rows):
+                return
 
 
 def _draw_lights(
@@ -426,8 +563,8 @@ def _draw_lights(
     but not on the other photographs.
     """
     size = photographs.shape[-1]
-    lights = []
-    for row in rows:
-        draws = generator(seed, "light", row, slide)
-        lights.append(draw_projected_light(1, size, draws, photographs))
-    return ProjectedLight.join(lights)
+    lights = [
+        draw_projected_light(1, size, generator(seed, "light", row, slide), photographs)
+        for row in rows
+    ]
+    return ProjectedLight(*map(torch.cat, zip(*lights, strict=True)))

@@ -35,7 +35,7 @@ from PIL import Image
 
 from augment.classifier import Classifier
 from augment.network import compute_outputs
-from augment.projected_light import relight_photographs
+from augment.photographs import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square
 from train.command_settings import LabSettings

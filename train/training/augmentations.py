@@ -19,8 +19,7 @@ from augment.attacks.loop import minimize_from
 from augment.attacks.norm_ball import NormBalls
 from augment.attacks.objective import Criterion, Objective, label_loss
 from augment.attacks.optimizers import Gradient
-from augment.photographs import RelitPhotographs
-from augment.projected_light import draw_projected_light
+from augment.photographs import RelitPhotographs, draw_projected_light
 from augment.random_streams import generator, stream_seed
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
@@ -193,12 +192,13 @@ class RelitBatches:
         light = draw_projected_light(count, size, draws, images).to(images.device)
         unit = to_unit(images)
         # The linear colors of an image stand for the albedo of what it shows.
-        problem = RelitPhotographs(decode(unit, "srgb"), light, CELLS, self._radius, self._steps)
+        albedo = decode(unit, "srgb")
+        problem = RelitPhotographs(albedo, light, CELLS, self._radius, self._steps)
         values = problem.sample(draws)
         if self._steps and self._radius and self._teacher is not None:
             values = self._attack(problem, values, unit)
         with torch.no_grad():
-            return to_bytes(light.apply(unit, problem.log_gain(values)))
+            return to_bytes(light.expose(albedo, problem.log_gain(values)))
 
     def _attack(
         self,

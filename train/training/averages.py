@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
 from augment.network import compute_outputs
+from augment.photographs import relight_photographs
 from augment.progress import progress
-from augment.projected_light import relight_photographs
 from augment.random_streams import stream_seed
 from train import console
 from train.data.sets import Split
