@@ -56,8 +56,8 @@ if TYPE_CHECKING:
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.
 OPERATOR_BYTES = 8
-# Description of a valid label in error messages.
-LABEL = "the name of a class, or its index"
+# Class of each local light by its settings.
+LOCAL_LIGHT_OF_SETTINGS = {LOCAL_LIGHT_SETTINGS[name]: kind for name, kind in LOCAL_LIGHTS.items()}
 # A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
 MeshSource = str | Path | Mesh
 # Names of the fields of `SceneSettings` and `RendererSettings` that `build_scene` takes as keyword
@@ -149,48 +149,36 @@ def build_scene(
     if unknown:
         choices = ", ".join(sorted(SCENE_OPTIONS | RENDERER_OPTIONS))
         raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
-    members = _as_meshes(meshes)
     scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
     renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
-    scene_settings = replace(scene or SceneSettings(), views=views, **scene_options)
+    settings = replace(scene or SceneSettings(), views=views, **scene_options)
     renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
-    objects = []
-    for member in progress(members, "reading meshes"):
-        item = _load_member(member, scene_settings.vertices)
-        objects.append(add_table(item, scene_settings.ground))
-    environment: Any = scene_settings.light
-    is_named = isinstance(environment, str | Path)
+    objects = _load_objects(meshes, settings)
+    environment: Any = settings.light
     degree = None
-    if is_named:
+    # Loads the lighting again with a higher degree, which a smoother surface may need later. It
+    # stays None if the user gave coefficients or chose the degree.
+    lights_of_degree = None
+    if isinstance(environment, str | Path):
         material = attack.material if attack else None
         smoothest = reached_gloss(objects, material, vary.gloss if vary else None)
-        pixels = views * len(objects) * size**2
-        degree = degree_of_scene(smoothest, scene_settings.degree, pixels)
+        degree = degree_of_scene(smoothest, settings.degree, views * len(objects) * size**2)
         environment = load_light(environment, degree, smoothest.gloss_roughness)
-        warn_of_low_degree(str(scene_settings.light), environment)
+        _warn_of_wrong_irradiance(settings.light, environment, degree)
+        if settings.degree is None:
+            lights_of_degree = partial(_build_lights, settings, settings.light)
     else:
         environment = as_tensor("light", environment)
         # `degree_of` raises InputError if the shape is not that of coefficients.
         degree_of(environment)
         require_bounded(light=environment)
-    basis, lights = _build_lights(scene_settings, environment, degree)
-    # `lights_of_degree` loads the lighting again with a higher degree, which a smoother surface
-    # may need later. It stays None if the user gave coefficients or chose the degree.
-    lights_of_degree = None
-    if is_named and scene_settings.degree is None:
-        lights_of_degree = partial(_build_lights, scene_settings, scene_settings.light)
+    basis, lights = _build_lights(settings, environment, degree)
     rasterizer = renderer_settings.rasterizer
-    given_cameras = given_cameras or orbit_cameras(
-        views,
-        scene_settings.width,
-        scene_settings.polar,
-        scene_settings.azimuth,
-        scene_settings.fov,
-    )
     return Scene.grid(
         objects,
-        given_cameras,
-        load_backgrounds(scene_settings.backgrounds, size),
+        given_cameras
+        or orbit_cameras(views, settings.width, settings.polar, settings.azimuth, settings.fov),
+        load_backgrounds(settings.backgrounds, size),
         lights.to(as_device(device)),
         renderer_settings.image(size),
         choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
@@ -201,43 +189,41 @@ def build_scene(
     )
 
 
-def _as_meshes(meshes: object) -> list[Any]:
-    """Check the argument `meshes` of `build_scene`, and return it as a list."""
-    expected = "a list of pairs such as ('solid:orange', 'orange'), or of nb.ObjectSettings"
+def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
+    """Load the objects of the argument `meshes` of `build_scene`, and put a table under each."""
+    example = "such as ('solid:orange', 'orange')"
+    expected = f"a list of pairs {example}, or of nb.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
-        raise InputError("meshes is empty: give pairs such as ('solid:orange', 'orange')")
+        raise InputError(f"meshes is empty: give pairs {example}")
     for index, member in enumerate(members):
         if isinstance(member, ObjectSettings):
-            require_kind(f"meshes[{index}].label", member.label, str, LABEL)
             continue
         if len(member) != 2:
             raise InputError(
                 f"meshes[{index}] is {describe(member)}: give a pair of a mesh and a label, "
-                "such as ('solid:orange', 'orange')"
+                f"{example}"
             )
         mesh, label = member
         if not isinstance(mesh, str | Path):
             require_mesh(f"meshes[{index}]", mesh)
         if not is_whole(label):
-            require_kind(f"meshes[{index}]: its label", label, str, LABEL)
-    return members
-
-
-def _load_member(
-    member: ObjectSettings | tuple[MeshSource, str | int], vertices: int
-) -> SceneObject:
-    """Load an object from a member of the argument `meshes` of `build_scene`."""
-    if isinstance(member, ObjectSettings):
-        return load_object(member, vertices)
-    mesh, label = member
-    if not isinstance(label, str):
-        label = int(label)
-    if isinstance(mesh, Mesh):
-        return SceneObject.from_mesh(label, subdivide(mesh, vertices))
-    loaded = load_object(ObjectSettings(str(mesh), str(label)), vertices)
-    # An index remains a number, because a class may have this number as its name.
-    return replace(loaded, label=label)
+            label_name = f"meshes[{index}]: its label"
+            require_kind(label_name, label, str, "the name of a class, or its index")
+    objects = []
+    for member in progress(members, "reading meshes"):
+        if isinstance(member, ObjectSettings):
+            item = load_object(member, settings.vertices)
+        else:
+            mesh, label = member
+            if isinstance(mesh, Mesh):
+                item = SceneObject.from_mesh("", subdivide(mesh, settings.vertices))
+            else:
+                item = load_object(ObjectSettings(str(mesh), ""), settings.vertices)
+            # An index remains a number, because a class may have this number as its name.
+            item = replace(item, label=label if isinstance(label, str) else int(label))
+        objects.append(add_table(item, settings.ground))
+    return objects
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
@@ -258,10 +244,8 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     if views not in (1, len(given)):
         raise InputError(f"views={views} does not fit {len(given)} cameras: leave views out")
     fixed = [camera.fixed() for camera in given]
-    if not normalize:
-        return fixed
     # The scene turns cameras about the origin. Make the origin the center of these cameras.
-    return [camera.normalized(np.zeros(3), 1.0) for camera in fixed]
+    return [camera.normalized(np.zeros(3), 1.0) for camera in fixed] if normalize else fixed
 
 
 def _build_lights(
@@ -288,10 +272,7 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
     Return its basis and its RGB coefficients: the pixels of the projector or the powers of the
     lamps.
     """
-    for name, kind in LOCAL_LIGHTS.items():
-        if type(settings) is LOCAL_LIGHT_SETTINGS[name]:
-            return kind.from_settings(settings)
-    raise TypeError(f"{type(settings).__name__} is not the settings of a local light")
+    return LOCAL_LIGHT_OF_SETTINGS[type(settings)].from_settings(settings)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
@@ -299,10 +280,10 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
 
     The shape is (B, 3, size, size), or (B, 1, size, size) if all backgrounds are gray.
     """
-    expected = "a list of gray values in [0, 1] or image files"
-    choices = as_list("backgrounds", choices, object, expected)
+    expected = "gray values in [0, 1] or image files"
+    choices = as_list("backgrounds", choices, object, f"a list of {expected}")
     if not choices:
-        raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
+        raise InputError(f"backgrounds is empty: give {expected}")
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
@@ -342,21 +323,27 @@ class Smoothest(NamedTuple):
 
     @property
     def degree(self) -> int:
-        """Return the degree of lighting that shows the highlights of the surface.
-
-        It is 0 if no surface has gloss.
-        """
+        """Return the degree of lighting that shows the highlights, or 0 without gloss."""
         return required_degree(self.roughness) if self.roughness < MATTE else 0
+
+    def affordable_degree(self, pixels: int) -> int:
+        """Return the degree of lighting that the surface needs, as far as memory permits."""
+        degree = max(DEGREE, self.degree)
+        cpu = torch.device("cpu")
+        while degree > DEGREE and not has_memory(OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu):
+            degree -= 1
+        return degree
 
     def warn(self, subject: str, degree: int) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
-        surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
-        needed = f"which takes light of degree {self.degree}"
         error = highlight_error(degree, self.roughness)
         least_error = highlight_error(self.degree, self.roughness)
-        errors = f"off by {error:.0%} (rms) instead of {least_error:.0%}"
-        message = f"{surface}, {needed}: {subject} shows the highlight of a point of light {errors}"
-        warnings.warn(message, stacklevel=4)
+        warnings.warn(
+            f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}, which takes light "
+            f"of degree {self.degree}: {subject} shows the highlight of a point of light off by "
+            f"{error:.0%} (rms) instead of {least_error:.0%}",
+            stacklevel=4,
+        )
 
 
 def reached_gloss(
@@ -368,15 +355,12 @@ def reached_gloss(
 
     Surfaces of props count, too. None stands for no attack or no variation.
     """
-    lowest = Smoothest(MATTE, "")
+    candidates = [Smoothest(MATTE, "")]
     for item in objects:
-        initial_roughness = smallest_roughness(item.mesh)
-        candidates = [lowest, Smoothest(initial_roughness, item.name)]
+        candidates.append(Smoothest(smallest_roughness(item.mesh), item.name))
         reached_roughness = _reached_roughness(item, material, layer)
-        if reached_roughness < initial_roughness:
-            candidates.append(Smoothest(reached_roughness, item.name, "can reach"))
-        lowest = min(candidates)
-    return lowest
+        candidates.append(Smoothest(reached_roughness, item.name, "can reach"))
+    return min(candidates, key=lambda smoothest: smoothest.roughness)
 
 
 def _reached_roughness(
@@ -386,32 +370,28 @@ def _reached_roughness(
 
     It is `MATTE` if neither changes the gloss. Props and table do not count.
     """
-    has_specular_layer = layer is not None and any(layer.specular_factor)
+    if layer is not None and not any(layer.specular_factor):
+        layer = None
     is_attacked = material is not None and any(
         (material.roughness, material.metallic, material.specular_factor)
     )
-    if not has_specular_layer and not is_attacked:
+    if layer is None and not is_attacked:
         return MATTE
     materials = initial_materials(item)
     # Roughness of each face of the object itself.
     roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
-    if layer is not None and has_specular_layer:
-        lowest_drawn = layer.roughness[0]
-        roughness = torch.full_like(roughness, lowest_drawn)
-    if material is not None and is_attacked and material.roughness:
-        # An attack lowers the mean roughness of the faces, and each face by the same amount.
+    if layer is not None:
+        roughness = torch.full_like(roughness, layer.roughness[0])
+    if material is not None and material.roughness:
+        # An attack lowers the mean roughness of the faces, and each face by the same amount. Its
+        # radius counts units of size `material.roughness`.
+        radius = math.inf if material.radius is None else material.radius
         mean = float(roughness.mean())
-        # The radius counts units of size `material.roughness`. No radius means no limit.
-        largest_change = math.inf
-        if material.radius is not None:
-            largest_change = material.radius * material.roughness
-        lowest_mean = max(mean - largest_change, MIN_ROUGHNESS)
-        change = min(lowest_mean - mean, 0.0)
-        roughness = (roughness + change).clamp(min=0)
+        lowest_mean = max(mean - radius * material.roughness, MIN_ROUGHNESS)
+        roughness = (roughness + min(lowest_mean - mean, 0.0)).clamp(min=0)
     # `Gloss` gets its default specular factor of 1, because attacks and variations can reach 1.
-    gloss = Gloss(roughness, textured=not has_specular_layer)
-    own_mesh = select_faces(item.mesh, slice(item.own))
-    return smallest_roughness(gloss.on(own_mesh))
+    gloss = Gloss(roughness, textured=layer is None)
+    return smallest_roughness(gloss.on(select_faces(item.mesh, slice(item.own))))
 
 
 def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int:
@@ -422,7 +402,7 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
     limits it, or if the user gives a degree that is too low.
     """
     if given is None:
-        degree = _affordable_degree(smoothest, pixels)
+        degree = smoothest.affordable_degree(pixels)
         if degree < smoothest.degree:
             smoothest.warn(f"degree={degree}, the highest that fits in memory,", degree)
         elif degree > DEGREE:
@@ -431,41 +411,28 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
     if smoothest.degree > given:
         smoothest.warn(f"degree={given}", given)
     if given < MIN_SHADING_DEGREE:
-        fault = "is too low to shade objects correctly"
-        if given == 0:
-            fault = "gives all sides of an object the same irradiance"
-        message = (
-            f"degree={given} {fault}, and attacks and variations of the light have the same "
-            f"degree: give {MIN_SHADING_DEGREE} or more, or leave degree out"
+        warnings.warn(
+            f"degree={given} is too low to shade objects correctly, and attacks and variations of "
+            f"the light have the same degree: give {MIN_SHADING_DEGREE} or more, or leave it out",
+            stacklevel=3,
         )
-        warnings.warn(message, stacklevel=3)
     return given
 
 
-def _affordable_degree(smoothest: Smoothest, pixels: int) -> int:
-    """Find the degree of lighting that the smoothest surface needs, as far as memory permits."""
-    degree = max(DEGREE, smoothest.degree)
-    cpu = torch.device("cpu")
-    while degree > DEGREE and not has_memory(OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu):
-        degree -= 1
-    return degree
+def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
+    """Warn if a named lighting has too low a degree for its irradiance.
 
-
-def warn_of_low_degree(name: str, light: Tensor) -> None:
-    """Warn if a named lighting was loaded with too low a degree for its irradiance.
-
-    The irradiance is compared with that of the same lighting of degree 8. The
-    warning is given if the rms difference, over normals and channels, is more
-    than 5 % of the rms irradiance.
+    The irradiance is compared with that of the same lighting of degree 8.
     """
-    degree = math.isqrt(len(light)) - 1
     if degree >= REFERENCE_DEGREE // 2:
         return
     error = float(irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
     if error > MAX_IRRADIANCE_ERROR:
-        fault = f"has an irradiance that is off by {error:.0%} (rms over normals)"
-        message = f"light {name} of degree={degree} {fault}: give a higher degree"
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(
+            f"light {name} of degree={degree} has an irradiance that is off by {error:.0%} (rms "
+            "over normals): give a higher degree",
+            stacklevel=3,
+        )
 
 
 def with_needed_degree(
@@ -481,12 +448,9 @@ def with_needed_degree(
     """
     smoothest = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree
-    view_count = sum(len(cameras) for cameras in scene.cameras)
-    needed = _affordable_degree(smoothest, view_count * scene.settings.size**2)
+    needed = smoothest.affordable_degree(len(scene) * scene.views * scene.settings.size**2)
     if needed <= degree:
         return scene
-    # `lights_of_degree` loads the lighting of the scene with another degree. It is None if the
-    # user gave the degree or the coefficients.
     if scene.lights_of_degree is not None:
         # Lighting that was changed after `build_scene` cannot be loaded again with another
         # degree. Compare the lighting of the scene with what `build_scene` loaded.
@@ -498,7 +462,6 @@ def with_needed_degree(
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
     # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
     # degree would add nothing, and no warning is needed.
-    highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
-    if highest_band.any():
+    if scene.lights[:, degree**2 : (degree + 1) ** 2].any():
         smoothest.warn(f"degree={degree}", degree)
     return scene
