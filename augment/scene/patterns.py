@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
 from renderer.image import LUMINANCE, decode, to_unit
@@ -38,9 +38,8 @@ def stripes(
 
     Row 0 of the points is x, row 1 is y. `bright` is the bright fraction of a period.
     """
-    is_bright = (points + shift) % 1 < bright
     # Vertical stripes depend on x only, which is row 0.
-    return is_bright[0]
+    return ((points + shift) % 1 < bright)[0]
 
 
 def checkers(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
@@ -59,9 +58,8 @@ def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool
 
 def half(points: Float[Tensor, "2 ..."], shift: Tensor | float) -> Bool[Tensor, " ..."]:
     """Find the points to the right of the vertical line x = shift - 0.5."""
-    is_greater = points > shift - 0.5
     # The line is vertical, so only the coordinate x counts, which is row 0.
-    return is_greater[0]
+    return (points > shift - 0.5)[0]
 
 
 def solid(points: Float[Tensor, "2 ..."], shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
@@ -93,15 +91,6 @@ def turned(
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y])
 
 
-def two_colors(
-    weight: Float[Tensor, " ..."],
-    first: Float[Tensor, " ..."],
-    second: Float[Tensor, " ..."],
-) -> Float[Tensor, " ..."]:
-    """Blend two colors in each of N images, with a weight for each pixel."""
-    return second + weight * (first - second)
-
-
 def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
     """Convert hue and saturation to colors of full brightness (HSV with value 1).
 
@@ -128,35 +117,33 @@ def draw_patterns(
     """
     if points is None:
         points = pixel_centers(size)
-    position_draws = []
-    family_draws = []
-    color_draws = []
-    for _ in range(count):
-        position_draws.append(torch.rand(4, generator=draws))
-        family_draws.append(torch.randint(len(FAMILIES), (), generator=draws))
-        color_draws.append(torch.rand(5, generator=draws))
+    drawn = [
+        (
+            torch.rand(4, generator=draws),
+            torch.randint(len(FAMILIES), (), generator=draws),
+            torch.rand(5, generator=draws),
+        )
+        for _ in range(count)
+    ]
+    # Shapes (count, 4), (count,) and (count, 5).
+    positions, family_of_pattern, colors = map(torch.stack, zip(*drawn, strict=True))
     # Four numbers in [0, 1] of each pattern, each of shape (count, 1, 1): angle as a fraction of
     # a full turn, period as a fraction of its range, and shifts along x and y.
-    turn, relative_period, shift_x, shift_y = torch.stack(position_draws).T[:, :, None, None]
+    turn, relative_period, *shifts = positions.T[:, :, None, None]
     period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
     # Points of the pattern in units of its period, shape (2, count, size, size).
     rotated = turned(points / period, angle.cos(), angle.sin())
-    shifts = torch.stack([shift_x, shift_y])
-    # Kind of each pattern as an index in `FAMILIES`, shape (count,).
-    family_of_pattern = torch.stack(family_draws)
+    shift = torch.stack(shifts)
     # Weight of the first color at each pixel, shape (count, 1, size, size).
     weight = torch.empty(count, 1, *points.shape[2:])
     for index, family in enumerate(FAMILIES):
-        patterns = torch.nonzero(family_of_pattern == index).squeeze(1)
-        weight[patterns, 0] = family(rotated[:, patterns], shifts[:, patterns]).float()
-    # Hue and saturation of the first color, hue and saturation of the second color, and
-    # brightness of the second color, shape (count, 5).
-    colors = torch.stack(color_draws)
+        rows = torch.nonzero(family_of_pattern == index).squeeze(1)
+        weight[rows, 0] = family(rotated[:, rows], shift[:, rows]).float()
+    # Hue and saturation of both colors, and the brightness of the second one.
     first = random_colors(colors[:, :2])
-    brightness = colors[:, 4:, None, None]
-    second = random_colors(colors[:, 2:4]) * brightness
-    return two_colors(weight, first, second)
+    second = random_colors(colors[:, 2:4]) * colors[:, 4:, None, None]
+    return second + weight * (first - second)
 
 
 def draw_photograph_patterns(
@@ -249,8 +236,7 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "
     pixel_to_cell = torch.cdist(pixels.expand(count, -1, -1), centers).argmin(2)
 
     hue, saturation, brightness = torch.rand(3, count * MAX_CELLS, generator=draws)
-    colors = random_colors(torch.stack([hue, saturation], dim=1))
-    colors = colors[:, :, 0, 0] * brightness[:, None]
+    colors = random_colors(torch.stack([hue, saturation], dim=1))[:, :, 0, 0] * brightness[:, None]
     colors = colors.view(count, MAX_CELLS, 3)
     # Color of each pixel, shape (count, size², 3).
     shown = colors.gather(1, pixel_to_cell[:, :, None].expand(-1, -1, 3))
@@ -298,8 +284,8 @@ def draw_projected(
 
 # Pictures of the projectors of pnb-lab. The object in the center of a picture spans about
 # [-0.3, 0.3]. A function draws each kind of pattern. It computes the weight of the first of two
-# colors at each pixel, in [0, 1], shape (1, H, W), or (3, H, W) for a weight of each channel. The
-# saved renders of the laboratory can be made again only if the order of the draws stays.
+# colors at each pixel, in [0, 1], or of each channel. The saved renders of the laboratory can be
+# made again only if the order of the draws stays.
 
 # Pixels per side of the picture.
 LAB_RESOLUTION = 512
@@ -316,90 +302,78 @@ LINE_LENGTH = 24
 LINE_SPACING = 1.2
 
 
-def _solid(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _solid(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Light the whole image in the first color."""
-    return solid(points)[None]
+    return solid(points)
 
 
-def _gradient(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _gradient(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw a linear ramp along x, whose value at the center of the image is 0.5."""
-    return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
+    return (points[0] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
-def _stripes(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _stripes(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw stripes along y with a random width and a random position."""
     scaled = points / rng.uniform(0.12, 0.5)
-    shift = rng.uniform()
-    bright_fraction = rng.uniform(0.3, 0.7)
-    return stripes(scaled, shift, bright_fraction).double()[None]
+    return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))
 
 
-def _checkers(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _checkers(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw a checkerboard with a random size and a random position."""
     scaled = points / rng.uniform(0.12, 0.5)
-    shift = torch.from_numpy(rng.uniform(size=2))
-    return checkers(scaled, shift[:, None, None]).double()[None]
+    return checkers(scaled, _pair(rng.uniform(size=2)))
 
 
-def _half(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _half(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Light the pixels on one side of a vertical line that crosses the object."""
-    line_x = rng.uniform(-0.12, 0.12)
     # `half` lights the points to the right of the line x = shift - 0.5.
-    return half(points, shift=0.5 + line_x).double()[None]
+    return half(points, shift=0.5 + rng.uniform(-0.12, 0.12))
 
 
-def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw discs at random places. All have one size and cover about half of the image."""
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
-    for center in torch.from_numpy(rng.uniform(-1, 1, (count, 2))):
-        squared_distance = (points - center[:, None, None]).square().sum(dim=0)
-        is_lit |= squared_distance < radius**2
-    return is_lit.double()[None]
+    for center in rng.uniform(-1, 1, (count, 2)):
+        is_lit |= (points - _pair(center)).square().sum(dim=0) < radius**2
+    return is_lit
 
 
-def _rings(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _rings(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw concentric rings of the same width around a random center."""
-    center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
-    radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
+    radius = (points - _pair(rng.uniform(-0.5, 0.5, 2))).norm(dim=0, keepdim=True)
     scaled = radius / rng.uniform(0.12, 0.4)
-    shift = rng.uniform()
-    bright_fraction = rng.uniform(0.3, 0.7)
-    return stripes(scaled, shift, bright_fraction).double()[None]
+    return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))
 
 
-def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw the light that falls through the panes of a window into a dark room."""
-    # Each of these three tensors has one value for x and one for y, shape (2, 1, 1).
-    pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
-    pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
-    center = torch.from_numpy(rng.uniform(-0.15, 0.15, 2))[:, None, None]
+    pane_counts = _pair(rng.integers(2, 5, 2))
+    pane_size = _pair(rng.uniform(0.15, 0.4, 2))
+    center = _pair(rng.uniform(-0.15, 0.15, 2))
     # The position (0, 0) is a corner of the window. A pane has the size 1.
     positions = (points - center) / pane_size + pane_counts / 2
     is_in_window = (positions > 0) & (positions < pane_counts)
-    distance_from_middle = (positions % 1 - 0.5).abs()
-    is_in_pane = distance_from_middle < rng.uniform(0.3, 0.45)
-    return (is_in_window & is_in_pane).all(dim=0).double()[None]
+    is_in_pane = (positions % 1 - 0.5).abs() < rng.uniform(0.3, 0.45)
+    return (is_in_window & is_in_pane).all(dim=0)
 
 
-def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw the shadows of leaves: random ellipses that cover about half of the image."""
     half_length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
     leaf_area = math.pi * half_length**2 / LEAF_RATIO
     for _ in range(round(TOTAL_AREA / leaf_area)):
         angle = rng.uniform(0, math.pi)
-        center = torch.from_numpy(rng.uniform(-1, 1, 2))
-        offset = points - center[:, None, None]
-        # `along` is the coordinate along the long axis of the leaf, `across` along
-        # its short axis.
+        offset = points - _pair(rng.uniform(-1, 1, 2))
+        # Coordinates along the long axis of the leaf and along its short axis.
         along, across = turned(offset, math.cos(angle), -math.sin(angle))
         is_lit &= (along / half_length) ** 2 + (across / half_length * LEAF_RATIO) ** 2 > 1
-    return is_lit.double()[None]
+    return is_lit
 
 
-def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "1 H W"]:
+def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw bright lines of random capital letters on a dark background."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -424,6 +398,11 @@ def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[T
     return _interpolate(grid, points, order=3).clamp(0, 1)
 
 
+def _pair(values: np.ndarray) -> Shaped[Tensor, "2 1 1"]:
+    """Convert values for x and y to a tensor that fits coordinates of points."""
+    return torch.from_numpy(values)[:, None, None]
+
+
 def _interpolate(
     image: Float[np.ndarray, "H W C"], points: Float[Tensor, "2 _ _"], order: int
 ) -> Float[Tensor, "C _ _"]:
@@ -438,9 +417,10 @@ def _interpolate(
     # `flip` swaps (x, y) to (y, x). The interval [-1, 1] becomes [-0.5, size - 0.5],
     # so that whole numbers are centers of pixels.
     rows_and_columns = (points.flip(0).numpy() + 1) / 2 * height_and_width - 0.5
-    channels = []
-    for channel in np.moveaxis(image, -1, 0):
-        channels.append(map_coordinates(channel, rows_and_columns, order=order, mode="reflect"))
+    channels = [
+        map_coordinates(channel, rows_and_columns, order=order, mode="reflect")
+        for channel in np.moveaxis(image, -1, 0)
+    ]
     return torch.from_numpy(np.stack(channels))
 
 
@@ -473,25 +453,21 @@ def draw_lab_pattern(
 
     The image and the slides are linear RGB. "slides" chooses one of the slides.
     """
-    first_color = torch.from_numpy(draw_lab_color(rng))[:, None, None]
-    second_color = torch.from_numpy(draw_lab_color(rng))[:, None, None]
+    first = torch.from_numpy(draw_lab_color(rng))[:, None, None]
+    second = torch.from_numpy(draw_lab_color(rng))[:, None, None]
     # The brightness is drawn even if it is not used, so that all patterns take the same
     # number of random draws.
     second_brightness = rng.uniform()
-    if name not in TWO_COLORED:
-        second_brightness = 0.0
-    second_color = second_color * second_brightness
+    second = second * (second_brightness if name in TWO_COLORED else 0.0)
     angle = rng.uniform(0, 2 * math.pi)
     centers = pixel_centers(LAB_RESOLUTION)[:, 0].double()
     points = turned(centers, math.cos(angle), -math.sin(angle))
     if name == "slides":
         picture = slides[int(rng.integers(len(slides)))]
         scaled = points * rng.uniform(0.3, 1)
-        shift = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
-        image = _interpolate(picture, scaled + shift[:, None, None], order=1)
+        image = _interpolate(picture, scaled + _pair(rng.uniform(-0.5, 0.5, 2)), order=1)
     else:
-        weight = LAB_PATTERNS[name](points, rng)
-        image = two_colors(weight, first_color, second_color).expand(3, -1, -1)
+        image = second + LAB_PATTERNS[name](points, rng) * (first - second)
     return image.permute(1, 2, 0).contiguous().float().numpy()
 
 

@@ -1,7 +1,7 @@
 """Random variation of a scene: objects, cameras, lighting, backgrounds and camera effects."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
@@ -9,16 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.augmentation_settings import (
-    CameraEffectSettings,
-    SpecularLayerSettings,
-    VariationSettings,
-)
+from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.progress import progress
-from augment.scene.camera_effects import draw_camera_effects, draw_image_files
+from augment.scene import patterns
 from augment.scene.objects import (
     Example,
     SceneObject,
@@ -26,16 +22,17 @@ from augment.scene.objects import (
     resample_instance,
     rotated,
 )
-from augment.scene.patterns import pixel_centers, random_colors
 from augment.scene.scene import Scene
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
+from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.files import directional, load_light
 from renderer.light.harmonics import degree_of
 from renderer.operators.rays import Rays
+from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.vectors import rotation_matrices
 
@@ -47,6 +44,13 @@ WALL_DISTANCES = (1.8, 8.0)
 # Largest difference in degrees between the direction of a random directional light and that of the
 # camera, in polar angle and in azimuth.
 MAX_LIGHT_ANGLE = 70.0
+# A Gaussian blur averages each pixel with this number of neighbors on each side.
+BLUR_RADIUS = 3
+# This standard deviation of a Gaussian blur, in pixels, replaces 0, by which one cannot divide. It
+# is so small that the blur changes nothing.
+MIN_BLUR = 1e-3
+# Probability that a random projected pattern shows a photograph, if there are photographs.
+PHOTOGRAPH_PROBABILITY = 0.5
 
 
 def vary(
@@ -66,132 +70,235 @@ def vary(
             )
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
-        scene = _vary_geometry(scene, settings, draws, once, is_on_table)
+        scene = _Variation(scene, settings, draws, is_on_table).change_geometry(once)
     if settings == VariationSettings():
         return scene
-    return _vary_lighting(scene, settings, draws, is_on_table)
+    return _Variation(scene, settings, draws, is_on_table).change_lighting()
 
 
-# Objects, cameras and backgrounds.
+@dataclass(frozen=True)
+class _Variation:
+    """Random changes of the E examples of a scene.
 
+    The background of the examples in the mask `is_on_table` becomes a table and a wall.
+    """
 
-def _vary_geometry(
-    scene: Scene,
-    settings: VariationSettings,
-    draws: torch.Generator,
-    once: bool,
-    is_on_table: Bool[Tensor, " E"],
-) -> Scene:
-    """Return a copy of a scene with random cameras, backgrounds and objects."""
-    examples = _draw_cameras(scene, settings, draws, is_on_table)
-    # Arguments of `Scene` that differ in the copy.
-    changed: dict[str, Any] = {}
-    if settings.backgrounds is not None:
-        folder = Path(settings.backgrounds)
-        size = scene.settings.size
-        changed["backgrounds"] = draw_image_files(folder, "backgrounds", len(scene), size, draws)
-        examples = _number_backgrounds(examples)
-    if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
-        # Examples of the same object and the same cameras get the same random object. They
-        # differ in their backgrounds only.
-        pairs = [(example.object, example.cameras) for example in scene.examples]
-        different_pairs = dict.fromkeys(pairs)
-        pair_to_new_object = {pair: index for index, pair in enumerate(different_pairs)}
-        objects = [scene.objects[object_index] for object_index, _ in different_pairs]
-        changed["objects"] = _draw_objects(objects, settings, draws)
-        examples = [
-            replace(example, object=pair_to_new_object[pair])
-            for example, pair in zip(examples, pairs, strict=True)
+    scene: Scene
+    settings: VariationSettings
+    draws: torch.Generator
+    is_on_table: Bool[Tensor, " E"]
+
+    def change_geometry(self, once: bool) -> Scene:
+        """Return a copy of the scene with random cameras, backgrounds and objects."""
+        scene = self.scene
+        settings = self.settings
+        examples = self._draw_cameras()
+        # Arguments of `Scene` that differ in the copy.
+        changed: dict[str, Any] = {}
+        if settings.backgrounds is not None:
+            changed["backgrounds"] = _draw_image_files(
+                settings.backgrounds, "backgrounds", len(scene), scene.settings.size, self.draws
+            )
+            examples = _number_backgrounds(examples)
+        if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
+            # Examples of the same object and the same cameras get the same random object. They
+            # differ in their backgrounds only.
+            pairs = [(example.object, example.cameras) for example in scene.examples]
+            different_pairs = dict.fromkeys(pairs)
+            pair_to_new_object = {pair: index for index, pair in enumerate(different_pairs)}
+            objects = [scene.objects[object_index] for object_index, _ in different_pairs]
+            changed["objects"] = self._draw_objects(objects)
+            examples = [
+                replace(example, object=pair_to_new_object[pair])
+                for example, pair in zip(examples, pairs, strict=True)
+            ]
+        # Direct rendering of a view in one lighting is faster than the construction of its transfer
+        # operator, except if direct rendering would trace rays.
+        needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
+        one_light = once and settings.moves and not needs_rays
+        return scene.changed(examples=examples, one_light=one_light, **changed)
+
+    def _draw_cameras(self) -> list[Example]:
+        """Return copies of the examples with randomly changed cameras.
+
+        All cameras of one example get the same changes.
+        """
+        settings = self.settings
+        count = len(self.scene)
+        shifts = self._draw_pairs(settings.shift)
+        scales = self._draw_log_uniform(settings.scale)
+        angles = self._draw_pairs(settings.azimuth)
+        fovs = [0.0] * count
+        if any(settings.fov):
+            low, high = settings.fov
+            fractions = torch.rand(count, generator=self.draws, dtype=torch.float64)
+            fovs = (low + (high - low) * fractions).tolist()
+        changes = zip(shifts, scales, angles, fovs, self.is_on_table.tolist(), strict=True)
+        return [
+            replace(example, cameras=tuple(_move(camera, *change) for camera in example.cameras))
+            for example, change in zip(self.scene.examples, changes, strict=True)
         ]
-    # Direct rendering of a view in one lighting is faster than the construction of its transfer
-    # operator, except if direct rendering would trace rays.
-    needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
-    one_light = once and settings.moves and not needs_rays
-    return scene.changed(examples=examples, one_light=one_light, **changed)
 
+    def _draw_objects(self, objects: list[SceneObject]) -> list[SceneObject]:
+        """Return copies of objects with a random shape, rotation and gloss.
 
-def _draw_cameras(
-    scene: Scene,
-    settings: VariationSettings,
-    draws: torch.Generator,
-    is_on_table: Bool[Tensor, " E"],
-) -> list[Example]:
-    """Return copies of the examples of a scene with randomly changed cameras.
+        A random shape is possible for generated solids only: another orange, for example.
+        """
+        settings = self.settings
+        count = len(objects)
+        if settings.instances:
+            seeds = torch.randint(2**31, (count,), generator=self.draws).tolist()
+            pairs = progress(zip(objects, seeds, strict=True), "new instances", count)
+            objects = [resample_instance(item, seed) for item, seed in pairs]
+        if settings.rotation:
+            axes = torch.randn(count, 3, generator=self.draws, dtype=torch.float64)
+            angles = torch.rand(count, 1, generator=self.draws, dtype=torch.float64)
+            # A rotation vector points along the axis, and its length is the angle in degrees.
+            rotation_vectors = settings.rotation * angles * axes / axes.norm(dim=1, keepdim=True)
+            objects = list(map(rotated, objects, rotation_matrices(rotation_vectors).numpy()))
+        if any(settings.gloss.specular_factor):
+            gloss = settings.gloss
+            ranges = torch.tensor([gloss.roughness, gloss.specular_factor], dtype=torch.float64)
+            fractions = torch.rand(count, 2, generator=self.draws, dtype=torch.float64)
+            values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions).tolist()
+            objects = [
+                add_specular_layer(item, Gloss(roughness, specular_factor=specular_factor))
+                for item, (roughness, specular_factor) in zip(objects, values, strict=True)
+            ]
+        return objects
 
-    The image is shifted and zoomed, and the camera turns around the object. If the settings
-    have a range of fields of view, the camera also gets one of them. All cameras of one example
-    get the same changes.
-    """
-    count = len(scene)
-    shifts = _draw_pairs(settings.shift, count, draws)
-    scales = _draw_log_uniform(settings.scale, count, draws)
-    angles = _draw_pairs(settings.azimuth, count, draws)
-    fovs = [0.0] * count
-    if any(settings.fov):
-        low, high = settings.fov
-        fractions = torch.rand(count, generator=draws, dtype=torch.float64)
-        fovs = (low + (high - low) * fractions).tolist()
-    examples = []
-    for index, example in enumerate(scene.examples):
-        cameras = []
-        for camera in example.cameras:
-            moved = _move_camera(camera, shifts[index], scales[index], angles[index])
-            if is_on_table[index]:
-                moved = _raise_above_table(moved)
-            if fovs[index]:
-                moved = _to_perspective(moved, fovs[index])
-            cameras.append(moved)
-        examples.append(replace(example, cameras=tuple(cameras)))
-    return examples
+    def change_lighting(self) -> Scene:
+        """Return a copy of the scene with random lighting and random effects of the camera."""
+        scene = self.scene
+        settings = self.settings
+        exposures = self._draw_log_uniform(settings.exposure)
+        examples = [
+            replace(example, exposure=example.exposure * factor)
+            for example, factor in zip(scene.examples, exposures, strict=True)
+        ]
+        environment, directions = self._draw_lights()
+        # Projector and lamps stay the same.
+        local = scene.lights[:, environment.shape[1] :]
+        albedo = None
+        if settings.lit_background or settings.tables or settings.background_saturation:
+            albedo = self._draw_background_albedo()
+            if settings.tables:
+                # The light from below is what the table reflects, with the albedo of the image.
+                rows = self.is_on_table
+                mean_albedo = albedo[rows].mean((2, 3))
+                environment = environment.clone()
+                environment[rows] = above_table(environment[rows], directions[rows], mean_albedo)
+        lights = torch.cat([_with_directional(environment, directions), local], dim=1)
+        # Arguments of `Scene` that differ in the copy.
+        changed: dict[str, Any] = {"lights": lights}
+        # Point of a projected pattern that each pixel shows. None if the pattern fills the image.
+        pattern_points = None
+        if albedo is not None:
+            lit = replace(self, scene=scene.changed(examples=examples, lights=lights))
+            changed["backgrounds"], pattern_points = lit._light_backgrounds(
+                albedo, environment, directions
+            )
+            # Each example now has a background of its own.
+            examples = _number_backgrounds(examples)
+        if settings.camera != CameraEffectSettings():
+            device = scene.lights.device
+            changed["camera_effects"] = draw_camera_effects(
+                settings.camera, len(scene), scene.settings, self.draws, device, pattern_points
+            )
+        return scene.changed(examples=examples, **changed)
 
+    def _draw_lights(self) -> tuple[Float[Tensor, "E K 3"], Float[Tensor, "E 3"]]:
+        """Draw an environment, and the unit vector towards a directional light, of each example.
 
-def _move_camera(
-    camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
-) -> Camera:
-    """Return a copy of a camera that is zoomed, shifted and turned around the object.
+        Zero stands for no directional light. An example with one has a dimmed environment. The
+        directions differ from that of the camera by at most `MAX_LIGHT_ANGLE` in polar angle and
+        in azimuth.
+        """
+        scene = self.scene
+        settings = self.settings
+        count = len(scene)
+        harmonics = harmonics_of(scene.basis)
+        environment = scene.lights[:, : harmonics.size]
+        if settings.environments:
+            chosen = torch.randint(len(settings.environments), (count,), generator=self.draws)
+            loaded = [load_light(light, harmonics.degree) for light in settings.environments]
+            environment = torch.stack(loaded)[chosen].to(scene.lights)
+        if not settings.directional_fraction:
+            return environment, torch.zeros(count, 3, dtype=torch.float64)
+        low, high = settings.fill_light
+        fill = low + (high - low) * torch.rand(count, 1, 1, generator=self.draws)
+        is_chosen = torch.rand(count, 1, 1, generator=self.draws) < settings.directional_fraction
+        to_lights = []
+        for example, turn in zip(scene.examples, self._draw_pairs(MAX_LIGHT_ANGLE), strict=True):
+            # The third axis of a camera points from the origin to the camera.
+            to_lights.append(_turn(example.cameras[0], *turn).axes()[2])
+        directions = torch.from_numpy(np.stack(to_lights))
+        # A table blocks light from below, so such directions are mirrored to above.
+        grounds = [scene.objects[example.object].ground for example in scene.examples]
+        has_table = self.is_on_table | torch.tensor([ground is not None for ground in grounds])
+        directions[has_table, 2] = directions[has_table, 2].abs()
+        dimmed = fill.to(environment) * environment
+        environment = torch.where(is_chosen.to(environment.device), dimmed, environment)
+        return environment, directions * is_chosen[:, 0]
 
-    The shift is that of the object to the right and up, as fractions of the image width. `scale`
-    enlarges the object. Angles are changes of polar angle and azimuth in degrees.
-    """
-    width = camera.width / scale
-    right, up = shift
-    polar, azimuth = angles
-    turned = _turn_camera(camera, polar, azimuth)
-    return replace(
-        turned,
-        width=width,
-        right=camera.right + right * width,
-        up=camera.up + up * width,
-    )
+    def _draw_background_albedo(self) -> Float[Tensor, "E _ size size"]:
+        """Convert the background of each example to an albedo, and multiply it by a random color.
 
+        The values of a background are taken as its albedo. The result is linear.
+        """
+        scene = self.scene
+        albedo = decode(scene.backgrounds, scene.settings.encoding)
+        albedo = albedo[[example.background for example in scene.examples]]
+        if self.settings.background_saturation:
+            fractions = torch.rand(len(scene), 2, generator=self.draws)
+            saturations = fractions * torch.tensor([1, self.settings.background_saturation])
+            albedo = albedo * patterns.random_colors(saturations).to(albedo)
+        return albedo
 
-def _turn_camera(camera: Camera, polar: float, azimuth: float) -> Camera:
-    """Return a copy of a camera that is turned around the object."""
-    return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
+    def _light_backgrounds(
+        self,
+        albedo: Float[Tensor, "E _ size size"],
+        environment: Float[Tensor, "E K 3"],
+        directions: Float[Tensor, "E 3"],
+    ) -> tuple[Tensor, Tensor | None]:
+        """Compute the background images of all examples from their albedo and their lighting.
 
+        Return the images, and the x and y of the point of a projected pattern that each pixel
+        shows, shape (2, E, size, size), or None without tables.
+        """
+        scene = self.scene
+        # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
+        background_irradiance = albedo.new_ones(3, 1, 1)
+        if self.settings.lit_background:
+            background_irradiance = _facing_irradiance(scene)
+        linear = albedo * background_irradiance
+        pattern_points = None
+        if self.settings.tables:
+            # Without a table, the pattern fills the image.
+            pattern_points = patterns.pixel_centers(scene.settings.size).repeat(1, len(scene), 1, 1)
+            distances = self._draw_log_uniform(WALL_DISTANCES)
+            indices = torch.nonzero(self.is_on_table).squeeze(1).tolist()
+            # Build the ray tracer of an object once for all successive examples that show it.
+            groups = groupby(progress(indices, "tables"), lambda row: scene.examples[row].object)
+            for object_index, rows in groups:
+                rays = Rays(scene.objects[object_index].mesh)
+                for row in rows:
+                    arriving, pattern_points[:, row] = _light_room(
+                        scene, row, rays, distances[row], environment[row], directions[row]
+                    )
+                    linear[row] = albedo[row] * arriving.to(albedo)
+        return encode(clamp(linear), scene.settings.encoding), pattern_points
 
-def _raise_above_table(camera: Camera) -> Camera:
-    """Return a copy of a camera whose elevation above a table is within limits.
+    def _draw_log_uniform(self, limits: Sequence[float]) -> list[float]:
+        """Draw a number of each example, whose logarithm is uniformly distributed."""
+        low, high = (math.log(limit) for limit in limits)
+        fractions = torch.rand(len(self.scene), generator=self.draws, dtype=torch.float64)
+        return (low + (high - low) * fractions).exp().tolist()
 
-    A camera below the horizon is mirrored to the same elevation above. The elevation is then
-    limited to the range from `MIN_ELEVATION` to `MAX_ELEVATION`.
-    """
-    # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.
-    elevation = abs(math.degrees(math.asin(math.cos(math.radians(camera.polar)))))
-    elevation = min(max(elevation, MIN_ELEVATION), MAX_ELEVATION)
-    return replace(camera, polar=90 - elevation)
-
-
-def _to_perspective(camera: Camera, fov: float) -> Camera:
-    """Return a perspective copy of a camera with a given field of view.
-
-    The copy is at such a distance that it sees the same width at the origin as before.
-    """
-    distance = camera.width / 2 / math.tan(math.radians(fov) / 2)
-    if isinstance(camera, PerspectiveCamera):
-        return replace(camera, distance=distance)
-    fields_of_camera = {item.name: getattr(camera, item.name) for item in fields(Camera)}
-    return PerspectiveCamera(**fields_of_camera, distance=distance)
+    def _draw_pairs(self, limit: float) -> list[list[float]]:
+        """Draw a pair of numbers of each example uniformly from [-limit, limit]."""
+        fractions = torch.rand(len(self.scene), 2, generator=self.draws, dtype=torch.float64)
+        return (limit * (2 * fractions - 1)).tolist()
 
 
 def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
@@ -199,238 +306,56 @@ def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
     return [replace(example, background=index) for index, example in enumerate(examples)]
 
 
-def _draw_objects(
-    objects: Sequence[SceneObject], settings: VariationSettings, draws: torch.Generator
-) -> list[SceneObject]:
-    """Return copies of objects with a random shape, rotation and gloss.
+def _turn(camera: Camera, polar: float, azimuth: float) -> Camera:
+    """Return a copy of a camera that is turned around the object."""
+    return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
-    A random shape is possible for generated solids only: another orange, for example.
+
+def _move(
+    camera: Camera,
+    shift: Sequence[float],
+    scale: float,
+    turn: Sequence[float],
+    fov: float,
+    is_above_table: bool,
+) -> Camera:
+    """Return a copy of a camera that is zoomed, shifted and turned around the object.
+
+    The shift is that of the object to the right and up, as fractions of the image width. `scale`
+    enlarges the object. `turn` has the changes of polar angle and azimuth in degrees. A camera
+    gets the field of view, at the distance from which it sees the same width at the origin, unless
+    this is 0. Above a table, a camera below the horizon is mirrored, and its elevation is limited.
     """
-    varied = list(objects)
-    if settings.instances:
-        seeds = torch.randint(2**31, (len(varied),), generator=draws).tolist()
-        pairs = progress(zip(varied, seeds, strict=True), "new instances", len(varied))
-        varied = [resample_instance(item, seed) for item, seed in pairs]
-    if settings.rotation:
-        rotations = _draw_rotations(settings.rotation, len(varied), draws)
-        varied = [rotated(item, rotation) for item, rotation in zip(varied, rotations, strict=True)]
-    if any(settings.gloss.specular_factor):
-        glosses = _draw_glosses(settings.gloss, len(varied), draws)
-        varied = [
-            add_specular_layer(item, gloss) for item, gloss in zip(varied, glosses, strict=True)
-        ]
-    return varied
+    width = camera.width / scale
+    right = camera.right + shift[0] * width
+    up = camera.up + shift[1] * width
+    moved = replace(_turn(camera, *turn), width=width, right=right, up=up)
+    if is_above_table:
+        # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.
+        elevation = abs(math.degrees(math.asin(math.cos(math.radians(moved.polar)))))
+        moved = replace(moved, polar=90 - min(max(elevation, MIN_ELEVATION), MAX_ELEVATION))
+    if fov:
+        distance = width / 2 / math.tan(math.radians(fov) / 2)
+        if isinstance(moved, PerspectiveCamera):
+            return replace(moved, distance=distance)
+        fields_of_camera = {item.name: getattr(moved, item.name) for item in fields(Camera)}
+        return PerspectiveCamera(**fields_of_camera, distance=distance)
+    return moved
 
 
-def _draw_rotations(
-    max_angle: float, count: int, draws: torch.Generator
-) -> Float[np.ndarray, "count 3 3"]:
-    """Draw rotations about random axes by random angles. The largest angle is in degrees."""
-    axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
-    angles = max_angle * torch.rand(count, 1, generator=draws, dtype=torch.float64)
-    # A rotation vector points along the axis, and its length is the angle.
-    rotation_vectors = angles * axes / axes.norm(dim=1, keepdim=True)
-    return rotation_matrices(rotation_vectors).numpy()
+def _with_directional(
+    environment: Float[Tensor, "E K 3"], directions: Float[Tensor, "E 3"]
+) -> Float[Tensor, "E K 3"]:
+    """Add white directional lights to environments, except where the direction is zero.
 
-
-def _draw_glosses(
-    settings: SpecularLayerSettings, count: int, draws: torch.Generator
-) -> list[Gloss]:
-    """Draw glosses with a uniformly distributed roughness and specular factor."""
-    # Row 0 is the roughness, row 1 the specular factor. Columns are the lowest and highest value.
-    ranges = torch.tensor([settings.roughness, settings.specular_factor], dtype=torch.float64)
-    fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
-    # Roughness and specular factor of each gloss, shape (count, 2).
-    values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions)
-    return [
-        Gloss(roughness, specular_factor=specular_factor)
-        for roughness, specular_factor in values.tolist()
-    ]
-
-
-@dataclass(frozen=True, eq=False)
-class _DrawnLights:
-    """The random lighting of E examples.
-
-    Attributes:
-        environment: RGB coefficients of the environment lighting in K harmonics.
-        directions: Unit vector from each object towards its directional light. Zero stands for no
-            directional light.
-        local: RGB coefficients of projector and lamps.
+    A surface that faces such a light has irradiance 1.
     """
-
-    environment: Float[Tensor, "E K 3"]
-    directions: Float[Tensor, "E 3"]
-    local: Float[Tensor, "E L 3"]
-
-    def coefficients(self) -> Float[Tensor, "E _ 3"]:
-        """Combine environment, directional light, projector and lamps of each example.
-
-        Directional lights are white, and a surface that faces them has irradiance 1. There are K
-        for the environment, then L for projector and lamps.
-        """
-        environment = self.environment
-        is_directional = self.directions.any(1)
-        if is_directional.any():
-            added = directional(self.directions, torch.ones(3), degree_of(environment[0]))
-            # Add the directional light only in the examples that have one.
-            mask = is_directional[:, None, None].to(environment.device)
-            environment = torch.where(mask, added.to(environment) + environment, environment)
-        return torch.cat([environment, self.local], dim=1)
-
-    def without_ground(
-        self, is_on_table: Bool[Tensor, " E"], albedo: Float[Tensor, "E C size size"]
-    ) -> "_DrawnLights":
-        """Return a copy in which the light from below is what a table reflects.
-
-        The table has the mean albedo of the image, which is linear.
-        """
-        environment = self.environment.clone()
-        environment[is_on_table] = above_table(
-            environment[is_on_table],
-            self.directions[is_on_table],
-            albedo[is_on_table].mean((2, 3)),
-        )
-        return replace(self, environment=environment)
-
-
-def _vary_lighting(
-    scene: Scene,
-    settings: VariationSettings,
-    draws: torch.Generator,
-    is_on_table: Bool[Tensor, " E"],
-) -> Scene:
-    """Return a copy of a scene with random lighting and random effects of the camera.
-
-    The background of some examples becomes a table and a wall.
-    """
-    exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
-    examples = [
-        replace(example, exposure=example.exposure * factor)
-        for example, factor in zip(scene.examples, exposures, strict=True)
-    ]
-    lights = _draw_lights(scene, settings, draws, is_on_table)
-    # Arguments of `Scene` that differ in the copy.
-    changed: dict[str, Any] = {}
-    # Point of a projected pattern that each pixel shows. None if the pattern fills the image.
-    pattern_points = None
-    if settings.lit_background or settings.tables or settings.background_saturation:
-        albedo = _draw_background_albedo(scene, settings, draws)
-        if settings.tables:
-            lights = lights.without_ground(is_on_table, albedo)
-        lit_scene = scene.changed(examples=examples, lights=lights.coefficients())
-        changed["backgrounds"], pattern_points = _light_backgrounds(
-            lit_scene, lights, albedo, settings, draws, is_on_table
-        )
-        # Each example now has a background of its own.
-        examples = _number_backgrounds(examples)
-    if settings.camera != CameraEffectSettings():
-        changed["camera_effects"] = draw_camera_effects(
-            settings.camera, len(scene), scene.settings, draws, scene.lights.device, pattern_points
-        )
-    return scene.changed(examples=examples, lights=lights.coefficients(), **changed)
-
-
-def _light_backgrounds(
-    scene: Scene,
-    lights: _DrawnLights,
-    albedo: Float[Tensor, "E _ size size"],
-    settings: VariationSettings,
-    draws: torch.Generator,
-    is_on_table: Bool[Tensor, " E"],
-) -> tuple[Tensor, Tensor | None]:
-    """Compute the background images of all examples from their albedo and the random lighting.
-
-    Return the images, and the x and y of the point of a projected pattern that each pixel shows,
-    shape (2, E, size, size), or None without tables.
-    """
-    # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
-    background_irradiance = albedo.new_ones(3, 1, 1)
-    if settings.lit_background:
-        background_irradiance = _facing_irradiance(scene)
-    linear = albedo * background_irradiance
-    pattern_points = None
-    if settings.tables:
-        wall_distances = _draw_log_uniform(WALL_DISTANCES, len(scene), draws)
-        table_irradiance, pattern_points = _light_rooms(scene, lights, wall_distances, is_on_table)
-        linear[is_on_table] = albedo[is_on_table] * table_irradiance.to(albedo)
-    return encode(clamp(linear), scene.settings.encoding), pattern_points
-
-
-def _draw_lights(
-    scene: Scene,
-    settings: VariationSettings,
-    draws: torch.Generator,
-    is_on_table: Bool[Tensor, " E"],
-) -> _DrawnLights:
-    """Draw a random environment and a random directional light for each example.
-
-    Projector and lamps stay the same. So does the environment if the settings name none.
-    """
-    harmonics = harmonics_of(scene.basis)
-    # Split the coefficients into those of the environment, and those of projector and lamps.
-    environment, local = scene.lights.tensor_split([harmonics.size], dim=1)
-    directions = torch.zeros(len(scene), 3, dtype=torch.float64)
-    if settings.environments:
-        chosen = torch.randint(len(settings.environments), (len(scene),), generator=draws)
-        loaded = [load_light(light, harmonics.degree) for light in settings.environments]
-        environment = torch.stack(loaded)[chosen].to(scene.lights)
-    lights = _DrawnLights(environment, directions, local)
-    if settings.directional_fraction > 0:
-        lights = _draw_directional(lights, scene, settings, draws, is_on_table)
-    return lights
-
-
-def _draw_directional(
-    lights: _DrawnLights,
-    scene: Scene,
-    settings: VariationSettings,
-    draws: torch.Generator,
-    is_on_table: Bool[Tensor, " E"],
-) -> _DrawnLights:
-    """Add a directional light to some examples, and dim their environment lighting.
-
-    The directions are random, but differ from the direction of the camera by at most
-    `MAX_LIGHT_ANGLE` in polar angle and in azimuth.
-    """
-    low, high = settings.fill_light
-    shape = (len(scene), 1, 1)
-    fill = low + (high - low) * torch.rand(shape, generator=draws)
-    is_chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
-    angles = _draw_pairs(MAX_LIGHT_ANGLE, len(scene), draws)
-    to_lights = []
-    for example, (polar, azimuth) in zip(scene.examples, angles, strict=True):
-        turned = _turn_camera(example.cameras[0], polar, azimuth)
-        # The third axis of a camera points from the origin to the camera.
-        to_lights.append(turned.axes()[2])
-    directions = torch.from_numpy(np.stack(to_lights))
-    # A table blocks light from below, so such directions are mirrored to above.
-    grounds = [scene.objects[example.object].ground for example in scene.examples]
-    has_table = is_on_table | torch.tensor([ground is not None for ground in grounds])
-    directions[has_table, 2] = directions[has_table, 2].abs()
-    environment = lights.environment
-    dimmed = fill.to(environment) * environment
-    return replace(
-        lights,
-        environment=torch.where(is_chosen.to(environment.device), dimmed, environment),
-        directions=directions * is_chosen[:, 0],
-    )
-
-
-def _draw_background_albedo(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator
-) -> Float[Tensor, "E _ size size"]:
-    """Convert the background of each example to an albedo, and multiply it by a random color.
-
-    The values of a background are taken as its albedo. The result is linear.
-    """
-    backgrounds = decode(scene.backgrounds, scene.settings.encoding)
-    albedo = backgrounds[[example.background for example in scene.examples]]
-    if settings.background_saturation:
-        fractions = torch.rand(len(scene), 2, generator=draws)
-        hue_and_saturation = fractions * torch.tensor([1, settings.background_saturation])
-        albedo = albedo * random_colors(hue_and_saturation).to(albedo)
-    return albedo
+    is_directional = directions.any(1)
+    if not is_directional.any():
+        return environment
+    added = directional(directions, torch.ones(3), degree_of(environment[0]))
+    mask = is_directional[:, None, None].to(environment.device)
+    return torch.where(mask, added.to(environment) + environment, environment)
 
 
 def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
@@ -443,66 +368,124 @@ def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
     normals = torch.from_numpy(np.stack(directions))
     exposures = torch.tensor([example.exposure for example in scene.examples])[:, None]
     harmonics = harmonics_of(scene.basis)
-    # RGB coefficients of the K harmonics that the irradiance depends on, shape (E, K, 3).
     coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
     facing = torch.einsum("ek,ekc->ec", harmonics.irradiance(normals), coefficients) * exposures
     return facing.to(scene.backgrounds)[:, :, None, None]
 
 
-def _light_rooms(
+def _light_room(
     scene: Scene,
-    lights: _DrawnLights,
-    wall_distances: Sequence[float],
-    is_on_table: Bool[Tensor, " E"],
-) -> tuple[Tensor, Tensor]:
-    """Light a table and a wall in some examples, and find where a projected pattern falls.
+    index: int,
+    rays: Rays,
+    wall_distance: float,
+    environment: Float[Tensor, "K 3"],
+    direction: Float[Tensor, " 3"],
+) -> tuple[Float[Tensor, "3 size size"], Float[Tensor, "2 size size"]]:
+    """Light a table and a wall in an example, and find where a projected pattern falls.
 
     The pattern falls on table, wall and object along the directional light of the example or, if it
-    has none, along the direction of the view. Distances are in world units. Return the irradiance
-    of table and wall in the N examples with a table, shape (N, 3, size, size), and the x and y of
-    the point of the pattern that each pixel of all E examples shows, shape (2, E, size, size).
+    has none, along the direction of the view. Return the irradiance of table and wall, and the x
+    and y of the point of the pattern that each pixel shows.
     """
-    room_examples = torch.nonzero(is_on_table).squeeze(1).tolist()
-    environments = lights.environment.cpu().double()
-    settings = scene.settings
-    irradiance_images = []
-    # Without a table, the pattern fills the image: each pixel shows the point at its center.
-    points = pixel_centers(settings.size).repeat(1, len(scene), 1, 1)
-    # Build the ray tracer of an object once for all successive examples that show this object.
-    groups = groupby(progress(room_examples, "tables"), lambda index: scene.examples[index].object)
-    for object_index, examples_of_object in groups:
-        item = scene.objects[object_index]
-        rays = Rays(item.mesh)
-        for index in examples_of_object:
-            example = scene.examples[index]
-            camera = example.cameras[0]
-            room = Room(rays, item.radius, item.lowest, wall_distances[index])
-            direction = lights.directions[index]
-            local = split_light(scene.basis, scene.lights[index].cpu().double()).local_lights
-            arriving = irradiance(room, camera, settings, environments[index], direction, local)
-            irradiance_images.append(example.exposure * arriving)
-            # A direction of zero stands for no directional light.
-            if not direction.any():
-                direction = torch.from_numpy(camera.axes()[2])
-            points[:, index] = project_along_light(
-                room, item.mesh, camera, settings, direction
-            ).float()
-    if not irradiance_images:
-        return torch.zeros(0, 3, settings.size, settings.size), points
-    return torch.stack(irradiance_images), points
+    example = scene.examples[index]
+    item = scene.objects[example.object]
+    camera = example.cameras[0]
+    room = Room(rays, item.radius, item.lowest, wall_distance)
+    local = split_light(scene.basis, scene.lights[index].cpu().double()).local_lights
+    sky = environment.cpu().double()
+    arriving = irradiance(room, camera, scene.settings, sky, direction, local)
+    # A direction of zero stands for no directional light.
+    if not direction.any():
+        direction = torch.from_numpy(camera.axes()[2])
+    points = project_along_light(room, item.mesh, camera, scene.settings, direction)
+    return example.exposure * arriving, points.float()
 
 
-# Random numbers.
+def draw_camera_effects(
+    settings: CameraEffectSettings,
+    count: int,
+    image: ImageSettings,
+    draws: torch.Generator,
+    device: torch.device | str = "cpu",
+    points: Float[Tensor, "2 count size size"] | None = None,
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Draw the effects of a camera and of a projector for the images of each example.
+
+    The linear light of an image is multiplied by a random pattern, as of a projector, and by a
+    random white balance. Then the image is blurred, and noise is added. The returned function takes
+    images of A examples, shape (A, V, 3, size, size), and their indices. `points` are x and y in
+    [-1, 1] of the point of the pattern that each pixel shows. None lets the pattern fill the image.
+    """
+    size = image.size
+    # Relative light of the projector at each pixel, shape (count, 3, size, size).
+    light = patterns.draw_patterns(count, size, draws, points)
+    if settings.slides is not None:
+        is_photograph = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY
+        if is_photograph.any():
+            photograph_count = int(is_photograph.sum())
+            files = _draw_image_files(settings.slides, "slides", photograph_count, size, draws)
+            shown = patterns.pixel_centers(size) if points is None else points[:, is_photograph]
+            light[is_photograph] = patterns.draw_photograph_patterns(
+                decode(files, "srgb"), shown, draws
+            )
+    low, high = settings.pattern_fill
+    # Fraction of the light of each example that does not come from the projector.
+    fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
+    # Some examples have no pattern.
+    has_pattern = torch.rand(count, 1, 1, 1, generator=draws) < settings.pattern_fraction
+    pattern_gains = torch.where(has_pattern, fill + (1 - fill) * light, 1.0)
+    # Change of the white balance of each channel, in stops. One stop is a factor of 2.
+    stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
+    deviations = (settings.blur * torch.rand(count, generator=draws)).to(device)
+    noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
+    noises = noise_deviations * torch.randn(count, 3, size, size, generator=draws)
+    noises = noises.to(device)
+    gains = (pattern_gains * 2**stops).to(device)
+
+    def apply_effects(
+        images: Float[Tensor, "A V 3 size size"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Apply the effects to images."""
+        gained = decode(images, image.encoding) * gains[examples, None]
+        blurred = _blur(gained, deviations[examples])
+        encoded = encode(clamp(blurred), image.encoding)
+        return clamp(encoded + noises[examples, None])
+
+    return apply_effects
 
 
-def _draw_log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
-    """Draw numbers whose logarithms are uniformly distributed."""
-    low, high = (math.log(limit) for limit in limits)
-    fractions = torch.rand(count, generator=draws, dtype=torch.float64)
-    return (low + (high - low) * fractions).exp().tolist()
+def _blur(
+    images: Float[Tensor, "A V 3 size size"], deviations: Float[Tensor, " A"]
+) -> Float[Tensor, "A V 3 size size"]:
+    """Blur the images of each example by a Gaussian of its own width.
+
+    The pixels at the border of an image are repeated beyond the border. Deviations are in pixels.
+    """
+    count = len(images)
+    size = images.shape[-1]
+    # A pixel is averaged over the N pixels with these offsets from it.
+    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
+    # Weight of each offset in each example, shape (A, N).
+    weights = torch.exp(-0.5 * (offsets / deviations.clamp(min=MIN_BLUR)[:, None]) ** 2)
+    weights = (weights / weights.sum(1, keepdim=True)).to(images)
+    # Position along a row or a column of the N pixels around each pixel, shape (size, N).
+    pixels = torch.arange(size, device=images.device)
+    neighbors = (pixels[:, None] + offsets).clamp(0, size - 1).expand(count, -1, -1)
+    # One matrix for each example. Its row i has the weights of all pixels in the average for
+    # pixel i, along one axis of the image. Shape (A, size, size).
+    matrices = images.new_zeros(count, size, size)
+    matrices.scatter_add_(2, neighbors, weights[:, None].expand(-1, size, -1))
+    # A Gaussian blur is separable: the first matrix blurs along columns, the second along rows.
+    return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)
 
 
-def _draw_pairs(limit: float, count: int, draws: torch.Generator) -> list[list[float]]:
-    """Draw pairs of numbers uniformly from [-limit, limit]."""
-    fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
-    return (limit * (2 * fractions - 1)).tolist()
+def _draw_image_files(
+    folder: str | Path, key: str, count: int, size: int, draws: torch.Generator
+) -> Float[Tensor, "count 3 size size"]:
+    """Read randomly chosen images of a folder, with replacement."""
+    files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not files:
+        raise InputError(f"{key}={folder} has no images: give a folder of .jpg or .png files")
+    chosen = torch.randint(len(files), (count,), generator=draws).tolist()
+    images = [read_image(files[index], size) for index in progress(chosen, f"reading {key}")]
+    return torch.stack(images)

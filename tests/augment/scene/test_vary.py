@@ -15,11 +15,10 @@ from torch import Tensor
 import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.random_streams import generator
-from augment.scene.camera_effects import draw_camera_effects
 from augment.scene.objects import Conditions
 from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.scene.scene import Scene
-from augment.scene.vary import vary
+from augment.scene.vary import draw_camera_effects, vary
 from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings, PropSettings
 from renderer.errors import InputError
 from renderer.image import decode, encode
