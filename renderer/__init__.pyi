@@ -5,7 +5,6 @@ from renderer.camera import orbit_cameras as orbit_cameras
 from renderer.errors import InputError as InputError
 from renderer.fit import FittedScene as FittedScene
 from renderer.fit import fit_scene as fit_scene
-from renderer.io.cameras import load_cameras as load_cameras
 from renderer.io.export import export_mesh as export_mesh
 from renderer.io.meshes import load_mesh as load_mesh
 from renderer.light import harmonics as harmonics
@@ -20,6 +19,7 @@ from renderer.mesh import subdivide as subdivide
 from renderer.operators.apply import TransferOperator as TransferOperator
 from renderer.operators.stack import TransferOperators as TransferOperators
 from renderer.pinhole import PinholeCamera as PinholeCamera
+from renderer.pinhole import load_cameras as load_cameras
 from renderer.rendering import light_sphere as light_sphere
 from renderer.rendering import precompute_transfer as precompute_transfer
 from renderer.rendering import render as render

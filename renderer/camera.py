@@ -35,6 +35,13 @@ MAX_FOV = 172.0
 # Smallest depth that a perspective camera can show, divided by the distance between camera and
 # origin. A mesh with a smaller depth raises an error.
 MIN_NEAR_RATIO = 0.01
+# Smallest and largest values of fields that are lengths, ratios or angles.
+_POSITIVE = (1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+_TURNS = (-MAX_TURN, MAX_TURN)
+_RANGES = {
+    **dict.fromkeys(("width", "clip_range", "distance", "pixel_aspect"), _POSITIVE),
+    **dict.fromkeys(("polar", "roll"), _TURNS),
+}
 
 
 @dataclass(frozen=True)
@@ -75,8 +82,12 @@ class Camera(ABC):
     clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
-    # Principal point relative to the image center, and aspect ratio of the pixels. Only a
-    # `PinholeCamera` has other values.
+    # Roll, point about which attacks turn the camera, principal point relative to the image
+    # center, and aspect ratio of the pixels. Only a `PinholeCamera` has other values.
+    roll: ClassVar[float] = 0.0
+    center_x: ClassVar[float] = 0.0
+    center_y: ClassVar[float] = 0.0
+    center_z: ClassVar[float] = 0.0
     principal_right: ClassVar[float] = 0.0
     principal_up: ClassVar[float] = 0.0
     pixel_aspect: ClassVar[float] = 1.0
@@ -86,11 +97,8 @@ class Camera(ABC):
         for name, value in vars(self).items():
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
-        require_range("width", self.width, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
-        require_range("clip_range", self.clip_range, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
-        require_range("polar", self.polar, -MAX_TURN, MAX_TURN)
-        for name in ("azimuth", "right", "up"):
-            require_range(name, getattr(self, name), -MAX_MAGNITUDE, MAX_MAGNITUDE)
+            limits = _RANGES.get(name, (-MAX_MAGNITUDE, MAX_MAGNITUDE))
+            require_range(name, getattr(self, name), *limits)
 
     @property
     def near(self) -> float:
@@ -110,10 +118,9 @@ class Camera(ABC):
 
     def fixed(self) -> Self:
         """Return a camera whose fields are numbers instead of tensors."""
-        numbers: dict[str, Any] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                numbers[name] = value.item()
+        numbers: dict[str, Any] = {
+            name: value.item() for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
         return replace(self, **numbers) if numbers else self
 
     def moved(self, polar: Tensor, azimuth: Tensor, log_distance: Tensor) -> Self:
@@ -187,10 +194,11 @@ class Camera(ABC):
         # The sum equals sin_polar, except for rounding errors. Using sin_polar instead would change
         # the last bits of images.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
-        right = [-sin_azimuth, cos_azimuth, 0.0]
-        up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
-        back = [back_x, back_y, cos_polar]
-        return np.array([right, up, back])
+        right = np.array([-sin_azimuth, cos_azimuth, 0.0])
+        up = np.array([-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z])
+        cos_roll, sin_roll = math.cos(math.radians(self.roll)), math.sin(math.radians(self.roll))
+        rolled = [cos_roll * right + sin_roll * up, cos_roll * up - sin_roll * right]
+        return np.array([*rolled, [back_x, back_y, cos_polar]])
 
     def pose(self) -> np.ndarray:
         """Return the matrix that maps camera coordinates to world coordinates.
@@ -200,16 +208,13 @@ class Camera(ABC):
             columns, float64, shape (4, 4). The last row is (0, 0, 0, 1).
         """
         axes = self.axes()
-        position = np.array([-self.right, -self.up, self.distance])
-        columns = np.column_stack([axes.T, position @ axes])
+        position = np.array([-self.right, -self.up, self.distance]) @ axes
+        columns = np.column_stack([axes.T, position - self._from_pivot(np.zeros(3))])
         return np.vstack([columns, [0, 0, 0, 1]])
 
     def _from_pivot(self, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
-        """Subtract the point about which attacks turn the camera from other points.
-
-        This point is the origin, except for a `PinholeCamera`.
-        """
-        return points
+        """Subtract the point about which attacks turn the camera from other points."""
+        return points - np.array([self.center_x, self.center_y, self.center_z])
 
     def eye(self) -> np.ndarray:
         """Return the position of the camera in homogeneous world coordinates.
@@ -277,28 +282,30 @@ class Camera(ABC):
         right, up, back = self._camera_coordinates(points)
         w, nearness = self._w_and_nearness(back)
         scale = 2 / self.width
-        x = (right + self.right) * scale
-        y = (up + self.up) * scale
+        x = (right + self.right) * scale + self.principal_right * w
+        y = (up + self.up) * scale * self.pixel_aspect + self.principal_up * w
         return torch.stack([x, y, w]).T, nearness
 
     def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
         """Convert points from world axes to the axes right, up and back of the camera.
 
         The result is differentiable with respect to the points, and with respect
-        to angles of the camera that are tensors. The coordinates are measured from the origin.
+        to fields of the camera that are tensors. The coordinates are measured from the pivot.
         """
-        polar = tensor_like(in_radians(self.polar), points)
-        azimuth = tensor_like(in_radians(self.azimuth), points)
-        sin_polar = polar.sin()
-        cos_polar = polar.cos()
-        sin_azimuth = azimuth.sin()
-        cos_azimuth = azimuth.cos()
-        axes = (
-            [-sin_azimuth, cos_azimuth, 0 * sin_azimuth],
-            [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, sin_polar],
-            [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar],
+        polar, azimuth, roll = (
+            tensor_like(in_radians(angle), points)
+            for angle in (self.polar, self.azimuth, self.roll)
         )
-        return torch.stack([torch.stack(axis) for axis in axes]) @ points.T
+        center = [self.center_x, self.center_y, self.center_z]
+        pivot = torch.stack([tensor_like(coordinate, points) for coordinate in center])
+        axes = (
+            [-azimuth.sin(), azimuth.cos(), 0 * azimuth],
+            [-polar.cos() * azimuth.cos(), -polar.cos() * azimuth.sin(), polar.sin()],
+            [polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()],
+        )
+        right, up, back = torch.stack([torch.stack(axis) for axis in axes]) @ (points - pivot).T
+        cosine, sine = roll.cos(), roll.sin()
+        return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
 
     @abstractmethod
     def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
@@ -375,11 +382,6 @@ class PerspectiveCamera(Camera):
     # The distance is a field of perspective cameras only.
     distance: float = field(kw_only=True)  # type: ignore[misc]
 
-    def __post_init__(self) -> None:
-        """Convert each field to a number or to a tensor of shape (), and check its range."""
-        super().__post_init__()
-        require_range("distance", self.distance, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
-
     def eye(self) -> np.ndarray:
         """Return the position of the camera as (x, y, z, 1), float64, shape (4,)."""
         return self.pose()[:, 3]
@@ -398,16 +400,16 @@ class PerspectiveCamera(Camera):
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points with perspective, with depths from -1 at `near` to 1 at `far`."""
+        """Project points with perspective, with depths from -1 (near plane) to 1 (far plane)."""
         depths = self.depths(points)
-        right, up, back = self.axes() @ points.T
+        right, up, back = self.axes() @ self._from_pivot(points).T
         scale = 2 / self.width * (self.distance / depths)
-        x = (right + self.right) * scale
-        y = (up + self.up) * scale
-        # Coordinate of the near plane along the axis from the origin to the camera.
-        near_back = self.distance - self.near
-        depth_scale = 2 * self.far / (self.far - self.near)
-        normalized_depth = depth_scale * ((near_back - back) / depths) - 1
+        x = (right + self.right) * scale + self.principal_right
+        y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
+        _, near, far = self._limits(depths)
+        # The near plane is measured along the axis from the pivot to the camera.
+        depth_scale = 2 * far / (far - near)
+        normalized_depth = depth_scale * ((self.distance - near - back) / depths) - 1
         return np.stack([x, y, normalized_depth]).T
 
     def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
@@ -417,14 +419,18 @@ class PerspectiveCamera(Camera):
 
     def depths(self, points: np.ndarray) -> np.ndarray:
         """Compute the depths of points, which must lie in front of the camera."""
-        depths = self.distance - points @ self.axes()[2]
-        if not (depths >= MIN_NEAR_RATIO * self.distance).all():
+        depths = self.distance - self._from_pivot(points) @ self.axes()[2]
+        if not (depths >= self._limits(depths)[0]).all():
             raise InputError(
-                f"the mesh reaches the camera at distance {self.distance:g} from the origin, or "
-                "extends beyond it: increase the distance (by a smaller fov or a larger width), or "
-                "normalize the mesh"
+                f"the mesh reaches the camera at {self.pose()[:3, 3].round(3).tolist()} or lies "
+                "behind it: normalize the mesh, increase the distance (by a smaller fov or a "
+                "larger width), or give cameras that have the whole mesh in front of them"
             )
         return depths
+
+    def _limits(self, depths: np.ndarray) -> tuple[float, float, float]:
+        """Return the smallest allowed depth, and the depths of the near and of the far plane."""
+        return MIN_NEAR_RATIO * self.distance, self.near, self.far
 
 
 def _as_scalar(name: str, value: Any) -> Any:

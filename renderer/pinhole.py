@@ -1,22 +1,30 @@
-"""Pinhole cameras with any pose and intrinsics, as view matrices and files of cameras have."""
+"""Pinhole cameras with any pose and intrinsics, from matrices and files of cameras.
 
+The intrinsics of a camera are the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+The focal lengths fx and fy are in pixels. The principal point (cx, cy) is in
+pixels from the top left corner of the image.
+"""
+
+import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from renderer.camera import MAX_TURN, PerspectiveCamera, in_radians, tensor_like
+from renderer.camera import PerspectiveCamera
 from renderer.errors import (
     MAX_MAGNITUDE,
     InputError,
     as_array,
+    as_path,
     require_choice,
-    require_range,
+    require_file,
     require_whole,
 )
 
@@ -29,6 +37,29 @@ MIN_DEPTH_RATIO = 1e-3
 # Tolerance for matrices of cameras: largest difference between R Rᵀ and the identity for a rotation
 # matrix R, and largest skew of intrinsics as a fraction of the focal length.
 MATRIX_TOLERANCE = 1e-4
+# Text file in which COLMAP stores the poses of images.
+COLMAP_IMAGES = "images.txt"
+# COLMAP's camera models without lens distortion, with their numbers of parameters.
+COLMAP_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
+# Points of an image in COLMAP's file: x, y and the number of a point in space for each, which is
+# -1 or 2^64 - 1 for no point.
+COLMAP_POINTS = re.compile(r"([-+.\de]+ [-+.\de]+ -?\d+ )*", re.IGNORECASE)
+# Camera models of nerfstudio that are perspective. Parameters of lens distortion, which
+# they also have, are checked separately.
+PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
+# Names of the parameters of lens distortion in transforms.json.
+DISTORTION = (
+    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4"),
+    *("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"),
+)
+# Entries of transforms.json that name another kind of camera, as instant-ngp, Blender and
+# others write them.
+OTHER_CAMERAS = (
+    *("is_fisheye", "fisheye", "ortho_scale", "orthographic", "is_orthographic"),
+    *("equirectangular", "latlong", "rolling_shutter", "distortion_params"),
+)
+# Advice at the end of errors about lens distortion.
+UNDISTORT = "undistort the images first, for example with colmap image_undistorter"
 
 
 @dataclass(frozen=True)
@@ -67,21 +98,13 @@ class PinholeCamera(PerspectiveCamera):
     [16.0, 20.0]
     """
 
-    roll: float = field(default=0.0, kw_only=True)
-    center_x: float = field(default=0.0, kw_only=True)
-    center_y: float = field(default=0.0, kw_only=True)
-    center_z: float = field(default=0.0, kw_only=True)
+    roll: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
+    center_x: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
+    center_y: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
+    center_z: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
     principal_right: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
     principal_up: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
     pixel_aspect: float = field(default=1.0, kw_only=True)  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        """Convert each field to a number or to a tensor of shape (), and check its range."""
-        super().__post_init__()
-        require_range("roll", self.roll, -MAX_TURN, MAX_TURN)
-        require_range("pixel_aspect", self.pixel_aspect, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
-        for name in ("center_x", "center_y", "center_z", "principal_right", "principal_up"):
-            require_range(name, getattr(self, name), -MAX_MAGNITUDE, MAX_MAGNITUDE)
 
     @classmethod
     def from_matrix(
@@ -129,19 +152,21 @@ class PinholeCamera(PerspectiveCamera):
             64
         """
         require_choice("convention", convention, CONVENTIONS)
+        # The rows of the rotation matrix are the axes of the camera in world axes.
         rotation, translation = _split_view(view)
         if convention == "opencv":
             # OpenCV's axes are right, down and forward. Ours are right, up and back.
             rotation = rotation * [[1], [-1], [-1]]
             translation = translation * [1, -1, -1]
         focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
-        image_width, image_height = _as_image_size(size)
+        image_width, image_height = size if np.ndim(size) else (size, size)
+        for side in (image_width, image_height):
+            require_whole("size", side, 1, MAX_MAGNITUDE)
         side = min(image_width, image_height)
-        # The rows of the rotation matrix are the axes of the camera in world axes.
         right, up, back = rotation
         position = -translation @ rotation
         distance = float(np.linalg.norm(position)) or 1.0
-        pivot = position - distance * back
+        center_x, center_y, center_z = position - distance * back
         azimuth = math.atan2(back[1], back[0])
         # This horizontal vector would be the camera's axis to the right if there were no roll.
         right_without_roll = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
@@ -152,9 +177,9 @@ class PinholeCamera(PerspectiveCamera):
             width=distance * side / focal_x,
             distance=distance,
             roll=math.degrees(roll),
-            center_x=pivot[0],
-            center_y=pivot[1],
-            center_z=pivot[2],
+            center_x=center_x,
+            center_y=center_y,
+            center_z=center_z,
             principal_right=(2 * principal_x - image_width) / side,
             principal_up=(image_height - 2 * principal_y) / side,
             pixel_aspect=focal_y / focal_x,
@@ -165,63 +190,180 @@ class PinholeCamera(PerspectiveCamera):
         moved = super().normalized(center, scale)
         return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
 
-    def axes(self) -> np.ndarray:
-        """Return the axes of the camera, which is turned by `roll`, in world coordinates."""
-        right, up, back = super().axes()
-        cosine = math.cos(math.radians(self.roll))
-        sine = math.sin(math.radians(self.roll))
-        return np.array([cosine * right + sine * up, cosine * up - sine * right, back])
+    def _limits(self, depths: np.ndarray) -> tuple[float, float, float]:
+        """Return the smallest allowed depth, and depths just around those of the points."""
+        near, far = depths.min(), depths.max()
+        smallest = MIN_DEPTH_RATIO * max(-near, far)
+        return smallest, near * (1 - MIN_DEPTH_RATIO), far * (1 + MIN_DEPTH_RATIO)
 
-    def pose(self) -> np.ndarray:
-        """Return the matrix that maps camera coordinates to world coordinates, shape (4, 4)."""
-        pose = super().pose()
-        pose[:3, 3] += [self.center_x, self.center_y, self.center_z]
-        return pose
 
-    def _from_pivot(self, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
-        """Subtract the point about which attacks turn the camera from other points."""
-        return points - np.array([self.center_x, self.center_y, self.center_z])
+def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
+    """Read the cameras of a scene from files of COLMAP or nerfstudio.
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points with perspective, with depths from about -1 at the nearest to about 1."""
-        depths = self.depths(points)
-        right, up, _ = self.axes() @ self._from_pivot(points).T
-        scale = 2 / self.width * (self.distance / depths)
-        x = (right + self.right) * scale + self.principal_right
-        y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
-        near = depths.min() * (1 - MIN_DEPTH_RATIO)
-        far = depths.max() * (1 + MIN_DEPTH_RATIO)
-        normalized_depth = 2 * far / (far - near) * (1 - near / depths) - 1
-        return np.stack([x, y, normalized_depth]).T
+    COLMAP's models SIMPLE_PINHOLE and PINHOLE are read. Images with lens
+    distortion must be undistorted first, for example by COLMAP's
+    image_undistorter. Binary models are written as text by `colmap
+    model_converter --output_type TXT`.
 
-    def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points to homogeneous image coordinates, with the principal point."""
-        positions, nearness = super().homogeneous(points)
-        x, y, w = positions.T
-        x = x + self.principal_right * w
-        y = y * self.pixel_aspect + self.principal_up * w
-        return torch.stack([x, y, w]).T, nearness
+    The cameras have the world coordinates of the file, so load the mesh with
+    `nb.load_mesh(path, up="z")`, which leaves its axes as they are. The camera of
+    an image that is not square shows the square in its center.
 
-    def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
-        """Convert points to the axes right, up and back, starting at the pivot (`_from_pivot`)."""
-        center = [self.center_x, self.center_y, self.center_z]
-        pivot = torch.stack([tensor_like(coordinate, points) for coordinate in center])
-        right, up, back = super()._camera_coordinates(points - pivot)
-        roll = tensor_like(in_radians(self.roll), points)
-        cosine = roll.cos()
-        sine = roll.sin()
-        return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
+    Args:
+        path: A transforms.json file of nerfstudio, or a folder with this file or
+            with the files cameras.txt and images.txt of COLMAP.
 
-    def depths(self, points: np.ndarray) -> np.ndarray:
-        """Compute the depths of points, which must lie in front of the camera."""
-        depths = self.distance - self._from_pivot(points) @ self.axes()[2]
-        if not (depths >= MIN_DEPTH_RATIO * np.abs(depths).max()).all():
-            position = self.pose()[:3, 3].round(3).tolist()
-            raise InputError(
-                f"the mesh reaches the camera at {position} or lies behind it: "
-                "give cameras that have the whole mesh in front of them"
+    Returns:
+        Cameras by the names of their images, in the order of the file.
+
+    Raises:
+        InputError: If a file is missing or damaged, has no cameras, or has two
+            images of one name, or if a camera is not perspective or has
+            distortion.
+
+    Example:
+        >>> import json
+        >>> from pathlib import Path
+        >>> import norm_balls as nb
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        >>> frames = [{"file_path": "front.png", "transform_matrix": pose}]
+        >>> scene = {"camera_angle_x": 0.6, "frames": frames}
+        >>> _ = Path("transforms.json").write_text(json.dumps(scene))
+        >>> cameras = nb.load_cameras("transforms.json")
+        >>> [*cameras], round(cameras["front.png"].distance, 3)
+        (['front.png'], 4.0)
+    """
+    path = as_path("path", path)
+    if path.is_dir() and (path / COLMAP_IMAGES).exists():
+        cameras = _read_colmap(path)
+    else:
+        cameras = _read_transforms(path / "transforms.json" if path.is_dir() else path)
+    if not cameras:
+        raise InputError(f"{path} has no cameras: give files with at least one image")
+    return cameras
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[str]:
+    """Read the text of a file for a `with` block, and name the file in errors of the block."""
+    require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
+    try:
+        yield path.read_text(encoding="utf-8-sig")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    # Python raises almost any exception if a file lacks an entry or has a wrong one.
+    except Exception as error:
+        raise InputError(f"{path} is no file of cameras ({error!r}): export it again") from error
+
+
+def _add(values: dict[str, Any], name: str, value: object) -> None:
+    """Add a value to a dictionary, and raise InputError if it has the name already."""
+    if name in values:
+        raise InputError(f"{name} occurs twice: give each image and camera a name of its own")
+    values[name] = value
+
+
+def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
+    """Read the cameras of a COLMAP model from its text files, by the names of their images."""
+    from scipy.spatial.transform import Rotation
+
+    # Intrinsic matrix and image size (width, height) of each camera by its id in the file.
+    lenses: dict[str, tuple[np.ndarray, tuple[int, int]]] = {}
+    cameras: dict[str, PinholeCamera] = {}
+    with _reading(folder / "cameras.txt") as text:
+        for line in _lines(text):
+            camera_id, model, width, height, *parameters = line.split()
+            _add(
+                lenses,
+                camera_id,
+                (_colmap_intrinsics(model, parameters), (int(width), int(height))),
             )
-        return depths
+    with _reading(folder / COLMAP_IMAGES) as text:
+        may_be_points = False
+        for line in _lines(text):
+            # A second line of an image lists its points. It may be empty or missing.
+            if may_be_points and COLMAP_POINTS.fullmatch(" ".join(line.split()) + " "):
+                may_be_points = False
+                continue
+            may_be_points = True
+            _, *numbers, camera_id, image_name = line.split(maxsplit=9)
+            pose = np.array(numbers, dtype=float)
+            # The real part of the quaternion is first in the file, and last for scipy.
+            rotation = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
+            view = np.column_stack([rotation, pose[4:]])
+            _add(cameras, image_name.strip(), PinholeCamera.from_matrix(view, *lenses[camera_id]))
+    return cameras
+
+
+def _lines(text: str) -> list[str]:
+    """List the lines of a text that are neither empty nor comments."""
+    # `splitlines` would also split at other characters, which may be in names.
+    return [line for line in text.split("\n") if not re.match(r"\s*(#|$)", line)]
+
+
+def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
+    """Convert one or two focal lengths and a principal point to an intrinsic matrix."""
+    if model not in COLMAP_PARAMETERS:
+        raise InputError(
+            f"the camera model {model} is not supported, because it has lens distortion (supported "
+            f"are {' and '.join(COLMAP_PARAMETERS)}): {UNDISTORT}"
+        )
+    if len(parameters) != COLMAP_PARAMETERS[model]:
+        raise ValueError(f"{model} with {len(parameters)} parameters")
+    *focal_lengths, center_x, center_y = map(float, parameters)
+    return np.array([[focal_lengths[0], 0, center_x], [0, focal_lengths[-1], center_y], [0, 0, 1]])
+
+
+def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
+    """Read the cameras of a transforms.json file of nerfstudio, by the paths of their images."""
+    cameras: dict[str, PinholeCamera] = {}
+    with _reading(path) as text:
+        scene = json.loads(text)
+        for frame in scene["frames"]:
+            # A frame is an image of the scene. Its entries override those of the scene.
+            intrinsics, size = _transforms_intrinsics({**scene, **frame})
+            view = np.linalg.inv(np.array(frame["transform_matrix"], dtype=float))
+            camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl")
+            if not isinstance(frame["file_path"], str):
+                raise TypeError(f"file_path is {frame['file_path']}")
+            _add(cameras, frame["file_path"], camera)
+    return cameras
+
+
+def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
+    """Read the intrinsic matrix and the size (width, height) of an image of transforms.json."""
+    for name in ("camera_model", "camera_type"):
+        model = entries.get(name, "PINHOLE")
+        if str(model).upper() not in PERSPECTIVE:
+            raise InputError(f"{name}={model} is not supported: {UNDISTORT}")
+    for name in OTHER_CAMERAS:
+        value = entries.get(name)
+        # The motion of a rolling shutter is a list of numbers.
+        if any(value) if isinstance(value, list) else value:
+            raise InputError(f"{name}={value} is not supported: give perspective cameras")
+    distortion_keys = [name for name in DISTORTION if entries.get(name)]
+    if distortion_keys:
+        raise InputError(
+            f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
+            f"supported: {UNDISTORT}"
+        )
+    if not {"w", "h"} <= entries.keys() and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
+        raise InputError("the focal length is in pixels, but the image size w and h is missing")
+    # A file with square images may have a field of view, but no image size. The focal length and
+    # the principal point are then computed for an image of one pixel.
+    width = int(entries.get("w", 1))
+    height = int(entries.get("h", width))
+    focal_lengths = []
+    for axis, side in (("x", width), ("y", height)):
+        if f"fl_{axis}" in entries:
+            focal_lengths.append(float(entries[f"fl_{axis}"]))
+        elif f"camera_angle_{axis}" in entries:
+            focal_lengths.append(side / 2 / math.tan(float(entries[f"camera_angle_{axis}"]) / 2))
+    center_x = float(entries.get("cx", width / 2))
+    center_y = float(entries.get("cy", height / 2))
+    # Pixels are square if only one focal length is given.
+    rows = [[focal_lengths[0], 0, center_x], [0, focal_lengths[-1], center_y], [0, 0, 1]]
+    return np.array(rows), (width, height)
 
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -254,11 +396,3 @@ def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
             f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
         )
     return focal_x, focal_y, center_x, center_y
-
-
-def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Convert the size of an image to its width and its height, and check them."""
-    width, height = size if isinstance(size, tuple | list) and len(size) == 2 else (size, size)
-    for side in (width, height):
-        require_whole("size", side, 1, MAX_MAGNITUDE)
-    return width, height

@@ -32,7 +32,7 @@ from renderer.errors import (
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
-from renderer.mesh import Mesh, require_mesh
+from renderer.mesh import NO_TEXTURE, Mesh, require_mesh
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.operators.rays import Rays, Surface
@@ -41,7 +41,7 @@ from renderer.operators.stack import TransferOperators
 from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
-from renderer.surface.albedo import NO_TEXTURE, face_albedo, surface_albedo
+from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments

@@ -11,7 +11,7 @@ these samples show G of the F faces. A texture has C channels. The local name
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
@@ -22,13 +22,8 @@ from torch import Tensor
 
 from renderer.errors import require_bounded
 from renderer.image import clamp, decode, encode, to_bytes
-from renderer.mesh import Mesh
+from renderer.mesh import NO_TEXTURE, Mesh
 from renderer.visibility.fragments import BLOCK, Fragments
-
-# Value of `Mesh.texture_ids` for a face without a texture.
-NO_TEXTURE = -1
-# Value of `Mesh.texture_ids` for a face with the first texture of the mesh.
-FIRST_TEXTURE = 0
 
 
 @dataclass(frozen=True)
@@ -55,12 +50,9 @@ class Texture:
         tensor. NaN or infinite values raise `InputError`.
         """
         require_bounded(texture=values)
-        height = values.shape[0]
-        width = values.shape[1]
         # One row for each channel, with all texels in row-major order.
         channels = values.flatten(0, 1).T
-        look_up = partial(torch.index_select, channels, 1)
-        return Texture(height=height, width=width, look_up=look_up)
+        return Texture(*values.shape[:2], look_up=partial(torch.index_select, channels, 1))
 
 
 def surface_albedo(
@@ -74,14 +66,11 @@ def surface_albedo(
     result is linear, too.
     """
     colors = _interpolated_colors(mesh, fragments, encoding)
-    textures_to_sample: list[Texture] = []
-    if textures is not None:
-        textures_to_sample = [Texture.from_values(values) for values in textures]
-    elif mesh.packed_textures:
-        textures_to_sample = mesh_textures(mesh, encoding, fragments.coverage)
-    if not textures_to_sample:
-        return colors
-    return colors * sample_textures(textures_to_sample, mesh, fragments).T
+    if textures is None:
+        looked_up = mesh_textures(mesh, encoding, fragments.coverage)
+    else:
+        looked_up = [Texture.from_values(values) for values in textures]
+    return colors * sample_textures(looked_up, mesh, fragments).T if looked_up else colors
 
 
 def sample_textures(
@@ -92,29 +81,30 @@ def sample_textures(
     Samples of faces without a texture have the value 1. `mesh.texture_ids` are
     indices into `textures`.
     """
-    sample_uvs = _interpolated_uvs(mesh, fragments)
-    texture_of_face = _texture_of_seen_face(mesh, fragments)
-    # All faces of most meshes have the same texture. Then it is looked up at all samples.
-    if len(textures) == 1 and bool((texture_of_face == FIRST_TEXTURE).all()):
-        return interpolate_texture(textures[0], sample_uvs)
-    sample_to_seen_face = fragments.sample_to_seen_face
-    texture_of_sample = texture_of_face.index_select(0, sample_to_seen_face)
-    # Indices of the samples that show each texture.
-    samples_by_texture = []
-    # Values of each texture at these samples.
-    values_by_texture = []
+    parts = list(_samples_of_textures(textures, mesh, fragments))
+    # One row for each channel.
+    values = torch.cat([interpolate_texture(texture, uvs) for texture, _, uvs in parts], 1)
+    sample_count = len(fragments.sample_to_seen_face)
+    # All faces of most meshes have the same texture.
+    if len(parts) == 1 and values.shape[1] == sample_count:
+        return values
+    # Samples of faces without a texture keep the value 1.
+    ones = values.new_ones(len(values), sample_count)
+    return ones.index_copy(1, torch.cat([samples for _, samples, _ in parts]), values)
+
+
+def _samples_of_textures(
+    textures: Sequence[Texture], mesh: Mesh, fragments: Fragments
+) -> Iterator[tuple[Texture, Int[Tensor, " N"], Float[Tensor, "2 N"]]]:
+    """Yield each texture of a mesh, and the samples that show it with their texture coordinates."""
+    corner_uvs = _of_seen_faces(mesh.corner_uvs, fragments).to(fragments.coverage)
+    sample_uvs = fragments.interpolate(corner_uvs).T
+    texture_of_face = _of_seen_faces(mesh.texture_ids, fragments)
+    texture_of_sample = texture_of_face.index_select(0, fragments.sample_to_seen_face)
     for texture_id, texture in enumerate(textures):
         samples = torch.nonzero(texture_of_sample == texture_id).squeeze(1)
-        samples_by_texture.append(samples)
-        uvs = sample_uvs.index_select(1, samples)
-        values_by_texture.append(interpolate_texture(texture, uvs))
-    textured_samples = torch.cat(samples_by_texture)
-    # One row for each channel, one column for each sample in `textured_samples`.
-    textured_values = torch.cat(values_by_texture, 1)
-    channel_count = len(textured_values)
-    # Samples of faces without a texture keep the value 1.
-    values = textured_values.new_ones(channel_count, len(texture_of_sample))
-    return values.index_copy(1, textured_samples, textured_values)
+        has_all = len(samples) == len(texture_of_sample)
+        yield texture, samples, sample_uvs if has_all else sample_uvs.index_select(1, samples)
 
 
 def interpolate_texture(texture: Texture, uvs: Float[Tensor, "2 N"]) -> Float[Tensor, "C N"]:
@@ -124,16 +114,12 @@ def interpolate_texture(texture: Texture, uvs: Float[Tensor, "2 N"]) -> Float[Te
     [0, 1] in both and repeats beyond. The center of column i is at
     u = (i + 0.5) / width.
     """
-    values_by_block = []
     # The points are processed in blocks to limit the memory.
-    for block_uvs in uvs.split(BLOCK, dim=1):
-        weighted_texels = [
-            weight * texture.look_up(texel)
-            for weight, texel in _surrounding_texels(texture, block_uvs)
-        ]
-        # Add up the weighted values of the four texels around each point.
-        values_by_block.append(reduce(torch.add, weighted_texels))
-    return torch.cat(values_by_block, dim=1)
+    blocks = [
+        reduce(torch.add, [w * texture.look_up(i) for w, i in _surrounding_texels(texture, block)])
+        for block in uvs.split(BLOCK, dim=1)
+    ]
+    return torch.cat(blocks, dim=1)
 
 
 def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
@@ -146,12 +132,11 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
     # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)
     columns = _neighbors(u, texture.width)
-    texels = []
-    for row, row_weight in rows:
-        for column, column_weight in columns:
-            texel = (row * texture.width + column).long()
-            texels.append((row_weight * column_weight, texel))
-    return texels
+    return [
+        (row_weight * column_weight, (row * texture.width + column).long())
+        for row, row_weight in rows
+        for column, column_weight in columns
+    ]
 
 
 def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor, Tensor]]:
@@ -162,17 +147,13 @@ def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor
     """
     # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5
-    line_before = position.floor()
-    fraction = position - line_before
+    before = position.floor()
+    fraction = position - before
+    # The texture repeats, so lines count modulo `count`.
     return [
-        (_modulo(line_before, count), 1 - fraction),
-        (_modulo(line_before + 1, count), fraction),
+        (line - count * (line / count).floor(), weight)
+        for line, weight in ((before, 1 - fraction), (before + 1, fraction))
     ]
-
-
-def _modulo(index: Float[Tensor, " N"], count: int) -> Float[Tensor, " N"]:
-    """Compute `index` modulo `count`, a number in [0, count)."""
-    return index - count * (index / count).floor()
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
@@ -182,14 +163,12 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     """
     # A channel has only 256 possible values. A table with the linear value of each saves
     # decoding every texel.
-    eight_bit_values = torch.arange(256, dtype=torch.float64) / 255
-    linear_values = decode(eight_bit_values, encoding).to(like)
+    linear_values = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
     textures = []
     for packed_texture in mesh.packed_textures:
-        height, width = packed_texture.shape
         packed_texels = torch.from_numpy(packed_texture).to(like.device).flatten()
         look_up = partial(_look_up_packed, packed_texels, linear_values)
-        textures.append(Texture(height=height, width=width, look_up=look_up))
+        textures.append(Texture(*packed_texture.shape, look_up=look_up))
     return textures
 
 
@@ -214,8 +193,9 @@ def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Ten
     The result is differentiable with respect to `albedo`.
     """
     require_bounded(albedo=albedo)
-    seen_faces = fragments.faces
-    return _at_samples(albedo.index_select(0, seen_faces), fragments)
+    columns = albedo.index_select(0, fragments.faces).T.contiguous()
+    # Selecting columns of the transposed matrix takes half the time of selecting rows.
+    return columns.index_select(1, fragments.sample_to_seen_face).T
 
 
 def paint_faces(
@@ -234,67 +214,39 @@ def paint_faces(
     The result is differentiable with respect to `added` and `hue`. `added` is linear, and
     `hue` is in degrees, or None for unchanged hues.
     """
-    sample_to_seen_face = fragments.sample_to_seen_face
-    added_at_samples = face_albedo(added, fragments)
-    added_to_face = added.index_select(0, fragments.faces)
-    hue_of_face = None
-    hue_at_samples = None
-    if hue is not None:
-        # Unlike `hue[faces]`, `index_select` adds up gradients in the same order for any
-        # number of threads.
-        hue_of_face = hue.index_select(0, fragments.faces)
-        hue_at_samples = hue_of_face.index_select(0, sample_to_seen_face)
-
+    # Unlike `hue[faces]`, `index_select` adds up gradients in the same order for any number of
+    # threads.
+    hue_of_face = None if hue is None else hue.index_select(0, fragments.faces)
     # First, change the colors of the corners of faces and interpolate them, as if no face
-    # had a texture.
-    seen_faces = fragments.faces.cpu().numpy()
-    corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0)).to(added)
-    # Axes: seen face, corner, channel.
-    corner_albedo = decode(corner_colors, encoding) * albedo_scale
-    # A new axis for the corners, because the three corners of a face have the same hue.
-    corner_hue = None if hue_of_face is None else hue_of_face[:, None]
-    painted_corners = changed_albedo(corner_albedo, corner_hue, added_to_face[:, None])
+    # had a texture. The three corners of a face have the same hue and added color.
+    corner_albedo = _corner_albedo(mesh, fragments, encoding, added) * albedo_scale
+    painted_corners = changed_albedo(
+        corner_albedo,
+        None if hue_of_face is None else hue_of_face[:, None],
+        added.index_select(0, fragments.faces)[:, None],
+    )
     albedo = fragments.interpolate(painted_corners)
     if not mesh.textures:
         return albedo
 
     # Then replace the albedo at samples of faces with a texture: change the texels of the
     # texture, and interpolate them.
-    colors = _interpolated_colors(mesh, fragments, encoding)
-    scaled_colors = (colors * albedo_scale).to(added)
-    sample_uvs = _interpolated_uvs(mesh, fragments)
-    texture_of_face = _texture_of_seen_face(mesh, fragments)
-    texture_of_sample = texture_of_face[sample_to_seen_face]
-    for texture_id, texture in enumerate(mesh_textures(mesh, encoding, added)):
-        samples = torch.nonzero(texture_of_sample == texture_id).squeeze(1)
-        hue_at_textured = None
-        if hue_at_samples is not None:
-            hue_at_textured = hue_at_samples.index_select(0, samples)
-        textured_albedo = _interpolate_painted_texels(
-            texture,
-            sample_uvs[:, samples],
-            colors=scaled_colors[samples],
-            hue=hue_at_textured,
-            added=added_at_samples.index_select(0, samples),
-        )
-        albedo = albedo.index_copy(0, samples, textured_albedo)
+    colors = (_interpolated_colors(mesh, fragments, encoding) * albedo_scale).to(added)
+    added_at_samples = face_albedo(added, fragments)
+    hue_at_samples = None
+    if hue_of_face is not None:
+        hue_at_samples = hue_of_face.index_select(0, fragments.sample_to_seen_face)
+    textures = mesh_textures(mesh, encoding, added)
+    for texture, samples, uvs in _samples_of_textures(textures, mesh, fragments):
+        hue_here = None if hue_at_samples is None else hue_at_samples.index_select(0, samples)
+        added_here = added_at_samples.index_select(0, samples)
+        weighted_texels = []
+        for weight, texel in _surrounding_texels(texture, uvs):
+            texel_albedo = colors[samples] * texture.look_up(texel).T
+            painted_texel = changed_albedo(texel_albedo, hue_here, added_here)
+            weighted_texels.append(weight.to(added)[:, None] * painted_texel)
+        albedo = albedo.index_copy(0, samples, reduce(torch.add, weighted_texels))
     return albedo
-
-
-def _interpolate_painted_texels(
-    texture: Texture,
-    uvs: Float[Tensor, "2 N"],
-    colors: Float[Tensor, "N 3"],
-    hue: Float[Tensor, " N"] | None,
-    added: Float[Tensor, "N 3"],
-) -> Float[Tensor, "N 3"]:
-    """Interpolate a texture at N points after a change of the hue and color of its texels."""
-    weighted_texels = []
-    for weight, texel in _surrounding_texels(texture, uvs):
-        texel_albedo = colors * texture.look_up(texel).T
-        painted_texel = changed_albedo(texel_albedo, hue, added)
-        weighted_texels.append(weight.to(added)[:, None] * painted_texel)
-    return reduce(torch.add, weighted_texels)
 
 
 def changed_albedo(
@@ -323,60 +275,38 @@ def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tens
     The result is linear. It is None if a texture or two colors prevent it, or if the view
     shows no face.
     """
-    if mesh.packed_textures:
+    if mesh.textures:
         return None
     # One row for each corner of the seen faces, one column for each channel.
-    albedo = _corner_albedo(mesh, fragments, encoding).flatten(0, 1)
-    if len(albedo) == 0:
-        return None
-    first_albedo = albedo[0]
-    if not (albedo == first_albedo).all():
-        return None
-    return first_albedo
+    albedo = _corner_albedo(mesh, fragments, encoding, fragments.coverage).flatten(0, 1)
+    return albedo[0] if len(albedo) and bool((albedo == albedo[0]).all()) else None
 
 
 def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, "S 3"]:
     """Interpolate the linear corner colors of a mesh at the S covered samples of a view."""
-    corner_albedo = _corner_albedo(mesh, fragments, encoding)
+    corner_albedo = _corner_albedo(mesh, fragments, encoding, fragments.coverage)
     if not mesh.one_color_per_face:
         return fragments.interpolate(corner_albedo)
     # All corners of a face have the same color, so take the first corner. One row for each
     # channel, one column for each seen face.
     face_colors = corner_albedo[:, 0].T.contiguous()
-    sample_to_seen_face = fragments.sample_to_seen_face
     # `gather` takes a third of the time of `index_select` in float64.
-    return face_colors.gather(1, sample_to_seen_face.expand(3, -1)).T
+    return face_colors.gather(1, fragments.sample_to_seen_face.expand(3, -1)).T
 
 
-def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Float[Tensor, "G 3 3"]:
-    """Decode the corner colors of the G faces that a view shows."""
-    seen_faces = fragments.faces.cpu().numpy()
-    corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0))
-    corner_colors = corner_colors.to(fragments.coverage)
+def _corner_albedo(
+    mesh: Mesh, fragments: Fragments, encoding: str, like: Tensor
+) -> Float[Tensor, "G 3 3"]:
+    """Decode the corner colors of the G faces that a view shows, in the dtype of `like`."""
+    corner_colors = _of_seen_faces(mesh.corner_colors, fragments).to(like)
     require_bounded(corner_colors=corner_colors)
     return decode(corner_colors, encoding)
 
 
-def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Float[Tensor, "2 S"]:
-    """Interpolate the texture coordinates of a mesh at the S covered samples of a view."""
-    seen_faces = fragments.faces.cpu().numpy()
-    # Axes: seen face, corner, texture coordinate (u or v).
-    corner_uvs = torch.from_numpy(mesh.corner_uvs.take(seen_faces, axis=0))
-    return fragments.interpolate(corner_uvs.to(fragments.coverage)).T
-
-
-def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Int[Tensor, " G"]:
-    """Return the index of the texture of each of the G faces that a view shows, or `NO_TEXTURE`."""
-    seen_faces = fragments.faces.cpu().numpy()
-    texture_ids = torch.from_numpy(mesh.texture_ids.take(seen_faces))
-    return texture_ids.to(fragments.sample_to_seen_face.device)
-
-
-def _at_samples(face_values: Float[Tensor, "G D"], fragments: Fragments) -> Float[Tensor, "S D"]:
-    """Look up the values of the face that each sample shows."""
-    sample_to_seen_face = fragments.sample_to_seen_face
-    # Selecting columns of the transposed matrix takes half the time of selecting rows.
-    return face_values.T.contiguous().index_select(1, sample_to_seen_face).T
+def _of_seen_faces(rows: np.ndarray, fragments: Fragments) -> Tensor:
+    """Select the rows of the G faces that a view shows, on the device of the view."""
+    seen_rows = rows.take(fragments.faces.cpu().numpy(), axis=0)
+    return torch.from_numpy(seen_rows).to(fragments.coverage.device)
 
 
 # Approximate limit for the number of texels of a new texture. If it would have more texels,
@@ -384,8 +314,6 @@ def _at_samples(face_values: Float[Tensor, "G D"], fragments: Fragments) -> Floa
 MAX_TEXELS = 2**26
 # Number of texels of a new texture that are computed at once. It limits the memory.
 SHEET_BLOCK = 2**20
-# Number of values of a channel with eight bits.
-CHANNEL_VALUES = 256
 
 
 def with_added_albedo(
@@ -414,38 +342,43 @@ def with_added_albedo(
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     # Linear value of each 8-bit value.
-    albedo_of_byte = decode(torch.arange(CHANNEL_VALUES) / (CHANNEL_VALUES - 1), encoding)
-    new_scale = max(1.0, albedo_scale * _largest_albedo(mesh, corner_albedo, albedo_of_byte))
-    added_to_face = torch.from_numpy(added).float()
-    hue_of_face = None if hue is None else torch.from_numpy(hue).float()
+    albedo_of_byte = decode(torch.arange(256) / 255, encoding)
+    # The largest corner color, times the largest texel if all faces have a texture.
+    largest = albedo_scale * float(corner_albedo.max())
+    if (mesh.texture_ids != NO_TEXTURE).all():
+        largest *= float(albedo_of_byte[max(int(texture.max()) for texture in mesh.textures)])
+    new_scale = max(1.0, largest)
 
     def paint(albedo: Float[Tensor, "N 3"], faces: Int[np.ndarray, " N"]) -> Tensor:
         """Change and encode the albedo at N points of faces."""
-        hue_at_points = None if hue_of_face is None else hue_of_face[faces]
-        changed = changed_albedo(albedo * albedo_scale, hue_at_points, added_to_face[faces])
+        hue_at_points = None if hue is None else torch.from_numpy(hue[faces]).float()
+        added_at_points = torch.from_numpy(added[faces]).float()
+        changed = changed_albedo(albedo * albedo_scale, hue_at_points, added_at_points)
         return encode(changed / new_scale, encoding)
 
     corner_faces = np.arange(len(mesh.faces)).repeat(3)
     colors = paint(corner_albedo.flatten(0, 1), corner_faces).view(-1, 3, 3).numpy()
-    colors[mesh.texture_ids >= 0] = 1
+    colors[mesh.texture_ids != NO_TEXTURE] = 1
     uvs = mesh.corner_uvs.copy()
-    textures = []
-    gloss_textures = []
+    textures, gloss_textures = [], []
     for texture_id, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.texture_ids == texture_id)
         gloss = mesh.gloss_textures[texture_id] if mesh.gloss_textures else texture[..., :0]
         charts = _Charts(mesh.corner_uvs[faces], texture.shape[1::-1])
-        columns, rows = charts.sheet_size
-        new_texture = np.zeros((rows, columns, 3), dtype=np.uint8)
-        new_gloss = np.zeros((rows, columns, gloss.shape[2]), dtype=np.uint8)
+        new_texture, new_gloss = (
+            np.zeros((*charts.sheet_size[::-1], old.shape[2]), np.uint8) for old in (texture, gloss)
+        )
         block_count = 1 + charts.texel_count // SHEET_BLOCK
         for block in np.array_split(np.arange(len(faces)), block_count):
-            chart, place, uv, weights = charts.texels(block)
-            albedo = albedo_of_byte[torch.from_numpy(_nearest(texture, uv)).int()]
+            chart, (column, row), center, weights = charts.texels(block)
+            # The texture repeats.
+            old_column, old_row = np.floor(center % 1 * texture.shape[1::-1]).astype(np.int64).T
+            albedo = albedo_of_byte[torch.from_numpy(texture[old_row, old_column]).int()]
             albedo *= torch.einsum("nk,nkc->nc", weights, corner_albedo[faces[chart]])
-            painted = to_bytes(paint(albedo, faces[chart])).numpy()
-            new_texture[place[:, 1], place[:, 0]] = painted
-            new_gloss[place[:, 1], place[:, 0]] = _nearest(gloss, uv)
+            new_texture[row, column] = to_bytes(paint(albedo, faces[chart])).numpy()
+            if mesh.gloss_textures:
+                old_column, old_row = np.floor(center % 1 * gloss.shape[1::-1]).astype(np.int64).T
+                new_gloss[row, column] = gloss[old_row, old_column]
         textures.append(new_texture)
         gloss_textures.append(new_gloss)
         uvs[faces] = charts.uvs
@@ -457,26 +390,6 @@ def with_added_albedo(
         gloss_textures=tuple(gloss_textures) if mesh.gloss_textures else (),
     )
     return baked, new_scale
-
-
-def _largest_albedo(
-    mesh: Mesh, corner_albedo: Float[Tensor, "F 3 3"], albedo_of_byte: Float[Tensor, " 256"]
-) -> float:
-    """Compute an upper bound of the linear albedo of a mesh.
-
-    It is the largest corner color, times the largest texel if all faces have a texture.
-    """
-    largest = float(corner_albedo.max())
-    if (mesh.texture_ids >= 0).all():
-        largest *= max(float(albedo_of_byte[texture.max()]) for texture in mesh.textures)
-    return largest
-
-
-def _nearest(texture: np.ndarray, positions: Float[np.ndarray, "N 2"]) -> np.ndarray:
-    """Look up the texels at positions (column, row) in [0, 1), beyond which the texture repeats."""
-    size = texture.shape[1::-1]
-    column, row = np.floor(positions % 1 * size).astype(np.int64).T
-    return texture[row, column]
 
 
 class _Charts:
@@ -519,7 +432,7 @@ class _Charts:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
         """List the T texels of some charts.
 
-        The results are the chart of each texel (T,), its column and row on the sheet (T, 2), its
+        The results are the chart of each texel (T,), its column and row on the sheet (2, T), its
         center in the old texture as a fraction of the size (T, 2), and its barycentric weights
         (T, 3) in the face. Negative weights, which are outside of the face, are replaced by 0.
         """
@@ -533,12 +446,8 @@ class _Charts:
         last = np.einsum("ni,nij->nj", from_first_corner, self._inverse_edges[chart])
         weights = np.column_stack([1 - last.sum(axis=1), last]).clip(min=0)
         weights /= weights.sum(axis=1, keepdims=True)
-        return (
-            chart,
-            self._corner[chart] + place,
-            center / self._new_size,
-            torch.tensor(weights, dtype=torch.float32),
-        )
+        sheet_place = (self._corner[chart] + place).T
+        return chart, sheet_place, center / self._new_size, torch.from_numpy(weights).float()
 
 
 def _pack(sizes: Int[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
