@@ -26,13 +26,7 @@ from renderer.errors import (
     require_range,
     require_whole,
 )
-from renderer.normals import (
-    CREASE,
-    doubled_area_vectors,
-    normal_groups,
-    plain_face_normals,
-    vertex_normals,
-)
+from renderer.normals import CREASE, doubled_area_vectors, normal_groups, vertex_normals
 from renderer.settings import MAX_VERTICES, NORMALS
 
 # Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes from files
@@ -51,8 +45,6 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "gloss": ("fiu", (3,)),
     "normal_ids": ("iu", (3,)),
 }
-# Arrays of a mesh that may be None when it is created.
-_OPTIONAL = ("gloss", "normal_ids")
 # Names of the arrays of a mesh that have one row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "normal_ids")
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
@@ -130,7 +122,7 @@ class Mesh:
     def __post_init__(self) -> None:
         """Convert lists to arrays, check all fields, and find sharp edges."""
         for name, (kinds, row) in _ARRAYS.items():
-            if getattr(self, name) is None and name in _OPTIONAL:
+            if getattr(self, name) is None and name in ("gloss", "normal_ids"):
                 continue
             array = as_array(name, getattr(self, name), kinds)
             # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
@@ -139,33 +131,29 @@ class Mesh:
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
         require_range("the number of faces", len(self.faces), 1, np.inf)
-        vertex_count = len(self.vertices)
-        lowest, highest = self.faces.min(), self.faces.max()
-        if not 0 <= lowest <= highest < vertex_count:
-            raise InputError(
-                f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
-                f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
-            )
-        if self.normal_ids is not None:
-            # A larger index is a mistake that would take all memory.
-            for index in (self.normal_ids.min(), self.normal_ids.max()):
-                require_range("an index of normal_ids", index, 0, 2**31 - 1)
-        else:
-            object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
             given = as_list(name, getattr(self, name), object, expected)
-            textures = [as_array(name, texture) for texture in given]
+            textures = tuple(as_array(name, texture) for texture in given)
             for texture in textures:
                 if texture.shape[2:] != (channels,) or texture.dtype != np.uint8:
                     raise InputError(f"{name} has {describe(texture)}: give {expected}")
-            object.__setattr__(self, name, tuple(textures))
-        if self.texture_ids.max() >= len(self.textures):
-            raise InputError(
-                f"texture_ids has the index {self.texture_ids.max()}, but the mesh has "
-                f"{len(self.textures)} textures: give indices below {len(self.textures)}, "
-                f"or {NO_TEXTURE} for faces without a texture"
-            )
+            object.__setattr__(self, name, textures)
+        limits = {
+            "faces": (0, len(self.vertices) - 1),
+            "texture_ids": (NO_TEXTURE, len(self.textures) - 1),
+            # A larger index is a mistake that would take all memory.
+            "normal_ids": (0, 2**31 - 1),
+        }
+        for name, (least, most) in limits.items():
+            ids = getattr(self, name)
+            if ids is not None and not least <= ids.min() <= ids.max() <= most:
+                raise InputError(
+                    f"{name} has indices from {ids.min()} to {ids.max()}: "
+                    f"give indices from {least} to {most}"
+                )
+        if self.normal_ids is None:
+            object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
 
     @staticmethod
     def plain(
@@ -193,8 +181,7 @@ class Mesh:
         """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
         given_faces = as_array("faces", faces)
-        # astype turns NaN into an arbitrary integer, with a warning. The warning is suppressed,
-        # because the comparison below finds the difference.
+        # astype turns NaN into an arbitrary integer, with a warning.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
@@ -204,10 +191,8 @@ class Mesh:
             given = reprlib.repr(color.tolist())
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
         try:
-            vertex_colors = np.broadcast_to(color, vertices.shape)
-            # Vertex indices out of range are clipped, because
-            # `Mesh(...)` below raises a better error than `take` would.
-            corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
+            # Vertex indices out of range are clipped, because `Mesh(...)` raises a better error.
+            corner_colors = np.broadcast_to(color, vertices.shape).take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(
                 f"vertices, faces and color do not fit together ({error}): give the shapes "
@@ -229,13 +214,14 @@ class Mesh:
 
         The normal of a face without area is zero.
         """
-        return plain_face_normals(self.vertices, self.faces)
+        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
+        lengths = np.linalg.norm(doubled_vectors, axis=1, keepdims=True)
+        zeros = np.zeros_like(doubled_vectors)
+        return np.divide(doubled_vectors, lengths, out=zeros, where=lengths > 0)
 
     def face_areas(self) -> np.ndarray:
         """Compute the areas of the F faces in squared world units, shape (F,)."""
-        # The length of each of these vectors is twice the area of a face.
-        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
-        return np.linalg.norm(doubled_vectors, axis=1) / 2
+        return np.linalg.norm(doubled_area_vectors(self.vertices, self.faces), axis=1) / 2
 
     @cached_property
     def corner_normals(self) -> np.ndarray:
@@ -370,46 +356,35 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     Vertices are not merged.
     """
     faces, texture_ids, normal_ids = [], [], []
-    # Numbers of vertices, textures and normals of the meshes before the
-    # mesh of the loop. The indices of this mesh grow by these numbers.
+    # The indices of a mesh grow by the numbers of vertices, textures and normals before it.
     vertex_count = texture_count = normal_count = 0
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
         normal_ids.append(mesh.normal_ids + normal_count)
-        shifted_ids = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
-        texture_ids.append(shifted_ids.astype(np.int32))
+        is_plain = mesh.texture_ids == NO_TEXTURE
+        texture_ids.append(np.where(is_plain, NO_TEXTURE, mesh.texture_ids + texture_count))
         vertex_count += len(mesh.vertices)
         texture_count += len(mesh.textures)
         normal_count += mesh.normal_ids.max() + 1
+    gloss = None
+    if any(mesh.gloss is not None for mesh in meshes):
+        rows = [_MATTE.repeat(len(m.faces), 0) if m.gloss is None else m.gloss for m in meshes]
+        gloss = np.concatenate(rows)
+    gloss_textures: tuple[np.ndarray, ...] = ()
+    if any(mesh.gloss_textures for mesh in meshes):
+        lists = [m.gloss_textures or (_NEUTRAL_GLOSS,) * len(m.textures) for m in meshes]
+        gloss_textures = tuple(texture for textures in lists for texture in textures)
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),
         corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
-        texture_ids=np.concatenate(texture_ids),
+        texture_ids=np.concatenate(texture_ids).astype(np.int32),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
-        gloss=_concatenate_gloss(meshes),
-        gloss_textures=_concatenate_gloss_textures(meshes),
+        gloss=gloss,
+        gloss_textures=gloss_textures,
         normal_ids=np.concatenate(normal_ids),
     )
-
-
-def _concatenate_gloss(meshes: Sequence[Mesh]) -> Float[np.ndarray, "F 3"] | None:
-    """Concatenate roughness, metallic and specular factor. None if all meshes are matte."""
-    if all(mesh.gloss is None for mesh in meshes):
-        return None
-    matte = [_MATTE.repeat(len(mesh.faces), 0) for mesh in meshes]
-    pairs = zip(meshes, matte, strict=True)
-    return np.concatenate([rows if mesh.gloss is None else mesh.gloss for mesh, rows in pairs])
-
-
-def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
-    """Concatenate gloss textures. Meshes without them get the factor 1, unless no mesh has any."""
-    if not any(mesh.gloss_textures for mesh in meshes):
-        return ()
-    neutral = (_NEUTRAL_GLOSS,)
-    lists = [mesh.gloss_textures or neutral * len(mesh.textures) for mesh in meshes]
-    return tuple(texture for textures in lists for texture in textures)
 
 
 def normalize(mesh: Mesh) -> Mesh:
@@ -470,16 +445,11 @@ def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
     from outside. The order of their corners is therefore reversed. The matrix is multiplied by
     columns (x, y, z, 1).
     """
-    is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
-    corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
-    return replace(
-        mesh,
-        vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
-        faces=mesh.faces[:, corner_order],
-        corner_colors=mesh.corner_colors[:, corner_order],
-        corner_uvs=mesh.corner_uvs[:, corner_order],
-        normal_ids=mesh.normal_ids[:, corner_order],
-    )
+    arrays: dict[str, Any] = {"vertices": mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]}
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        for name in ("faces", "corner_colors", "corner_uvs", "normal_ids"):
+            arrays[name] = getattr(mesh, name)[:, [0, 2, 1]]
+    return replace(mesh, **arrays)
 
 
 def subdivide(mesh: Mesh, vertices: float) -> Mesh:
@@ -535,10 +505,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(small_faces, name), getattr(divided, name)])
-        for name in PER_FACE
-        # The array `gloss` of a matte mesh is None.
-        if getattr(mesh, name) is not None
+        name: np.concatenate([rows, getattr(divided, name)])
+        for name, rows in _rows_of_faces(small_faces).items()
     }
     # The divided mesh has all old vertices, so the vertex
     # indices of the small faces are valid in it, too.
@@ -547,23 +515,25 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
     """Return a copy of a mesh with some faces (indices, mask or slice) and all of its vertices."""
-    # The array `gloss` of a matte mesh is None.
-    rows = {name: getattr(mesh, name) for name in PER_FACE if getattr(mesh, name) is not None}
+    rows: dict[str, Any] = _rows_of_faces(mesh)
     return replace(mesh, **{name: values[faces] for name, values in rows.items()})
+
+
+def _rows_of_faces(mesh: Mesh) -> dict[str, np.ndarray]:
+    """Return the arrays of a mesh with one row for each face. A matte mesh has no gloss."""
+    return {name: getattr(mesh, name) for name in PER_FACE if getattr(mesh, name) is not None}
 
 
 def _quartered(mesh: Mesh) -> Mesh:
     """Return a copy of a mesh in which each face is divided into four triangles (`subdivide`)."""
-    edge_ends, edge_of_side = _shared_edges(mesh.faces)
+    edge_ends, edge_of_side = shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
-    # The midpoints follow the old vertices, so their indices begin at V.
-    midpoint_vertices = len(mesh.vertices) + edge_of_side
-    # Vertices of the three corners and of the three midpoints of each face, shape (F, 6).
-    points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
+    # Vertices of the three corners and of the three midpoints of each face, shape (F, 6). The
+    # midpoints follow the old vertices.
+    points = np.concatenate([mesh.faces, len(mesh.vertices) + edge_of_side], axis=1)
     # Two faces share the normal in the middle of an edge if they share the normals at both ends.
-    _, normal_of_side = _shared_edges(mesh.normal_ids)
-    midpoint_normals = mesh.normal_ids.max() + 1 + normal_of_side
-    normals = np.concatenate([mesh.normal_ids, midpoint_normals], axis=1)
+    _, normal_of_side = shared_edges(mesh.normal_ids)
+    normals = np.concatenate([mesh.normal_ids, mesh.normal_ids.max() + 1 + normal_of_side], axis=1)
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, midpoints]),
@@ -576,17 +546,15 @@ def _quartered(mesh: Mesh) -> Mesh:
     )
 
 
-def _shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
+def shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
     """List the ends (E, 2) of the edges of a mesh, and the edge (F, 3) of each side of a face."""
     vertex_count = faces.max() + 1
     # The two vertices of each side, the smaller index first, shape (3 F, 2).
     side_ends = np.sort(faces[:, EDGES].reshape(-1, 2), axis=1)
     # A side from vertex a to b gets the key a · V + b. np.unique sorts numbers faster than pairs.
-    side_keys = side_ends @ [vertex_count, 1]
-    edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
+    edge_keys, edge_of_side = np.unique(side_ends @ [vertex_count, 1], return_inverse=True)
     # Dividing the key a · V + b by V gives the quotient a and the remainder b.
-    edge_ends = np.stack(np.divmod(edge_keys, vertex_count), axis=1)
-    return edge_ends, edge_of_side.reshape(-1, 3)
+    return np.stack(np.divmod(edge_keys, vertex_count), axis=1), edge_of_side.reshape(-1, 3)
 
 
 def _interpolate_quarters(

@@ -82,32 +82,15 @@ def vertex_normals(
     return unit(sums.masked_fill(is_canceled, 0)).T.to(vertices.dtype)
 
 
-def plain_face_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "F 3"]:
-    """Compute the unit normals of faces with NumPy, without a gradient.
-
-    Unlike `face_normals`, this function does not correct the rounding errors of
-    triangles with a very small angle. A face without area has the normal zero.
-    """
-    doubled_vectors = doubled_area_vectors(vertices, faces)
-    lengths = np.linalg.norm(doubled_vectors, axis=1, keepdims=True)
-    zeros = np.zeros_like(doubled_vectors)
-    return np.divide(doubled_vectors, lengths, out=zeros, where=lengths > 0)
-
-
 def doubled_area_vectors(
     vertices: Num[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Num[np.ndarray, "F 3"]:
     """Compute a vector along the normal of each face, whose length is twice the face area."""
     # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
-    # The edge a leads from the first corner of a face to the second
-    # corner, and the edge b to the third corner. The cross product a
-    # × b is written out, because np.cross is several times slower.
-    ax, ay, az = corners[:, 1] - corners[:, 0]
-    bx, by, bz = corners[:, 2] - corners[:, 0]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    edges = corners[:, 1:] - corners[:, :1]
+    # np.cross is several times slower.
+    return np.stack(_components(edges[:, 0], edges[:, 1]), axis=1)
 
 
 def area_vectors(
@@ -140,8 +123,7 @@ class _AreaVectors(torch.autograd.Function):
         edges then do not overflow. The area vectors become smaller by the square of this power.
         """
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
-        # Positions of the corners of F faces,
-        # shape (3 components, 3 corners, F).
+        # Positions of the corners of F faces, shape (3 components, 3 corners, F).
         corners = corners.unflatten(1, (3, -1))
         # The edges from the first corner of each face to the second
         # and the third corner, shape (3 components, 2 edges, F).
@@ -174,17 +156,10 @@ class _AreaVectors(torch.autograd.Function):
         # With g for `upstream`, the gradient of g · (u × v) is v × g
         # with respect to u, and g × u with respect to v. The edge u
         # ends at the second corner, and the edge v at the third corner.
-        second_corner_gradient = _cross(edge_v, upstream)
-        third_corner_gradient = _cross(upstream, edge_u)
-        # The first corner is the start of both
-        # edges, so the signs are reversed.
-        first_corner_gradient = -second_corner_gradient - third_corner_gradient
-        # Shape (3 components, 3 F corners): all first
-        # corners, then all second and all third corners.
-        corner_gradients = torch.cat(
-            [first_corner_gradient, second_corner_gradient, third_corner_gradient], dim=1
-        )
-        corner_gradients = corner_gradients.div_(scale)
+        second, third = _cross(edge_v, upstream), _cross(upstream, edge_u)
+        # The first corner is the start of both edges, so the signs are reversed. Shape
+        # (3 components, 3 F corners): all first corners, then all second and all third corners.
+        corner_gradients = torch.cat([-second - third, second, third], dim=1).div_(scale)
         gradient = _sum_at_vertices(corner_gradients, faces, ctx.vertex_shape[0], ctx.dtype)
         return gradient.T, None
 
@@ -240,9 +215,14 @@ def _cross(u: Float[Tensor, "3 N"], v: Float[Tensor, "3 N"]) -> Float[Tensor, "3
     Unlike torch.linalg.cross, this function gives exactly zero for parallel
     vectors, because it does not fuse multiplications and additions.
     """
+    return torch.stack(_components(u, v))
+
+
+def _components(u: Any, v: Any) -> list[Any]:
+    """Compute the components of cross products of vectors with components along the first axis."""
     ux, uy, uz = u
     vx, vy, vz = v
-    return torch.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
+    return [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx]
 
 
 def _exact_cross(
@@ -255,14 +235,9 @@ def _exact_cross(
     """
     u, u_error = _difference(b, a)
     v, v_error = _difference(c, a)
-    ux, uy, uz = u
-    vx, vy, vz = v
-    # The components of u × v, with the rounding
-    # errors of the products added back.
-    x = _difference_of_products(uy, vz, uz, vy)
-    y = _difference_of_products(uz, vx, ux, vz)
-    z = _difference_of_products(ux, vy, uy, vx)
-    product = torch.stack([x, y, z])
+    # The components of u × v, with the rounding errors of the products added back.
+    first, second = [1, 2, 0], [2, 0, 1]
+    product = _difference_of_products(u[first], v[second], u[second], v[first])
     # (u + u_error) × (v + v_error) = u × v + u × v_error + u_error × v, because
     # u_error × v_error is negligible.
     return product + (_cross(u, v_error) + _cross(u_error, v))
@@ -281,7 +256,7 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return rounded, error_of_a - error_of_b
 
 
-def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
+def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Compute a · b, and the rounding error of this product (Dekker 1971).
 
     The binary digits of each factor are split into an upper and a lower half. Products of two
@@ -296,7 +271,7 @@ def _product(a: Float[Tensor, " N"], b: Float[Tensor, " N"]) -> tuple[Tensor, Te
     return rounded, error + a_low * b_low
 
 
-def _halves(numbers: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
+def _halves(numbers: Tensor) -> tuple[Tensor, Tensor]:
     """Split numbers into the upper and the lower half of their binary digits (Dekker 1971).
 
     Upper and lower halves add up to exactly the given numbers.
@@ -307,10 +282,8 @@ def _halves(numbers: Float[Tensor, " N"]) -> tuple[Tensor, Tensor]:
     return high, numbers - high
 
 
-def _difference_of_products(
-    a: Float[Tensor, " N"], b: Tensor, c: Tensor, d: Tensor
-) -> Float[Tensor, " N"]:
-    """Compute a · b - c · d for N quadruples of numbers, almost without rounding errors."""
+def _difference_of_products(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Compute a · b - c · d for tensors of one shape, almost without rounding errors."""
     product_ab, error_ab = _product(a, b)
     product_cd, error_cd = _product(c, d)
     rounded, error = _difference(product_ab, product_cd)

@@ -41,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import InputError, as_tensor, require_bounded, require_flag
+from renderer.errors import InputError, as_tensor, require_flag
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
@@ -108,9 +108,7 @@ class Gloss:
         """
         require_mesh("mesh", mesh)
         face_count = len(mesh.faces)
-        columns = []
-        for values in self.checked(face_count):
-            columns.append(values.detach().cpu().expand(face_count))
+        columns = [values.detach().cpu().expand(face_count) for values in self.checked(face_count)]
         textures = mesh.gloss_textures if self.textured else ()
         by_face = torch.stack(columns, dim=1).float().numpy()
         return replace(mesh, gloss=by_face, gloss_textures=textures)
@@ -137,8 +135,8 @@ class Gloss:
             if isinstance(given, int | float):
                 # `as_tensor` would round a Python number to float32.
                 values = torch.tensor(float(given), dtype=torch.float64)
-            require_bounded(**{name: values})
             has_right_shape = values.shape in ((), (1,), (faces,))
+            # A comparison with NaN is False, so `not` also finds NaN.
             if not has_right_shape or not (values.min() >= 0 and values.max() <= 1):
                 raise InputError(
                     f"gloss: {name} has shape {tuple(values.shape)} or values outside [0, 1]: "
@@ -164,11 +162,6 @@ class SampleGloss(NamedTuple):
     metallic: Tensor
     specular_factor: Tensor
 
-    @property
-    def has_metal(self) -> bool:
-        """Whether a sample is partly metal, or the gradient of `metallic` is needed."""
-        return self.metallic.requires_grad or bool(self.metallic.any())
-
     def at(self, samples: Tensor | slice) -> SampleGloss:
         """Return the gloss of some of the samples."""
         return SampleGloss(*(at_samples(values, samples) for values in self))
@@ -186,10 +179,12 @@ class SampleGloss(NamedTuple):
         albedo, and None if no sample is metallic. The second has the color of the light.
         The cosine is that between the normal and the direction to the camera.
         """
-        terms = (DIELECTRIC, SCHLICK, EDGE) if self.has_metal else (DIELECTRIC,)
+        # The terms of metals are also needed for the gradient of `metallic`.
+        has_metal = self.metallic.requires_grad or bool(self.metallic.any())
+        terms = (DIELECTRIC, SCHLICK, EDGE) if has_metal else (DIELECTRIC,)
         dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
         white = (1 - self.metallic) * self.specular_factor * dielectric
-        if not metal_terms:
+        if not has_metal:
             return None, white
         schlick, edge = metal_terms
         # A metal reflects the fraction albedo · SCHLICK + EDGE. The color of the light stays
@@ -206,10 +201,8 @@ class SampleGloss(NamedTuple):
         """
         cosine = (normals * toward).sum(1).clamp(0, 1)
         colored, white = self.lobes(cosine, degree=0)
-        white_radiance = white[0] * _UNIFORM_COEFFICIENT
-        if colored is None:
-            return None, white_radiance
-        return colored[0] * _UNIFORM_COEFFICIENT, white_radiance
+        colored_radiance = None if colored is None else colored[0] * _UNIFORM_COEFFICIENT
+        return colored_radiance, white[0] * _UNIFORM_COEFFICIENT
 
     def coat_transmittance(self, cosine: Tensor) -> Tensor:
         """Compute the fraction of a light beam that passes the dielectric coat.
@@ -234,9 +227,8 @@ class SampleGloss(NamedTuple):
         """
         # Factors B_l of the light that the coat reflects: one row for each degree l, one column
         # for each sample.
-        coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ roughness_polynomials(
-            self.roughness
-        )
+        polynomials = roughness_polynomials(self.roughness)
+        coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ polynomials
         # Factors A_l without a coat, one for each SH coefficient of the light.
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
@@ -330,16 +322,22 @@ def sample_gloss(
     # A given gloss uses the textures of the mesh only if its field `textured` is True.
     gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
     if gloss is None:
-        gloss = _gloss_of_mesh(mesh)
-    if gloss is None:
-        return None
+        if mesh.gloss is None:
+            return None
+        has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
+        rows = mesh.gloss[:1] if has_one_gloss else mesh.gloss
+        gloss = Gloss(*torch.from_numpy(rows).unbind(1))
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
-    roughness, metallic, specular_factor = (_at_faces(column, fragments) for column in columns)
+    # A single value, which all faces share, stays as it is.
+    roughness, metallic, specular_factor = (
+        values
+        if len(values) == 1
+        else values.index_select(0, fragments.faces).index_select(0, fragments.sample_to_seen_face)
+        for values in columns
+    )
     if gloss_textures:
-        textures = []
-        for eight_bit_texture in gloss_textures:
-            factors = torch.from_numpy(eight_bit_texture).to(fragments.coverage) / 255
-            textures.append(Texture.from_values(factors))
+        factors = [torch.from_numpy(texture).to(fragments.coverage) for texture in gloss_textures]
+        textures = [Texture.from_values(values / 255) for values in factors]
         # The two channels of a texture are factors for the roughness and for metallic.
         roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)
         roughness = roughness * roughness_factor
@@ -353,27 +351,6 @@ def sample_gloss(
     return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, specular_factor)
 
 
-def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
-    """Convert the array `Mesh.gloss` to a `Gloss`."""
-    if mesh.gloss is None:
-        return None
-    has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
-    rows = mesh.gloss[:1] if has_one_gloss else mesh.gloss
-    roughness, metallic, specular_factor = torch.from_numpy(rows).unbind(1)
-    return Gloss(roughness, metallic, specular_factor)
-
-
-def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
-    """Look up the value of the face that each sample shows.
-
-    A single value, which all faces share, is returned as it is.
-    """
-    if len(face_values) == 1:
-        return face_values
-    seen_face_values = face_values.index_select(0, fragments.faces)
-    return seen_face_values.index_select(0, fragments.sample_to_seen_face)
-
-
 def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
     """Compute unit vectors from the S samples of a view to the camera.
 
@@ -383,8 +360,7 @@ def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float
     eye = fragments.eye.to(vertices)
     # `eye` is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with
     # the direction to an orthographic camera.
-    has_perspective = bool(eye[3])
-    if not has_perspective:
+    if not eye[3]:
         return eye[None, :3]
     points = fragments.interpolate(vertices[fragments.corners])
     return unit((eye[:3] - points).T).T

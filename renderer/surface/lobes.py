@@ -110,7 +110,8 @@ class ViewFrame(NamedTuple):
         axes in the order y, z, x. The coefficients in world axes are
         `frame.to_world(frame.harmonics(lobes))`.
         """
-        degree = _degree_of_lobes(lobes)
+        # There are M = (degree + 1) (degree + 2) / 2 lobe functions.
+        degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
         coefficients = self._harmonics_in_sample_axes(lobes, degree)
         if self.tilt is None:
             return coefficients
@@ -192,10 +193,7 @@ class ViewAxis(NamedTuple):
 
     def for_columns(self, coefficients: Tensor) -> ViewAxis:
         """Convert both angles to the shape (1,) and to the dtype and device of coefficients."""
-        return ViewAxis(
-            polar=self.polar.for_columns(coefficients),
-            azimuth=self.azimuth.for_columns(coefficients),
-        )
+        return ViewAxis(*(angle.for_columns(coefficients) for angle in self))
 
     def to_view(self, vectors: Tensor) -> Components:
         """Rotate vectors, shape (S, 3), from world axes to view axes."""
@@ -233,11 +231,8 @@ class Tilt(NamedTuple):
         chosen so that cos b ≥ 0.
         """
         x, y, z = directions
-        sine_b = x
         cosine_b = (1 - x**2).sqrt()
-        sine_a = -y / cosine_b
-        cosine_a = z / cosine_b
-        return Tilt(torch.stack([sine_b, cosine_b, sine_a, cosine_a]))
+        return Tilt(torch.stack([x, cosine_b, -y / cosine_b, z / cosine_b]))
 
     def to_sample(self, vectors: Components) -> Components:
         """Rotate one vector per sample from view axes to sample axes."""
@@ -245,11 +240,6 @@ class Tilt(NamedTuple):
         # rotates back about x first.
         rotated_about_x = rotate_about_x(vectors, self.about_x.reversed())
         return rotate_about_y(rotated_about_x, self.about_y.reversed())
-
-
-def _degree_of_lobes(lobes: Tensor) -> int:
-    """Find the degree of lobe functions from their number M = (degree + 1) (degree + 2) / 2."""
-    return (math.isqrt(8 * len(lobes) + 1) - 3) // 2
 
 
 def _sine_exponents(orders: Tensor) -> Tensor:
@@ -275,18 +265,12 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
 
     There are 2 degree + 1 rows: sin |m|φ for m < 0, and then cos mφ for m ≥ 0.
     """
-    real_parts: list[Tensor] = []
-    imaginary_parts: list[Tensor] = []
-    real = x
-    imaginary = y
+    rows = [torch.ones_like(x)]
+    real, imaginary = x, y
     for _ in range(degree):
-        real_parts.append(real)
-        imaginary_parts.append(imaginary)
-        next_real = real * x - imaginary * y
-        next_imaginary = real * y + imaginary * x
-        real = next_real
-        imaginary = next_imaginary
-    return torch.stack([*reversed(imaginary_parts), torch.ones_like(x), *real_parts])
+        rows = [imaginary, *rows, real]
+        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+    return torch.stack(rows)
 
 
 def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
@@ -317,12 +301,9 @@ def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     A rotation does not mix coefficients of different degrees. The matrix is zero outside one block
     per degree on its diagonal, so only the blocks are multiplied.
     """
-    products: list[Tensor] = []
-    for l in range(math.isqrt(len(coefficients))):
-        # Indices of the harmonics of degree l.
-        band = slice(l * l, (l + 1) * (l + 1))
-        products.append(rotation[band, band].to(coefficients) @ coefficients[band])
-    return torch.cat(products)
+    degrees = range(math.isqrt(len(coefficients)))
+    slices = [slice(l * l, (l + 1) * (l + 1)) for l in degrees]
+    return torch.cat([rotation[b, b].to(coefficients) @ coefficients[b] for b in slices])
 
 
 @cache_tensors
@@ -400,10 +381,8 @@ def coat_mean(roughness: Tensor) -> Tensor:
     The fraction is E_avg = 2 ∫ E(μ) μ dμ over 0 ≤ μ ≤ 1, with the reflected
     fraction E(μ) of a single beam (`coat_albedo`). The result is differentiable.
     """
-    reflected_irradiance = (
-        coat_irradiance_factors(0).to(roughness) @ roughness_polynomials(roughness)
-    )[0]
-    return reflected_irradiance / math.pi
+    factors = coat_irradiance_factors(0).to(roughness)
+    return (factors @ roughness_polynomials(roughness))[0] / math.pi
 
 
 def _coat_coefficients() -> Tensor:
@@ -418,48 +397,23 @@ def _coat_coefficients() -> Tensor:
     return _table(COMMON_DEGREE)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
 
-# Chebyshev polynomials have arguments in [-1, 1]. The following four functions map
-# cosines and values of the roughness to such arguments, and back.
-
-
-def _cosine_to_argument(cosine: Tensor) -> Tensor:
-    """Map cosines in [0, 1] to arguments of Chebyshev polynomials in [-1, 1].
-
-    Small cosines are spread over a wider range, because lobes change quickly at grazing angles.
-    """
-    return 4 * cosine / (cosine + 1) - 1
-
-
-def _argument_to_cosine(argument: Tensor) -> Tensor:
-    """Map arguments in [-1, 1] to cosines in [0, 1], as the inverse of `_cosine_to_argument`."""
-    return (argument + 1) / (3 - argument)
-
-
-def _roughness_to_argument(roughness: Tensor) -> Tensor:
-    """Map values of the roughness from [MIN_ROUGHNESS, 1] to arguments in [-1, 1]."""
-    return 1 - 2 * roughness.log() / math.log(MIN_ROUGHNESS)
-
-
-def _argument_to_roughness(argument: Tensor) -> Tensor:
-    """Map arguments in [-1, 1] to values of the roughness in [MIN_ROUGHNESS, 1]."""
-    return MIN_ROUGHNESS ** ((1 - argument) / 2)
-
-
 def roughness_polynomials(roughness: Tensor) -> Tensor:
-    """Evaluate Chebyshev polynomials in the roughness.
+    """Evaluate Chebyshev polynomials in the roughness, differentiably.
 
-    Functions of the roughness in this module are sums of these polynomials. The
-    result is differentiable with respect to the roughness.
+    Their argument 1 - 2 log r / log MIN_ROUGHNESS is in [-1, 1]. Functions of the roughness in
+    this module are sums of these polynomials.
     """
-    return _chebyshev(_roughness_to_argument(roughness), ROUGHNESS_POLYNOMIALS) / roughness**2
+    argument = 1 - 2 * roughness.log() / math.log(MIN_ROUGHNESS)
+    return _chebyshev(argument, ROUGHNESS_POLYNOMIALS) / roughness**2
 
 
 def _cosine_polynomials(cosine: Tensor, count: int) -> Tensor:
-    """Evaluate Chebyshev polynomials in the cosine.
+    """Evaluate Chebyshev polynomials in the cosine, of which functions of the cosine are sums.
 
-    Functions of the cosine in this module are sums of these polynomials.
+    Their argument 4 c / (c + 1) - 1 is in [-1, 1]. It spreads small cosines over a wider range,
+    because lobes change quickly at grazing angles.
     """
-    return _chebyshev(_cosine_to_argument(cosine), count)
+    return _chebyshev(4 * cosine / (cosine + 1) - 1, count)
 
 
 def _chebyshev(argument: Tensor, count: int) -> Tensor:
@@ -471,16 +425,14 @@ def _chebyshev(argument: Tensor, count: int) -> Tensor:
     return torch.stack(values)
 
 
-def _chebyshev_nodes(count: int) -> Tensor:
-    """Compute the zeros of the Chebyshev polynomial of degree `count`, shape (count,)."""
+def _nodes_and_interpolation(count: int) -> tuple[Tensor, Tensor]:
+    """Return the zeros of a Chebyshev polynomial, and the matrix from values there to coefficients.
+
+    The degree of the polynomial is `count`.
+    """
     steps = torch.arange(count, dtype=torch.float64) + 0.5
-    angles = math.pi * steps / count
-    return angles.cos()
-
-
-def _interpolation(count: int) -> Tensor:
-    """Return the matrix that maps values at `_chebyshev_nodes` to Chebyshev coefficients."""
-    return torch.linalg.inv(_chebyshev(_chebyshev_nodes(count), count).T)
+    nodes = (math.pi * steps / count).cos()
+    return nodes, torch.linalg.inv(_chebyshev(nodes, count).T)
 
 
 @cache_tensors
@@ -494,13 +446,15 @@ def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     """Interpolate the lobe functions by Chebyshev polynomials T in the roughness and the cosine.
 
     A lobe function is Σ_k Σ_p a_kp T_k(y) T_p(x). The argument y stands for the roughness (see
-    `_roughness_to_argument`), and x for the cosine (see `_cosine_to_argument`). When a mirror turns
+    `roughness_polynomials`), and x for the cosine (see `_cosine_polynomials`). When a mirror turns
     by θ, the reflected light turns by 2 θ. A harmonic of degree l of this light therefore needs
     polynomials up to degree 2 l in cos θ. The axes are the Fresnel term, the pair (l, m), k and p.
     """
-    cosine_count = 2 * degree + EXTRA_POLYNOMIALS
-    roughnesses = _argument_to_roughness(_chebyshev_nodes(ROUGHNESS_POLYNOMIALS))
-    cosines = _argument_to_cosine(_chebyshev_nodes(cosine_count))
+    nodes, interpolation = _nodes_and_interpolation(2 * degree + EXTRA_POLYNOMIALS)
+    roughness_nodes, roughness_interpolation = _nodes_and_interpolation(ROUGHNESS_POLYNOMIALS)
+    # The inverses of the arguments of `_cosine_polynomials` and `roughness_polynomials`.
+    cosines = (nodes + 1) / (3 - nodes)
+    roughnesses = MIN_ROUGHNESS ** ((1 - roughness_nodes) / 2)
     # Axes: Fresnel term, pair (l, m), roughness, cosine.
     blocks = [
         lobe_integrals(block, roughnesses, degree) for block in cosines.split(COSINES_AT_ONCE)
@@ -511,8 +465,8 @@ def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     return torch.einsum(
         "tmrc,kr,pc->tmkp",
         values,
-        _interpolation(ROUGHNESS_POLYNOMIALS) * roughnesses**2,
-        _interpolation(cosine_count),
+        roughness_interpolation * roughnesses**2,
+        interpolation,
     ).contiguous()
 
 

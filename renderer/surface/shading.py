@@ -121,14 +121,18 @@ def glossy_radiance(
     specular_blocks = []
     for first in range(0, len(shading_normals), BLOCK):
         block = slice(first, first + BLOCK)
-        reflected = _lobe_radiance(
-            shading_normals[block],
-            at_samples(to_camera, block),
-            light,
-            albedo[block],
-            gloss.at(block),
+        normals_here, gloss_here = shading_normals[block], gloss.at(block)
+        # One row for each SH coefficient, one column for each sample. The reflection of metals
+        # (colored) is multiplied by the albedo. All other specular reflection (white) has the
+        # color of the light.
+        colored, white, frame = gloss_here.specular_transfer(
+            normals_here, at_samples(to_camera, block), harmonics.degree_of(light)
         )
-        coat_irradiance = _coat_irradiance(shading_normals[block].T, light, gloss.at(block))
+        light_in_frame = frame.from_world(light).T
+        reflected = light_in_frame @ white
+        if colored is not None:
+            reflected = reflected + albedo[block].T * (light_in_frame @ colored)
+        coat_irradiance = _coat_irradiance(normals_here.T, light, gloss_here)
         # `radiance` below lets all light reach the diffuse layer. Subtract the diffuse
         # reflection of the light that the coat reflects and that does not reach it.
         specular_blocks.append(reflected - diffuse_albedo[block].T * coat_irradiance)
@@ -138,26 +142,6 @@ def glossy_radiance(
     diffuse = radiance(fragments, vertices, light, diffuse_albedo, normals)
     zeros = specular.new_zeros(COLORS, len(fragments.pixels))
     return diffuse + zeros.index_add(1, fragments.sample_to_pixel, specular).to(diffuse)
-
-
-def _lobe_radiance(
-    normals: Float[Tensor, "S 3"],
-    to_camera: Float[Tensor, "_ 3"],
-    light: Float[Tensor, "K 3"],
-    albedo: Float[Tensor, "S 3"],
-    gloss: SampleGloss,
-) -> Float[Tensor, "3 S"]:
-    """Compute the radiance of specular reflection at S samples under environment light."""
-    degree = harmonics.degree_of(light)
-    # `colored` and `white` have one row for each SH coefficient, one column for each sample.
-    # The reflection of metals (colored) is multiplied by the albedo. All other specular
-    # reflection (white) has the color of the light.
-    colored, white, frame = gloss.specular_transfer(normals, to_camera, degree)
-    light_in_frame = frame.from_world(light).T
-    reflected = light_in_frame @ white
-    if colored is not None:
-        reflected = reflected + albedo.T * (light_in_frame @ colored)
-    return reflected
 
 
 def _coat_irradiance(
@@ -229,10 +213,8 @@ class _HarmonicSum(torch.autograd.Function):
     def backward(ctx: Any, upstream: Float[Tensor, "C N"]) -> tuple[Tensor | None, Tensor | None]:
         """Compute the gradients with respect to the normals and the coefficients."""
         normals, gradient = ctx.saved_tensors
-        normal_gradient = None
+        normal_gradient = (gradient * upstream).sum(1) if ctx.needs_input_grad[0] else None
         coefficient_gradient = None
-        if ctx.needs_input_grad[0]:
-            normal_gradient = (gradient * upstream).sum(1)
         if ctx.needs_input_grad[1]:
             # One tensor for each of the K harmonics, with its values at the normals.
             values = harmonics.evaluate_harmonics(normals, range((ctx.degree + 1) ** 2))
@@ -271,13 +253,7 @@ class _Irradiance(torch.autograd.Function):
         """Compute the irradiance at N normals."""
         directions, lengths = unit_vectors(normals)
         directions = directions.to(light.dtype)
-        polynomial = _IrradiancePolynomial(light)
-        # Each pair has the irradiance of a block of normals, and its gradient.
-        pairs = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
-        value = torch.cat([block_value for block_value, _ in pairs], dim=-1)
-        gradient = torch.cat([block_gradient for _, block_gradient in pairs], dim=-1)
-        # Deleting the list releases the memory of the blocks.
-        del pairs
+        value, gradient = _evaluate_polynomial(light, directions)
         zero_normals = torch.nonzero(lengths == 0).squeeze(1)
         if len(zero_normals):
             degree = math.isqrt(len(light)) - 1
@@ -317,8 +293,10 @@ class _Irradiance(torch.autograd.Function):
         return normal_gradient, light_gradient
 
 
-class _IrradiancePolynomial:
-    """Irradiance under one light, as a polynomial of the unit normal n.
+def _evaluate_polynomial(
+    light: Float[Tensor, "K 3"], directions: Float[Tensor, "3 N"]
+) -> tuple[Tensor, Tensor]:
+    """Compute the irradiance and its gradient at N unit normals n.
 
     The irradiance is c + a · n + p(n). The constant c comes from the harmonics of
     degree 0, and the linear function a · n from those of degree 1. On the unit
@@ -326,52 +304,34 @@ class _IrradiancePolynomial:
     homogeneous polynomial p(n) of degree d. Its gradient ∇p is a sum over the J
     monomials of degree d - 1. All other degrees do not change the irradiance.
 
-    Attributes:
-        degree: Degree d of p.
-        even_gradient: Coefficients of ∇p in the monomials, with one row for each
-            of 3 directions of the derivative and 3 colors, shape (9, J).
-        linear_gradient: The vector a, with one row for each of 3 directions and 3
-            colors, shape (9, 1).
-        constant: The constant c for 3 colors, shape (3, 1).
+    The irradiance has the shape (3 colors, N), and the gradient (3 components, 3 colors, N). Only
+    its tangential component is the derivative.
     """
-
-    def __init__(self, light: Float[Tensor, "K 3"]):
-        """Compute the coefficients of the irradiance c + a · n + p(n)."""
-        light_degree = math.isqrt(len(light)) - 1
-        matrices = _gradient_of_light(light_degree, light.dtype, light.device)
-        # Gradients with the axes: direction of the derivative, coefficient (those of ∇p
-        # first, then the one of a), color.
-        gradients = matrices @ light[: matrices.shape[2]]
-        # One row for each direction and color, one column for each coefficient.
-        gradients_by_row = gradients.mT.flatten(0, 1)
-        self.degree = _even_degree(light_degree)
-        self.even_gradient = gradients_by_row[:, :-1]
-        self.linear_gradient = gradients_by_row[:, -1:]
-        # For degree 0, the irradiance is π U_0 Y_0 with the coefficient U_0 of the light
-        # and the harmonic Y_0 = 1 / √(4π).
-        self.constant = light[:1].T * math.sqrt(math.pi / 4)
-
-    def evaluate(self, directions: Float[Tensor, "3 N"]) -> tuple[Tensor, Tensor]:
-        """Compute the irradiance and its gradient at N unit normals n.
-
-        The irradiance is c + a · n + p(n), with the constant c, the vector a and the polynomial p
-        of this object. The irradiance has the shape (3 colors, N), and the gradient (3 components,
-        3 colors, N). Only its tangential component is the derivative.
-        """
-        # A tensor of monomials with a name would stay in memory until the function
-        # returns.
+    light_degree = math.isqrt(len(light)) - 1
+    degree = _even_degree(light_degree)
+    matrices = _gradient_of_light(light_degree, light.dtype, light.device)
+    # Axes of the product: direction of the derivative, coefficient (those of ∇p first, then the
+    # one of a), color. Then one row for each direction and color.
+    coefficients = (matrices @ light[: matrices.shape[2]]).mT.flatten(0, 1)
+    even_gradient, linear_gradient = coefficients[:, :-1], coefficients[:, -1:]
+    linear = linear_gradient.view(3, COLORS).T
+    # For degree 0, the irradiance is π U_0 Y_0 with the coefficient U_0 of the light and the
+    # harmonic Y_0 = 1 / √(4π).
+    constant = light[:1].T * math.sqrt(math.pi / 4)
+    values, gradients = [], []
+    for block in directions.split(BLOCK, dim=1):
+        # A tensor of monomials with a name would stay in memory.
         gradient = torch.addmm(
-            self.linear_gradient,
-            self.even_gradient,
-            harmonics.monomials(directions, self.degree - 1),
+            linear_gradient, even_gradient, harmonics.monomials(block, degree - 1)
         ).unflatten(0, (3, COLORS))
         # Because p(n) = n · ∇p(n) / d, the irradiance is the sum of two terms: first
         # c + (1 - 1/d) a · n, and then n · (a + ∇p(n)) / d, which the loop adds.
-        linear = self.linear_gradient.view(3, COLORS).T
-        value = torch.addmm(self.constant, linear, directions, alpha=1 - 1 / self.degree)
-        for gradient_component, normal_component in zip(gradient, directions, strict=True):
-            value.addcmul_(gradient_component, normal_component, value=1 / self.degree)
-        return value, gradient
+        value = torch.addmm(constant, linear, block, alpha=1 - 1 / degree)
+        for gradient_component, normal_component in zip(gradient, block, strict=True):
+            value.addcmul_(gradient_component, normal_component, value=1 / degree)
+        values.append(value)
+        gradients.append(gradient)
+    return torch.cat(values, dim=-1), torch.cat(gradients, dim=-1)
 
 
 @harmonics.cache_tensors
