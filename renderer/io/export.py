@@ -1,40 +1,28 @@
 """Write meshes to .glb files with colors, textures, normals and cameras."""
 
+import io
+import json
 import math
+import struct
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, as_list, as_path, require_whole
 from renderer.image import decode
 from renderer.io.files import atomic_write
-from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
+from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, require_mesh
 
-if TYPE_CHECKING:
-    # Importing trimesh takes half a second,
-    # so the functions that need it import it.
-    import trimesh
-    from trimesh.visual.material import PBRMaterial
-
-# Temporary names of the vertex attributes for colors and normals.
-# trimesh writes attributes whose names begin with an underscore
-# without changing their values. Before the file is written,
-# `_as_one_mesh` renames the attributes to COLOR_0 and NORMAL.
-_COLOR = "_COLOR_0"
-_NORMAL = "_NORMAL"
-# Name of the specular factor of a material in glTF. trimesh
-# cannot write this factor. It is first appended to the name
-# of the material, and `_as_one_mesh` moves it to its place.
-SPECULAR = "specularFactor"
-# Roughness and metallic of a material without specular reflection.
-MATTE = (1.0, 0.0)
+# Types of the numbers and kinds of the rows of arrays in glTF (3.6.2.2).
+_TYPES = {"float32": 5126, "uint32": 5125}
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+SPECULAR = "KHR_materials_specular"
 
 
 def export_mesh(
@@ -79,7 +67,7 @@ def export_mesh(
         raise InputError(
             f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
         )
-    content = _glb(mesh, unit_normals, cameras, first)
+    content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
@@ -87,129 +75,115 @@ def export_mesh(
         raise InputError(f"the mesh file {path} cannot be written: {error}") from error
 
 
-def _glb(
-    mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first: int | None
-) -> bytes:
-    """Create the content of a .glb file. The first `first` faces are written before all others."""
-    import trimesh
+class _Tree(dict[str, Any]):
+    """JSON object of a .glb file, with its buffer."""
 
-    first_count = len(mesh.faces) if first is None else first
+    def __init__(self) -> None:
+        super().__init__(asset={"version": "2.0"})
+        self.buffer = bytearray()
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append an entry to a list of the object, such as "materials", and return its index."""
+        entries = self.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def add_bytes(self, content: bytes) -> int:
+        """Append bytes to the buffer, and return the index of their view."""
+        view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(content)}
+        self.buffer += content + bytes(-len(content) % 4)
+        return self.add("bufferViews", view)
+
+    def add_array(self, values: np.ndarray) -> int:
+        """Append an array of float32 or uint32, and return the index of its accessor."""
+        rows = values.reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.add_bytes(values.tobytes()),
+            "componentType": _TYPES[values.dtype.name],
+            "count": len(rows),
+            "type": _KINDS[rows.shape[1]],
+            "min": rows.min(axis=0).tolist(),
+            "max": rows.max(axis=0).tolist(),
+        }
+        return self.add("accessors", accessor)
+
+    def add_texture(self, texels: np.ndarray) -> dict[str, int]:
+        """Append an image, and return a reference to its texture."""
+        png = io.BytesIO()
+        Image.fromarray(texels).save(png, "PNG")
+        image = {"bufferView": self.add_bytes(png.getvalue()), "mimeType": "image/png"}
+        return {"index": self.add("textures", {"source": self.add("images", image)})}
+
+    def content(self) -> bytes:
+        """Return the content of the file (4.4)."""
+        self["buffers"] = [{"byteLength": len(self.buffer)}]
+        text = json.dumps(self).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(self.buffer), b"BIN\0") + self.buffer
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _glb(
+    mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first_count: int
+) -> bytes:
+    """Create the content of a .glb file, with y up and linear colors."""
+    tree = _Tree()
+    # Faces with the same key are written together. The key tells whether a face is one of the
+    # first ones, and has the index of the texture and, if the mesh has gloss, its three values.
     is_later = np.arange(len(mesh.faces)) >= first_count
-    # Faces with the same key are written together. The key
-    # is the flag `is_later`, the index of the texture and,
-    # if the mesh has gloss, the three values of the gloss.
-    keys = np.stack([is_later, mesh.texture_ids], axis=1)
-    if mesh.gloss is not None:
-        keys = np.concatenate([keys, mesh.gloss], axis=1)
-    parts = []
+    gloss = [] if mesh.gloss is None else [mesh.gloss]
+    keys = np.column_stack([is_later, mesh.texture_ids, *gloss])
+    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
+    rotation = Y_UP_TO_Z_UP[:3, :3]
+    primitives = []
     for key in np.unique(keys, axis=0):
         has_key = (keys == key).all(1)
-        material = _material(mesh, int(key[1]), key[2:].tolist())
-        parts.append(_part_for_trimesh(mesh, normals, material, has_key))
-    return trimesh.Scene(parts).export(
-        file_type="glb",
-        include_normals=False,
-        tree_postprocessor=partial(_as_one_mesh, cameras=cameras),
-    )
-
-
-def _part_for_trimesh(
-    mesh: Mesh,
-    normals: Float[np.ndarray, "F 3 3"],
-    material: "PBRMaterial",
-    is_in_part: Bool[np.ndarray, " F"],
-) -> "trimesh.Trimesh":
-    """Convert the faces of a mesh with one texture and gloss to a mesh of trimesh, with y up."""
-    import trimesh
-    from trimesh.visual.texture import TextureVisuals
-
-    colors = mesh.corner_colors[is_in_part]
-    uvs = mesh.corner_uvs[is_in_part]
-    # Eight values for each corner: color (3),
-    # texture coordinates (2) and normal (3).
-    corner_values = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
-    vertex_ids, values, faces = _split_vertices(mesh.faces[is_in_part], corner_values)
-    linear_colors = decode(torch.from_numpy(values[:, :3]), "srgb")
-    y_up_to_z_up = Y_UP_TO_Z_UP[:3, :3]
-    # A row vector times this matrix is rotated in
-    # the opposite direction: from z up to y up.
-    positions = mesh.vertices[vertex_ids] @ y_up_to_z_up
-    rotated_normals = values[:, 5:] @ y_up_to_z_up
-    return trimesh.Trimesh(
-        positions,
-        faces,
-        visual=TextureVisuals(uv=values[:, 3:5], material=material),
-        vertex_attributes={
-            _COLOR: linear_colors.float().numpy(),
-            _NORMAL: rotated_normals.astype(np.float32),
-        },
-        process=False,
-    )
-
-
-def _material(mesh: Mesh, texture_id: int, gloss: list[float]) -> "PBRMaterial":
-    """Create the glTF material of one texture and gloss. Its name ends with the specular factor.
-
-    The index is NO_TEXTURE (-1) for no texture, and `gloss` is empty for a matte mesh.
-    """
-    from trimesh.visual.material import PBRMaterial
-
-    texture = None
-    gloss_texture = None
-    if texture_id >= 0:
-        texture = Image.fromarray(mesh.textures[texture_id])
-        if mesh.gloss_textures:
-            factors = mesh.gloss_textures[texture_id]
-            # glTF stores roughness in green and metallic
-            # in blue, so an empty red channel is inserted.
-            gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
-    # Materials need different names. Otherwise trimesh would merge two
-    # images with the same bytes, even if their widths and heights differ.
-    name = f"texture {texture_id}"
-    roughness, metallic = MATTE
-    if gloss:
-        roughness, metallic, specular_factor = gloss
-        name = f"{name}, {SPECULAR} {specular_factor}"
-    return PBRMaterial(
-        name=name,
-        baseColorTexture=texture,
-        metallicRoughnessTexture=gloss_texture,
-        metallicFactor=metallic,
-        roughnessFactor=roughness,
-        doubleSided=True,
-    )
-
-
-def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
-    """Change the JSON object of a .glb file before trimesh writes the file.
-
-    All meshes become primitives of one glTF mesh. Colors, normals and specular factors get their
-    names in glTF, and the cameras are added. trimesh itself would write colors with 8 bits, which
-    is too coarse for dark linear colors. The JSON object is changed in place.
-    """
-    primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
-    for primitive in primitives:
-        attributes = primitive["attributes"]
-        attributes["COLOR_0"] = attributes.pop(_COLOR)
-        attributes["NORMAL"] = attributes.pop(_NORMAL)
-    tree["meshes"] = [{"primitives": primitives}]
-    tree["nodes"] = [{"mesh": 0}]
-    for material in tree["materials"]:
-        # trimesh writes no extensions, so the name of a material ends with its factor.
-        _, found, specular_factor = material["name"].partition(f", {SPECULAR} ")
-        if found:
-            material["extensions"] = {"KHR_materials_specular": {SPECULAR: float(specular_factor)}}
-            tree["extensionsUsed"] = ["KHR_materials_specular"]
-    if cameras:
-        tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
-    z_up_to_y_up = Y_UP_TO_Z_UP.T
+        # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
+        values = [mesh.corner_colors[has_key], mesh.corner_uvs[has_key], normals[has_key]]
+        vertex_ids, values, faces = _split_vertices(
+            mesh.faces[has_key], np.concatenate(values, axis=-1)
+        )
+        attributes = {
+            "POSITION": mesh.vertices[vertex_ids] @ rotation,
+            # v points down in glTF.
+            "TEXCOORD_0": values[:, 3:5] * [1, -1] + [0, 1],
+            "COLOR_0": decode(torch.from_numpy(values[:, :3]), "srgb").numpy(),
+            "NORMAL": values[:, 5:] @ rotation,
+        }
+        primitive = {
+            "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
+            "indices": tree.add_array(faces.astype(np.uint32).ravel()),
+            "material": _add_material(tree, mesh, int(key[1]), key[2:].tolist()),
+        }
+        primitives.append(primitive)
+    tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
     for index, camera in enumerate(cameras):
-        # The axes of a camera in glTF are the same as ours: right, up and back.
-        pose = z_up_to_y_up @ camera.pose()
-        # glTF stores matrices column by column.
-        matrix = pose.T.ravel().tolist()
-        tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": matrix})
-    tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
+        # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
+        # matrices column by column.
+        matrix = (Y_UP_TO_Z_UP.T @ camera.pose()).T.ravel().tolist()
+        lens = tree.add("cameras", _gltf_camera(camera))
+        tree.add("nodes", {"camera": lens, "name": f"view {index}", "matrix": matrix})
+    tree["scene"] = tree.add("scenes", {"nodes": list(range(len(tree["nodes"])))})
+    return tree.content()
+
+
+def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:
+    """Add the material of one texture, or NO_TEXTURE, and gloss, which is empty if matte."""
+    roughness, metallic, *specular_factors = gloss or (1.0, 0.0)
+    model: dict[str, Any] = {"roughnessFactor": roughness, "metallicFactor": metallic}
+    if texture_id != NO_TEXTURE:
+        model["baseColorTexture"] = tree.add_texture(mesh.textures[texture_id])
+        if mesh.gloss_textures:
+            # glTF stores roughness in green and metallic in blue, so an empty red channel is
+            # inserted.
+            factors = np.insert(mesh.gloss_textures[texture_id], 0, 0, axis=2)
+            model["metallicRoughnessTexture"] = tree.add_texture(factors)
+    material = {"pbrMetallicRoughness": model, "doubleSided": True}
+    for specular_factor in specular_factors:
+        material["extensions"] = {SPECULAR: {"specularFactor": specular_factor}}
+        tree["extensionsUsed"] = [SPECULAR]
+    return tree.add("materials", material)
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:

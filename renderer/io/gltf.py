@@ -11,9 +11,9 @@ crosses are divided until their sides are shorter than a texel. The border is
 straight within such a face.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,8 +22,8 @@ from jaxtyping import Float, Int, UInt8
 from renderer.errors import require_memory
 from renderer.image import encode
 from renderer.io.gltf_file import QUANTIZATION, GltfFile, Material, ignored_features, read_material
-from renderer.io.mesh_file import MeshFile, Part, require_bounded
-from renderer.mesh import NO_TEXTURE, Mesh
+from renderer.io.mesh_file import CPU, MeshFile, Part, colored_mesh, require_bounded
+from renderer.mesh import shared_edges
 
 # Kinds of primitives that consist of triangles (5.24.4).
 TRIANGLES = 4
@@ -53,8 +53,7 @@ SKINNED_VERTEX_BYTES = 1000
 MAX_WEIGHT_ERROR = 0.01
 
 
-@dataclass(frozen=True)
-class _Primitive:
+class _Primitive(NamedTuple):
     """Part in its own axes, with V vertices and F faces.
 
     Attributes:
@@ -117,7 +116,7 @@ def _require_memory(file: GltfFile, nodes: list[int]) -> None:
             copies = file.instance_count(index)
             vertex_bytes = SKINNED_VERTEX_BYTES if "skin" in node else VERTEX_BYTES
             needed += copies * int(FACE_BYTES * faces + vertex_bytes * vertices)
-    require_memory("its faces", needed, torch.device("cpu"))
+    require_memory("its faces", needed, CPU)
 
 
 def _read_part(
@@ -155,10 +154,9 @@ def _attributes(
 
     Attributes that nothing uses, such as other texture coordinates, are not read.
     """
-    if DRACO in primitive.get("extensions", {}) and any(
-        "bufferView" not in file.entry("accessors", index)
-        for index in primitive["attributes"].values()
-    ):
+    accessors = [file.entry("accessors", index) for index in primitive["attributes"].values()]
+    is_compressed = DRACO in primitive.get("extensions", {})
+    if is_compressed and not all("bufferView" in accessor for accessor in accessors):
         raise ValueError(f"its arrays are compressed ({DRACO}): export it without compression")
     attributes = {}
     for name, index in primitive["attributes"].items():
@@ -206,7 +204,7 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
     if mode == TRIANGLES or len(indices) < 3:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
     if mode == FAN:
-        first = np.full(max(len(indices) - 2, 0), indices[0])
+        first = np.full(len(indices) - 2, indices[0])
         faces = np.stack([indices[1:-1], indices[2:], first], axis=1)
     else:
         faces = np.lib.stride_tricks.sliding_window_view(indices, 3).copy()
@@ -232,22 +230,21 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
     vertices, faces, corners = _visible(part, vertices)
     if not len(faces):
         return []
-    texture_id = NO_TEXTURE if part.material.texture is None else 0
-    gloss = part.material.gloss
-    mesh = Mesh(
-        vertices=vertices,
-        faces=faces,
-        corner_colors=encode(torch.from_numpy(corners[..., 3:6]), "srgb").float().numpy(),
-        corner_uvs=corners[..., :2].astype(np.float32),
-        texture_ids=np.full(len(faces), texture_id, dtype=np.int32),
-        # `load_mesh` finds the sharp edges of all parts together.
-        normal_ids=faces,
-        textures=() if part.material.texture is None else (part.material.texture,),
-        gloss=None if gloss is None else np.tile(gloss.astype(np.float32), (len(faces), 1)),
-        gloss_textures=(
-            () if part.material.gloss_texture is None else (part.material.gloss_texture,)
-        ),
+    material = part.material
+    mesh = colored_mesh(
+        vertices,
+        faces,
+        encode(torch.from_numpy(corners[..., 3:6]), "srgb").numpy(),
+        corners[..., :2],
+        textures=[] if material.texture is None else [material.texture],
     )
+    if material.gloss is not None:
+        has_texture = material.gloss_texture is not None
+        mesh = replace(
+            mesh,
+            gloss=np.tile(material.gloss.astype(np.float32), (len(faces), 1)),
+            gloss_textures=(material.gloss_texture,) if has_texture else (),
+        )
     normals = corners[..., 6:] if corners[..., 6:].any() else None
     if "skin" not in node:
         return [Part(mesh, normals, pose) for pose in poses]
@@ -271,22 +268,21 @@ def _posed(
         if len(bind) < len(matrices):
             raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
         matrices = matrices @ bind
+    names = [name for name in part.joints if name.startswith("JOINTS")]
+    none = np.zeros((len(part.positions), 0), np.int64)
+    joints = np.hstack([none, *(part.joints[name] for name in names)])
+    weights = np.hstack([none, *(part.joints[n.replace("JOINTS", "WEIGHTS")] for n in names)])
+    # A joint with the weight 0 may be any number, so it is replaced by joint 0.
+    joints = np.where(weights == 0, 0, joints)
+    if not 0 <= joints.min(initial=0) <= joints.max(initial=0) < len(matrices):
+        raise ValueError(
+            f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
+        )
     # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
     blended = np.zeros((len(part.positions), 4, 4))
-    sums = np.zeros(len(part.positions))
-    for name in part.joints:
-        if not name.startswith("JOINTS"):
-            continue
-        weights = part.joints[name.replace("JOINTS", "WEIGHTS")]
-        # A joint with the weight 0 may be any number, so it is replaced by joint 0.
-        joints = np.where(weights == 0, 0, part.joints[name])
-        if not 0 <= joints.min() <= joints.max() < len(matrices):
-            raise ValueError(
-                f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
-            )
-        for joint, weight in zip(joints.T, weights.T, strict=True):
-            blended += weight[:, None, None] * matrices[joint]
-            sums += weight
+    for joint, weight in zip(joints.T, weights.T, strict=True):
+        blended += weight[:, None, None] * matrices[joint]
+    sums = weights.sum(axis=1)
     deviations = np.abs(sums - 1)
     # A comparison with NaN is False, so `not` also finds NaN.
     if not (deviations <= MAX_WEIGHT_ERROR).all():
@@ -323,28 +319,23 @@ MAX_FACES = 10**6
 class _AlphaTexture:
     """Alpha of a texture, which repeats, and its range within rectangles."""
 
-    def __init__(self, texels: np.ndarray) -> None:
-        """Reduce the texels (H, W) to their ranges in blocks of 2^n × 2^n texels."""
+    def __init__(self, texels: UInt8[np.ndarray, "H W"]) -> None:
+        """Compute the minimum and the maximum of the 2^n × 2^n texels from each texel on."""
         self.texels = texels
-        height, width = texels.shape
-        # Twice the texture holds every rectangle that begins within the texture.
-        low = np.pad(texels, ((0, height), (0, width)), mode="wrap")
-        self._levels = [(low, low)]
-        while max(low.shape) > 1:
-            low, high = (
-                np.pad(values, [(0, n % 2) for n in values.shape], mode="edge")
-                for values in self._levels[-1]
-            )
-            blocks = (low.shape[0] // 2, 2, low.shape[1] // 2, 2)
-            low = low.reshape(blocks).min(axis=(1, 3))
-            self._levels.append((low, high.reshape(blocks).max(axis=(1, 3))))
+        self._levels = [np.stack([texels, texels])]
+        while 2 ** (len(self._levels) - 1) < max(texels.shape):
+            low, high = self._levels[-1]
+            for axis in (0, 1):
+                step = -(2 ** (len(self._levels) - 1))
+                low = np.minimum(low, np.roll(low, step, axis))
+                high = np.maximum(high, np.roll(high, step, axis))
+            self._levels.append(np.stack([low, high]))
 
     def position(self, corners: np.ndarray) -> np.ndarray:
         """Compute the positions (column, row), in texels, of points with texture coordinates."""
         height, width = self.texels.shape
-        return np.stack(
-            [corners[..., U] * width - 0.5, (1 - corners[..., V]) * height - 0.5], axis=-1
-        )
+        columns = corners[..., U] * width - 0.5
+        return np.stack([columns, (1 - corners[..., V]) * height - 0.5], axis=-1)
 
     def at(self, positions: np.ndarray) -> np.ndarray:
         """Interpolate alpha in [0, 1] bilinearly at positions (N, 2) in texels."""
@@ -354,31 +345,22 @@ class _AlphaTexture:
         columns = (first[:, :1].astype(np.int64) + np.arange(2)) % width
         rows = (first[:, 1:].astype(np.int64) + np.arange(2)) % height
         values = self.texels[rows[:, :, None], columns[:, None, :]] / FULL
-        values = values[:, 0] + weight[:, 1:] * (values[:, 1] - values[:, 0])
-        return values[:, 0] + weight[:, 0] * (values[:, 1] - values[:, 0])
+        values = _interpolate(values[:, 0], values[:, 1], weight[:, 1])
+        return _interpolate(values[:, 0], values[:, 1], weight[:, 0])
 
-    def ranges(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of alpha within F faces with corners at positions (F, 3, 2)."""
-        size = np.array(self.texels.shape[::-1])
+    def ranges(self, positions: np.ndarray) -> np.ndarray:
+        """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
         start = np.floor(positions.min(axis=1)).astype(np.int64)
-        end = np.floor(positions.max(axis=1)).astype(np.int64) + 1
-        # A rectangle as large as the texture holds all texels.
-        end = np.minimum(end, start + size - 1)
-        end -= start - start % size
-        start %= size
-        level_of_face = np.ceil(np.log2((end - start).max(axis=1) + 1)).astype(np.int64)
-        low = np.empty(len(positions))
-        high = np.empty(len(positions))
-        for level in np.unique(level_of_face):
-            faces = level_of_face == level
-            # A rectangle lies in the four blocks of its corners.
-            columns = np.stack([start[faces, 0], end[faces, 0]], axis=1) >> level
-            rows = np.stack([start[faces, 1], end[faces, 1]], axis=1) >> level
-            blocks = (rows[:, :, None], columns[:, None, :])
-            lows, highs = self._levels[min(level, len(self._levels) - 1)]
-            low[faces] = lows[blocks].min(axis=(1, 2))
-            high[faces] = highs[blocks].max(axis=(1, 2))
-        return low / FULL, high / FULL
+        extent = np.floor(positions.max(axis=1)).astype(np.int64) + 2 - start
+        # From the last level on, a square holds all texels.
+        levels = np.ceil(np.log2(extent.max(axis=1))).astype(np.int64)
+        levels = np.minimum(levels, len(self._levels) - 1)
+        column, row = (start % self.texels.shape[::-1]).T
+        bounds = np.empty((2, len(positions)))
+        for level in np.unique(levels):
+            faces = levels == level
+            bounds[:, faces] = self._levels[level][:, row[faces], column[faces]]
+        return bounds / FULL
 
 
 def cut_out(
@@ -403,22 +385,18 @@ def cut_out(
         alphas = corners[..., ALPHA]
         is_shown = high * alphas.max(axis=1) >= cutoff
         is_crossed = is_shown & (low * alphas.min(axis=1) < cutoff)
-        # The sides are opposite to the corners 2, 0 and 1.
         lengths = np.linalg.norm(positions - np.roll(positions, -1, axis=1), axis=2)
-        if texels is None:
-            # Alpha is linear in each face, so faces need not be divided.
-            lengths *= 0
         is_large = is_crossed & (lengths.max(axis=1) > 1)
-        if not is_large.any():
+        # Without a texture, alpha is linear in each face, so faces need not be divided.
+        if texels is None or not is_large.any():
             break
         if len(faces) > MAX_FACES:
             raise ValueError(
                 f"the border of its alpha needs more than {MAX_FACES} faces: use fewer texels "
                 "or fewer repetitions of the texture"
             )
-        keep = np.flatnonzero(is_shown)
-        vertices, faces, corners = _divide(
-            vertices, faces[keep], corners[keep], lengths[keep].argmax(axis=1), is_large[keep]
+        vertices, faces, corners = _halve(
+            vertices, faces[is_shown], corners[is_shown], lengths[is_shown], is_large[is_shown]
         )
     crossed = np.flatnonzero(is_crossed)
     flat_alpha = texture.at(positions[crossed].reshape(-1, 2)).reshape(-1, 3)
@@ -440,60 +418,44 @@ def _interpolate(values: np.ndarray, others: np.ndarray, share: np.ndarray) -> n
     return values + share * (others - values)
 
 
-def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """List the ends (E, 2) of the edges of faces, and the edge (F, 3) from each corner on."""
-    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    keys, edge_of_side = np.unique(ends @ [vertex_count, 1], return_inverse=True)
-    return np.stack(np.divmod(keys, vertex_count), axis=1), edge_of_side.reshape(-1, 3)
-
-
-def _divide(
+def _halve(
     vertices: np.ndarray,
     faces: np.ndarray,
     corners: np.ndarray,
-    longest: np.ndarray,
+    lengths: np.ndarray,
     is_large: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide large faces at their longest side (F,), and neighbors so that no crack opens.
+    """Halve some faces at an edge that is the longest of all faces around it, so no crack opens.
 
-    Rivara (1984): a face that is divided at any side is also divided at its longest side.
+    Such an edge is at the end of a path from each large face over the longest edge to the next
+    face (Rivara 1984). `lengths` are those of the sides 0-1, 1-2 and 2-0, shape (F, 3).
     """
-    ends, edge_of_side = _edges(faces, len(vertices))
+    ends, edge_of_side = shared_edges(faces)
+    # A seam of the texture has two lengths. Edges of one length are ordered by their numbers.
+    edge_length = np.zeros(len(ends))
+    np.maximum.at(edge_length, edge_of_side, lengths)
+    rank = np.argsort(np.argsort(edge_length, kind="stable"))
+    longest = rank[edge_of_side].argmax(axis=1)
     longest_edge = np.take_along_axis(edge_of_side, longest[:, None], axis=1)[:, 0]
-    is_divided = np.zeros(len(ends), dtype=bool)
+    is_wanted = np.zeros(len(ends), dtype=bool)
     touched = is_large
-    while not is_divided[longest_edge[touched]].all():
-        is_divided[longest_edge[touched]] = True
-        touched = is_divided[edge_of_side].any(axis=1)
-    # Corners 0 and 1 are the ends of the longest side. Points 3, 4 and 5
-    # are the middles of the sides 0-1, 1-2 and 2-0.
-    order = (longest[touched, None] + np.arange(3)) % 3
-    ordered_faces = np.take_along_axis(faces[touched], order, axis=1)
-    ordered_corners = np.take_along_axis(corners[touched], order[..., None], axis=1)
-    sides = np.take_along_axis(edge_of_side[touched], order, axis=1)
-    new_vertex = len(vertices) + np.cumsum(is_divided) - 1
-    points = np.concatenate([ordered_faces, new_vertex[sides]], axis=1)
-    middles = (ordered_corners + np.roll(ordered_corners, -1, axis=1)) / 2
-    values = np.concatenate([ordered_corners, middles], axis=1)
-    side_divided = is_divided[sides]
-    new_faces = [faces[~touched]]
-    new_corners = [corners[~touched]]
-    pieces = {
-        (1, True): [(3, 1, 4), (3, 4, 2)],
-        (1, False): [(3, 1, 2)],
-        (2, True): [(0, 3, 5), (5, 3, 2)],
-        (2, False): [(0, 3, 2)],
-    }
-    for (side, divided), triangles in pieces.items():
-        rows = np.flatnonzero(side_divided[:, side] == divided)
-        for triangle in triangles:
-            new_faces.append(points[rows][:, triangle])
-            new_corners.append(values[rows][:, triangle])
-    middle_vertices = vertices[ends[is_divided]].mean(axis=1)
+    while not is_wanted[longest_edge[touched]].all():
+        is_wanted[longest_edge[touched]] = True
+        touched = is_wanted[edge_of_side].any(axis=1)
+    is_wanted[edge_of_side[edge_of_side != longest_edge[:, None]]] = False
+    halved = is_wanted[longest_edge]
+    # Corners 0 and 1 are the ends of the longest side, and point 3 is its middle.
+    order = (longest[halved, None] + np.arange(3)) % 3
+    points = np.take_along_axis(faces[halved], order, axis=1)
+    middle = len(vertices) + (np.cumsum(is_wanted) - 1)[longest_edge[halved]]
+    points = np.column_stack([points, middle])
+    values = np.take_along_axis(corners[halved], order[..., None], axis=1)
+    values = np.concatenate([values, values[:, :2].mean(axis=1, keepdims=True)], axis=1)
+    halves = [[0, 3, 2], [3, 1, 2]]
     return (
-        np.concatenate([vertices, middle_vertices]),
-        np.concatenate(new_faces),
-        np.concatenate(new_corners),
+        np.concatenate([vertices, vertices[ends[is_wanted]].mean(axis=1)]),
+        np.concatenate([faces[~halved], *(points[:, half] for half in halves)]),
+        np.concatenate([corners[~halved], *(values[:, half] for half in halves)]),
     )
 
 
@@ -506,35 +468,31 @@ def _cut(
     """
     is_kept = excess >= 0
     count = is_kept.sum(axis=1)
+    whole, crossed = count == 3, (count == 1) | (count == 2)
     # The corner 0 is the one that differs from both others.
-    odd = np.where(count == 1, is_kept.argmax(axis=1), is_kept.argmin(axis=1))
+    odd = np.where(count == 1, is_kept.argmax(axis=1), is_kept.argmin(axis=1))[crossed]
     order = (odd[:, None] + np.arange(3)) % 3
-    faces = np.take_along_axis(faces, order, axis=1)
-    corners = np.take_along_axis(corners, order[..., None], axis=1)
-    excess = np.take_along_axis(excess, order, axis=1)
-    cut_faces = [faces[count == 3]]
-    cut_corners = [corners[count == 3]]
-    crossed = (count == 1) | (count == 2)
-    faces, corners, excess = faces[crossed], corners[crossed], excess[crossed]
+    odd_faces = np.take_along_axis(faces[crossed], order, axis=1)
+    odd_corners = np.take_along_axis(corners[crossed], order[..., None], axis=1)
+    excess = np.take_along_axis(excess[crossed], order, axis=1)
     # Points 3 and 4 lie on the sides 0-1 and 0-2.
     shares = excess[:, :1] / (excess[:, :1] - excess[:, 1:])
-    points = [_interpolate(corners[:, 0], corners[:, k], shares[:, k - 1]) for k in (1, 2)]
-    values = np.concatenate([corners, np.stack(points, axis=1)], axis=1)
+    starts, stops = odd_corners[:, [0, 0]], odd_corners[:, 1:]
+    values = np.concatenate([odd_corners, starts + shares[..., None] * (stops - starts)], axis=1)
     # Both faces at an edge get the same point, at the share of the first of them.
-    starts = faces[:, [0, 0]].ravel()
-    stops = faces[:, [1, 2]].ravel()
-    is_forward = starts < stops
-    low, high = np.minimum(starts, stops), np.maximum(starts, stops)
+    sides = np.stack([odd_faces[:, [0, 0]], odd_faces[:, 1:]], axis=-1).reshape(-1, 2)
+    is_forward = sides[:, 0] < sides[:, 1]
     share = np.where(is_forward, shares.ravel(), 1 - shares.ravel())
+    sides.sort(axis=1)
     _, first, point_of_side = np.unique(
-        low * len(vertices) + high, return_index=True, return_inverse=True
+        sides @ [len(vertices), 1], return_index=True, return_inverse=True
     )
-    new_vertices = _interpolate(vertices[low[first]], vertices[high[first]], share[first])
-    ids = np.concatenate([faces, len(vertices) + point_of_side.reshape(-1, 2)], axis=1)
+    low, high = vertices[sides[first]].swapaxes(0, 1)
+    ids = np.concatenate([odd_faces, len(vertices) + point_of_side.reshape(-1, 2)], axis=1)
     one = count[crossed] == 1
     pieces = [(one, (0, 3, 4)), (~one, (3, 1, 2)), (~one, (3, 2, 4))]
     return (
-        np.concatenate([vertices, new_vertices]),
-        np.concatenate([*cut_faces, *(ids[rows][:, triangle] for rows, triangle in pieces)]),
-        np.concatenate([*cut_corners, *(values[rows][:, triangle] for rows, triangle in pieces)]),
+        np.concatenate([vertices, _interpolate(low, high, share[first])]),
+        np.concatenate([faces[whole], *(ids[rows][:, piece] for rows, piece in pieces)]),
+        np.concatenate([corners[whole], *(values[rows][:, piece] for rows, piece in pieces)]),
     )

@@ -13,7 +13,6 @@ import io
 import json
 import math
 import struct
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -26,9 +25,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from renderer.errors import require_memory
-from renderer.image import decode, encode
+from renderer.image import decode, encode, to_bytes
 from renderer.io.images import eight_bits, identify
-from renderer.io.mesh_file import MeshFile
+from renderer.io.mesh_file import CPU, MeshFile
 
 # Types of the numbers in accessors (3.6.2.2).
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -86,12 +85,11 @@ class GltfFile:
         accessor = self.entry("accessors", index)
         dtype = np.dtype(TYPES[accessor["componentType"]])
         width = WIDTHS[accessor["type"]]
-        needed = ARRAY_BYTES * accessor["count"] * width
-        require_memory("arrays", needed, torch.device("cpu"))
+        shape = (accessor["count"], width)
+        require_memory("arrays", ARRAY_BYTES * math.prod(shape), CPU)
+        values = np.zeros(shape, dtype)
         if "bufferView" in accessor:
             values = self._elements(accessor, accessor["count"], dtype, width)
-        else:
-            values = np.zeros((accessor["count"], width), dtype)
         if "sparse" in accessor:
             values = values.copy()
             sparse = accessor["sparse"]
@@ -109,16 +107,16 @@ class GltfFile:
         """Return the elements that an accessor or its sparse part stores, without a copy."""
         index = location["bufferView"]
         view = self._view(index)
-        size = dtype.itemsize
-        stride = self.entry("bufferViews", index).get("byteStride", width * size)
+        row_size = width * dtype.itemsize
+        stride = self.entry("bufferViews", index).get("byteStride", row_size)
         offset = location.get("byteOffset", 0)
-        end = offset + stride * (count - 1) + width * size
-        if stride < width * size:
+        end = offset + stride * (count - 1) + row_size
+        if stride < row_size:
             raise ValueError(f"the elements of an array overlap in its buffer view {index}")
         # NumPy would read bytes before the buffer at a negative offset.
         if min(offset, count) < 0 or end > len(view):
             raise ValueError(f"an array ends behind its buffer view {index}: the file is damaged")
-        return np.ndarray((count, width), dtype, view, offset, (stride, size))
+        return np.ndarray((count, width), dtype, view, offset, (stride, dtype.itemsize))
 
     def _view(self, index: int) -> memoryview:
         """Return the bytes of a buffer view."""
@@ -145,11 +143,11 @@ class GltfFile:
 
     def _resource(self, uri: str) -> bytes:
         """Read the bytes that a URI holds (a data URI), or of a file below the folder."""
-        if uri.startswith("data:"):
-            with urlopen(uri) as response:
-                content: bytes = response.read()
-            return content
-        return self.file.read(uri)
+        if not uri.startswith("data:"):
+            return self.file.read(uri)
+        with urlopen(uri) as response:
+            content: bytes = response.read()
+        return content
 
     # Images
 
@@ -161,12 +159,10 @@ class GltfFile:
             names = ", ".join(texture.get("extensions", {"no image": {}}))
             raise ValueError(f"a texture has only {names}: export the textures as PNG or JPEG")
         entry = self.entry("images", source)
-        content = (
-            self._resource(entry["uri"]) if "uri" in entry else self._view(entry["bufferView"])
-        )
+        uri = entry.get("uri")
+        content = self._view(entry["bufferView"]) if uri is None else self._resource(uri)
         image = identify(io.BytesIO(content))
-        texel_bytes = TEXEL_BYTES * image.width * image.height
-        require_memory("textures", texel_bytes, torch.device("cpu"))
+        require_memory("textures", TEXEL_BYTES * image.width * image.height, CPU)
         return eight_bits(image)
 
     # Nodes
@@ -191,17 +187,13 @@ class GltfFile:
     @cached_property
     def parents(self) -> dict[int, int]:
         """Parent of each node that has one."""
-        nodes = self.tree.get("nodes", [])
-        edges = [
-            (child, parent)
-            for parent, node in enumerate(nodes)
-            for child in node.get("children", [])
-        ]
-        for child, _ in edges:
-            self.entry("nodes", child)
-        if max(Counter(child for child, _ in edges).values(), default=0) > 1:
-            raise ValueError("a node has two parents: the file is damaged")
-        return dict(edges)
+        parents: dict[int, int] = {}
+        for parent, node in enumerate(self.tree.get("nodes", [])):
+            for child in node.get("children", []):
+                self.entry("nodes", child)
+                if parents.setdefault(child, parent) != parent or node["children"].count(child) > 1:
+                    raise ValueError("a node has two parents: the file is damaged")
+        return parents
 
     def scene_nodes(self) -> list[int]:
         """List the visible nodes of the default scene, parents before their children."""
@@ -233,10 +225,8 @@ class GltfFile:
     def instances(self, index: int) -> np.ndarray:
         """Return the matrices (N, 4, 4) that place the N copies of a node's mesh in the scene."""
         arrays = {name: self.array(i) for name, i in self._instancing(index).items()}
-        copies = [
-            _local_matrix({name: values[row] for name, values in arrays.items()})
-            for row in range(self.instance_count(index))
-        ]
+        rows = range(self.instance_count(index))
+        copies = [_local_matrix({name: arrays[name][row] for name in arrays}) for row in rows]
         return self.poses[index] @ np.stack(copies)
 
     def _instancing(self, index: int) -> dict[str, int]:
@@ -350,39 +340,65 @@ class Material:
             return self, np.zeros((len(uvs), 2))
         matrix = np.array(self.placement.transform)
         uvs = uvs @ matrix[:, :2].T + matrix[:, 2]
-        placed = self
+        textures: dict[str, Any] = {
+            name: getattr(self, name)
+            for name in ("texture", "alpha", "gloss_texture")
+            if getattr(self, name) is not None
+        }
         for axis, wrap in enumerate(self.placement.wraps):
-            size = self.texture.shape[1 - axis]
+            shape = textures["texture"].shape[:2]
+            size = shape[1 - axis]
             coordinates = uvs[:, axis]
+            mode: Any = "edge"
             if wrap == MIRROR:
                 before, after, mode = 0, size, "symmetric"
             elif wrap == CLAMP:
                 # Interpolation needs one texel more than the surface covers.
                 before = 1 + max(0, math.ceil(-coordinates.min() * size))
                 after = 1 + max(0, math.ceil((coordinates.max() - 1) * size))
-                mode = "edge"
             else:
                 continue
-            placed = placed._extended(1 - axis, before, after, mode)
-            uvs[:, axis] = (coordinates * size + before) / (before + size + after)
+            new_size = before + size + after
+            require_memory("textures", TEXEL_BYTES * new_size * shape[axis], CPU)
+            for name, texels in textures.items():
+                padding = [(0, 0)] * texels.ndim
+                padding[1 - axis] = (before, after)
+                textures[name] = np.pad(texels, padding, mode)
+            uvs[:, axis] = (coordinates * size + before) / new_size
         # v points down in glTF, and up in `Mesh`.
         uvs[:, 1] = 1 - uvs[:, 1]
-        return placed, uvs
+        return replace(self, **textures), uvs
 
-    def _extended(self, axis: int, before: int, after: int, mode: Any) -> "Material":
-        """Return a copy whose textures have more texels before and after the present ones."""
-        assert self.texture is not None
-        size = list(self.texture.shape[:2])
-        size[axis] += before + after
-        require_memory("textures", TEXEL_BYTES * math.prod(size), torch.device("cpu"))
-        textures: dict[str, Any] = {}
-        for name in ("texture", "alpha", "gloss_texture"):
-            texels = getattr(self, name)
-            if texels is not None:
-                padding = [(0, 0)] * texels.ndim
-                padding[axis] = (before, after)
-                textures[name] = np.pad(texels, padding, mode=mode)
-        return replace(self, **textures)
+    def with_placement(self, placement: Placement, shape: tuple[int, ...]) -> "Material":
+        """Return a copy with a texture at a place, which is white (H, W) if there was none."""
+        if self.placement is None:
+            white = np.full((*shape, 3), 255, dtype=np.uint8)
+            return replace(self, placement=placement, texture=white)
+        if self.placement != placement:
+            raise ValueError(
+                "the textures of a material differ in texture coordinates, transform or wrap "
+                "mode: use the same for all"
+            )
+        return self
+
+    def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
+        """Return a copy with factors of roughness and metallic (H, W, 2)."""
+        material = self.with_placement(placement, (1, 1))
+        assert material.texture is not None
+        # Textures that will be extended need the same size.
+        if placement.wraps != (REPEAT, REPEAT):
+            channels = [
+                _resized(channel, material.texture) for channel in np.moveaxis(texels, 2, 0)
+            ]
+            texels = np.stack(channels, axis=-1)
+        return replace(material, gloss_texture=texels)
+
+
+def _resized(channel: np.ndarray, texture: np.ndarray) -> np.ndarray:
+    """Resize a channel to the height and the width of a texture."""
+    height, width = texture.shape[:2]
+    image = Image.fromarray(channel)
+    return np.array(image.resize((width, height), Image.Resampling.BILINEAR))
 
 
 def ignored_features(tree: dict[str, Any]) -> list[str]:
@@ -421,29 +437,22 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
     mode = entry.get("alphaMode", "OPAQUE")
     if mode not in ("OPAQUE", "MASK", "BLEND"):
         raise ValueError(f"a material has the alphaMode {mode}: use OPAQUE, MASK or BLEND")
+    material = Material(np.ones(4), mode, entry.get("alphaCutoff", 0.5))
     if SPECULAR_GLOSSINESS in extensions:
-        material = _specular_glossiness(file, extensions[SPECULAR_GLOSSINESS], gloss)
-    else:
-        material = _metallic_roughness(file, entry, gloss)
-    return replace(material, mode=mode, cutoff=entry.get("alphaCutoff", 0.5))
-
-
-def _metallic_roughness(file: GltfFile, entry: dict[str, Any], gloss: bool) -> Material:
-    """Read a material of glTF's own model (3.9.2)."""
+        return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS], gloss)
+    # The model of glTF itself (3.9.2).
     model = entry.get("pbrMetallicRoughness", {})
-    material = _with_texture(
-        Material(color=_factor(model, "baseColorFactor", 4)), file, model.get("baseColorTexture")
-    )
+    material = _with_color(material, file, model, "baseColor")
     if not gloss:
         return material
     factors = [model.get("roughnessFactor", 1), model.get("metallicFactor", 1)]
-    factors = [*factors, _specular_factor(entry.get("extensions", {}))]
+    factors = [*factors, _specular_factor(extensions)]
     material = replace(material, gloss=np.clip(factors, 0.0, 1.0))
     if "metallicRoughnessTexture" not in model:
         return material
     image, placement = _image(file, model["metallicRoughnessTexture"])
     # glTF stores roughness in green and metallic in blue.
-    return _with_gloss_texture(material, np.array(image.convert("RGB"))[..., 1:], placement)
+    return material.with_gloss_texture(np.array(image.convert("RGB"))[..., 1:], placement)
 
 
 def _specular_factor(extensions: dict[str, Any]) -> float:
@@ -461,14 +470,14 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     return factor
 
 
-def _specular_glossiness(file: GltfFile, model: dict[str, Any], gloss: bool) -> Material:
-    """Read a material of the extension KHR_materials_pbrSpecularGlossiness.
+def _specular_glossiness(
+    material: Material, file: GltfFile, model: dict[str, Any], gloss: bool
+) -> Material:
+    """Read the values of a material of the extension KHR_materials_pbrSpecularGlossiness.
 
     Its diffuse albedo is diffuse · (1 - max(specular)).
     """
-    material = _with_texture(
-        Material(color=_factor(model, "diffuseFactor", 4)), file, model.get("diffuseTexture")
-    )
+    material = _with_color(material, file, model, "diffuse")
     specular = _factor(model, "specularFactor", 3)
     glossiness = np.array(model.get("glossinessFactor", 1.0))
     placement = None
@@ -479,61 +488,25 @@ def _specular_glossiness(file: GltfFile, model: dict[str, Any], gloss: bool) -> 
         glossiness = glossiness * texels[..., 3].numpy()
     reflectance = np.clip(specular, 0, 1).max(axis=-1)
     if placement is None:
-        material.color[:3] *= 1 - reflectance
+        material = replace(material, color=material.color * [*[1 - reflectance] * 3, 1])
     else:
-        material = _dimmed(material, 1 - reflectance, placement)
+        material = material.with_placement(placement, reflectance.shape)
+        assert material.texture is not None
+        kept = _resized((1 - reflectance).astype(np.float32), material.texture)
+        linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
+        dimmed = to_bytes(encode(linear * torch.from_numpy(kept)[..., None], "srgb"))
+        material = replace(material, texture=dimmed.numpy())
     if not gloss:
         return material
     factor = min(float(reflectance.mean()) / DIELECTRIC, 1.0)
     if np.abs(specular - factor * DIELECTRIC).max() > 1e-3:
         file.file.assume(f"the specular factor {factor:.2g} stands for a specular color")
-    material = replace(material, gloss=np.array([1.0, 0, factor]))
     roughness = np.clip(1 - glossiness, 0, 1)
     if placement is None:
         return replace(material, gloss=np.array([float(roughness), 0, factor]))
     factors = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
-    return _with_gloss_texture(material, factors.astype(np.uint8), placement)
-
-
-def _dimmed(material: Material, factors: np.ndarray, placement: Placement) -> Material:
-    """Multiply the texture of a material by factors (H, W), which lie at the given place."""
-    material = _with_common_placement(material, placement, factors.shape)
-    assert material.texture is not None
-    height, width = material.texture.shape[:2]
-    image = Image.fromarray(factors.astype(np.float32)).resize(
-        (width, height), Image.Resampling.BILINEAR
-    )
-    linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
-    dimmed = encode(linear * torch.from_numpy(np.array(image))[..., None], "srgb")
-    return replace(material, texture=(255 * dimmed).round().to(torch.uint8).numpy())
-
-
-def _with_gloss_texture(material: Material, texels: np.ndarray, placement: Placement) -> Material:
-    """Add a gloss texture (H, W, 2) to a material."""
-    material = _with_common_placement(material, placement, (1, 1))
-    assert material.texture is not None
-    if placement.wraps != (REPEAT, REPEAT) and texels.shape[:2] != material.texture.shape[:2]:
-        # Textures that will be extended need the same size.
-        height, width = material.texture.shape[:2]
-        channels = [Image.fromarray(channel) for channel in np.moveaxis(texels, 2, 0)]
-        resized = [np.array(c.resize((width, height), Image.Resampling.BILINEAR)) for c in channels]
-        texels = np.stack(resized, axis=-1)
-    return replace(material, gloss_texture=texels)
-
-
-def _with_common_placement(
-    material: Material, placement: Placement, shape: tuple[int, ...]
-) -> Material:
-    """Return a material with a texture at a place, which is white if there was none."""
-    if material.placement is None:
-        white = np.full((*shape, 3), 255, dtype=np.uint8)
-        return replace(material, placement=placement, texture=white)
-    if material.placement != placement:
-        raise ValueError(
-            "the textures of a material differ in texture coordinates, transform or wrap mode: "
-            "use the same for all"
-        )
-    return material
+    material = replace(material, gloss=np.array([1.0, 0, factor]))
+    return material.with_gloss_texture(factors.astype(np.uint8), placement)
 
 
 def _factor(model: dict[str, Any], name: str, count: int) -> np.ndarray:
@@ -544,15 +517,14 @@ def _factor(model: dict[str, Any], name: str, count: int) -> np.ndarray:
     return np.clip(factor, 0, 1)
 
 
-def _with_texture(material: Material, file: GltfFile, info: dict[str, Any] | None) -> Material:
-    """Add a texture of color and alpha to a material."""
-    if info is None:
+def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name: str) -> Material:
+    """Add the factor and the texture of color and alpha, whose names begin with `name`."""
+    material = replace(material, color=_factor(model, f"{name}Factor", 4))
+    if f"{name}Texture" not in model:
         return material
-    image, placement = _image(file, info)
-    alpha = None
-    if image.has_transparency_data:
-        alpha = np.array(image.convert("RGBA"))[..., 3]
-        alpha = None if alpha.min() == 255 else alpha
+    image, placement = _image(file, model[f"{name}Texture"])
+    alpha = np.array(image.convert("RGBA"))[..., 3] if image.has_transparency_data else None
+    alpha = None if alpha is None or alpha.min() == 255 else alpha
     texture = np.array(image.convert("RGB"))
     return replace(material, placement=placement, texture=texture, alpha=alpha)
 

@@ -101,15 +101,12 @@ class MeshFile:
         key = folder + name
         if key not in self._textures:
             with identify(io.BytesIO(self.read(name, folder))) as image:
-                texel_count = image.width * image.height
-                require_memory(f"the texels of {name}", _TEXEL_BYTES * texel_count, CPU)
-                pixels = eight_bits(image)
-            if (
-                pixels.has_transparency_data
-                and np.array(pixels.convert("RGBA"))[..., 3].min() < 255
-            ):
+                needed = _TEXEL_BYTES * image.width * image.height
+                require_memory(f"the texels of {name}", needed, CPU)
+                pixels = np.array(eight_bits(image).convert("RGBA"))
+            if pixels[..., 3].min() < 255:
                 self.assume(f"the alpha of {name} is ignored")
-            self._textures[key] = np.array(pixels.convert("RGB"))
+            self._textures[key] = pixels[..., :3]
         return self._textures[key]
 
     def ignore(self, feature: str) -> None:
@@ -123,8 +120,7 @@ class MeshFile:
     def warn(self, stacklevel: int) -> None:
         """Warn once of all that was ignored or assumed."""
         if self._assumptions:
-            clauses = "; ".join(self._assumptions)
-            warnings.warn(f"{self.path}: {clauses}", stacklevel=stacklevel + 1)
+            warnings.warn(f"{self.path}: {'; '.join(self._assumptions)}", stacklevel=stacklevel + 1)
         if self._ignored:
             kind = self.path.suffix.lower()
             names = ", ".join(sorted(self._ignored))
@@ -220,12 +216,18 @@ def colored_mesh(
     texture_ids: Int[np.ndarray, " F"] | None = None,
     textures: Sequence[np.ndarray] = (),
 ) -> Mesh:
-    """Create a matte mesh from the arrays of a file. Colors are sRGB in [0, 1], absent uvs NaN."""
-    corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
-    if not textures or texture_ids is None:
+    """Create a matte mesh from the arrays of a file.
+
+    Colors are sRGB-encoded in [0, 1], and absent texture coordinates are NaN. Without
+    `texture_ids`, all faces have the first texture.
+    """
+    if not textures:
         texture_ids = np.full(len(faces), NO_TEXTURE)
-    else:
-        is_textured = texture_ids != NO_TEXTURE
+    elif texture_ids is None:
+        texture_ids = np.zeros(len(faces), np.int64)
+    is_textured = texture_ids != NO_TEXTURE
+    corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
+    if is_textured.any():
         if uvs is None or np.isnan(uvs[is_textured]).any():
             raise ValueError("faces with a texture have no texture coordinates")
         require_bounded(texture_coordinates=uvs[is_textured])

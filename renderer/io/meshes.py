@@ -24,8 +24,7 @@ from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits, identify
 from renderer.io.mesh_file import OPAQUE, MeshFile, Part, colored_mesh, require_bounded, unit_colors
 from renderer.io.obj import read_obj
-from renderer.io.off_and_stl import read_off, read_stl
-from renderer.io.ply import read_ply
+from renderer.io.ply_off_stl import read_off, read_ply, read_stl
 from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.normals import normal_groups
 

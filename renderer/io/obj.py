@@ -28,8 +28,8 @@ _READ = {"v", "vt", "vn", "f", "usemtl", "mtllib", "g", "o"}
 _IGNORED = {"l", "p", "s", "vp", "lod", "mg", "bevel", "c_interp", "d_interp", "shadow_obj"}
 # Properties of materials, in lower case, that would change the shape or the base color.
 _REFUSED_PROPERTIES = {"map_d", "map_tr", "disp", "decal"}
-# Successive lines with the same keyword.
-_BLOCK = re.compile(rb"[ \t]*(\S+)[^\n]*\n(?:[ \t]*\1(?=\s)[^\n]*\n)*")
+# Keyword at the beginning of a line, and the text after it.
+_LINE = re.compile(rb"^[ \t]*(\S+)[ \t]*(.*)", re.MULTILINE)
 # Comment of ZBrush with the colors of vertices. Each is a
 # mask, red, green and blue in two hexadecimal digits each.
 _POLYPAINT = re.compile(rb"^#MRGB[ \t]+((?:[0-9a-fA-F]{8})+)", re.MULTILINE)
@@ -50,39 +50,20 @@ _Definition = tuple[str, list[tuple[str, str]]]
 
 
 class _Lines(NamedTuple):
-    """All lines with the same keyword.
+    """All lines with the same keyword: their numbers in the file, and the texts after it."""
 
-    Attributes:
-        keyword: Keyword at the beginning of each line.
-        firsts: Number of the first line of each block of successive lines.
-        blocks: Text of each block.
-    """
-
-    keyword: bytes
-    firsts: list[int]
-    blocks: list[bytes]
-
-    def numbers(self) -> np.ndarray:
-        """Return the number of each line, which counts the lines that are read."""
-        ranges = [
-            np.arange(first, first + block.count(b"\n"))
-            for first, block in zip(self.firsts, self.blocks, strict=True)
-        ]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *ranges])
-
-    def texts(self) -> list[str]:
-        """Return the text of each line after the keyword."""
-        lines = b"".join(self.blocks).decode().split("\n")[:-1]
-        return [line.strip().removeprefix(self.keyword.decode()).strip() for line in lines]
+    keyword: str
+    numbers: list[int]
+    texts: list[bytes]
 
     def words(self) -> tuple[np.ndarray, bytes]:
-        """Return the number of words of each line, and the lines, without keyword and comment."""
-        text = b"".join(self.blocks)
-        text = without_comments(text)
-        if text.count(self.keyword) != text.count(b"\n"):
-            raise ValueError(f"a line {self.keyword.decode()} is damaged: export the file again")
-        text = text.replace(self.keyword, b"")
+        """Return the number of words of each line, and all lines, without keyword and comment."""
+        text = without_comments(b"".join(text + b"\n" for text in self.texts))
         return words_per_line(text), text
+
+    def names(self) -> list[str]:
+        """Return the text of each line, which is a name."""
+        return [text.decode().strip() for text in self.texts]
 
 
 class _Material(NamedTuple):
@@ -102,17 +83,28 @@ class _Material(NamedTuple):
 
 def read_obj(file: MeshFile) -> list[Part]:
     """Read all objects of an .obj file as one part, or none if the file has no faces."""
-    lines = _lines_by_keyword(file)
+    lines = {keyword: _Lines(keyword, [], []) for keyword in _READ}
+    for number, (word, text) in enumerate(_LINE.findall(_cleaned(file.content))):
+        keyword = word.decode()
+        if keyword in lines:
+            lines[keyword].numbers.append(number)
+            lines[keyword].texts.append(text)
+        elif keyword in _IGNORED:
+            file.ignore(keyword)
+        else:
+            raise ValueError(
+                f"the statement {keyword[:20]} is not supported: convert the file to polygons"
+            )
     vertices, vertex_colors = _vertices(lines["v"], file)
     uvs, _ = _table(lines["vt"], (1, 2, 3))
     normals, _ = _table(lines["vn"], (3,))
     require_bounded(texture_coordinates=uvs)
-    line_numbers, indices, sizes = _polygons(lines, file)
+    indices, sizes = _polygons(lines)
     corners, polygons = triangles_of(file, vertices, indices[:, 0], sizes)
     if not len(corners):
         return []
     faces, uv_ids, normal_ids = np.moveaxis(indices[corners], 2, 0)
-    materials, material_of_polygon = _materials(lines, line_numbers, file)
+    materials, material_of_polygon = _materials(lines, file)
     material_of_face = material_of_polygon[polygons]
     colors = np.array([material.color for material in materials])[material_of_face, None]
     if vertex_colors is not None:
@@ -133,9 +125,8 @@ def read_obj(file: MeshFile) -> list[Part]:
         np.array(ids)[material_of_face],
         [file.texture(*texture) for texture in textures],
     )
-    if not len(normals):
-        return [Part(mesh)]
-    return [Part(mesh, np.append(normals, [[0.0] * 3], axis=0)[normal_ids])]
+    normals = np.append(normals, [[0.0] * 3], axis=0)
+    return [Part(mesh, normals[normal_ids] if len(normals) > 1 else None)]
 
 
 def _cleaned(text: bytes) -> bytes:
@@ -148,33 +139,13 @@ def _cleaned(text: bytes) -> bytes:
     return re.sub(rb"\\[ \t]*(?:\n|\Z)", b" ", text) + b"\n"
 
 
-def _lines_by_keyword(file: MeshFile) -> dict[str, _Lines]:
-    """Sort the lines of the file by their keywords, and refuse unsupported statements."""
-    lines = {keyword: _Lines(keyword.encode(), [], []) for keyword in _READ}
-    number = 0
-    for match in _BLOCK.finditer(_cleaned(file.content)):
-        keyword = match[1].decode()
-        if keyword in lines:
-            lines[keyword].firsts.append(number)
-            lines[keyword].blocks.append(match[0])
-            number += match[0].count(b"\n")
-        elif keyword in _IGNORED:
-            file.ignore(keyword)
-        else:
-            raise ValueError(
-                f"the statement {keyword[:20]} is not supported: convert the file to polygons"
-            )
-    return lines
-
-
 def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Parse N lines of numbers, filled up with zeros, and return how many each has, shape (N,)."""
     counts, text = lines.words()
     wrong = counts[~np.isin(counts, lengths)]
     if len(wrong):
         raise ValueError(
-            f"a line {lines.keyword.decode()} has {wrong[0]} numbers: "
-            f"give {' or '.join(map(str, lengths))}"
+            f"a line {lines.keyword} has {wrong[0]} numbers: give {' or '.join(map(str, lengths))}"
         )
     table = np.zeros((len(counts), max(lengths)))
     is_given = np.arange(max(lengths)) < counts[:, None]
@@ -188,34 +159,31 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
     if (table[counts == 4, 3] != 1).any():
         raise ValueError("vertices with a weight other than 1 are not supported")
     is_colored = counts == 6
+    if is_colored.any():
+        colors = np.ones((len(table), 3))
+        colors[is_colored] = unit_colors(table[is_colored, 3:], file)
+        return table[:, :3], colors
     painted = bytes.fromhex(b"".join(_POLYPAINT.findall(file.content)).decode())
-    if painted and not is_colored.any():
-        if len(painted) != 4 * len(table):
-            raise ValueError("the colors in comments #MRGB are not one for each vertex")
-        return table[:, :3], np.frombuffer(painted, np.uint8).reshape(-1, 4)[:, 1:] / 255
-    if not is_colored.any():
+    if not painted:
         return table[:, :3], None
-    colors = np.ones((len(table), 3))
-    colors[is_colored] = unit_colors(table[is_colored, 3:], file)
-    return table[:, :3], colors
+    if len(painted) != 4 * len(table):
+        raise ValueError("the colors in comments #MRGB are not one for each vertex")
+    return table[:, :3], np.frombuffer(painted, np.uint8).reshape(-1, 4)[:, 1:] / 255
 
 
-def _polygons(
-    lines: dict[str, _Lines], file: MeshFile
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
     """Parse the P faces with C corners.
 
-    Return the line number (P,) of each face, the indices (C, 3) of the position, uv and normal of
-    each corner, or -1, and the number of corners (P,) of each face.
+    Return the indices (C, 3) of the position, uv and normal of each corner, or -1, and the number
+    of corners (P,) of each face.
     """
-    line_numbers = lines["f"].numbers()
     sizes, text = lines["f"].words()
     indices = _corners(text.split())
     for column, keyword in enumerate(("v", "vt", "vn")):
         written = indices[:, column]
-        numbers = lines[keyword].numbers()
+        numbers = lines[keyword].numbers
         # A negative index counts backward from the line of the face.
-        counts_before = np.searchsorted(numbers, line_numbers).repeat(sizes)
+        counts_before = np.searchsorted(numbers, lines["f"].numbers).repeat(sizes)
         resolved = np.where(written < 0, counts_before + written, written - 1)
         is_given = written != _LEFT_OUT
         wrong = written[is_given & ((resolved < 0) | (resolved >= len(numbers)))]
@@ -225,7 +193,7 @@ def _polygons(
                 f"but the file has {len(numbers)} lines {keyword}"
             )
         indices[:, column] = np.where(is_given, resolved, -1)
-    return line_numbers, indices, sizes
+    return indices, sizes
 
 
 def _corners(words: list[bytes]) -> np.ndarray:
@@ -250,23 +218,16 @@ def _corners(words: list[bytes]) -> np.ndarray:
     return table
 
 
-def _materials(
-    lines: dict[str, _Lines], line_numbers: np.ndarray, file: MeshFile
-) -> tuple[list[_Material], np.ndarray]:
+def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
     """Read the materials in use, the first for faces without one, and find that of each face."""
-    library = _library(lines["mtllib"].texts(), file)
-    materials = [_Material()]
-    # Index of the material of each line "usemtl", after the index for faces before these lines.
-    indices = [0]
-    index_of_name: dict[str, int] = {}
-    choice_of_face = np.searchsorted(lines["usemtl"].numbers(), line_numbers)
-    used_choices = set(choice_of_face.tolist())
-    for choice, name in enumerate(lines["usemtl"].texts(), start=1):
-        if choice in used_choices and name not in index_of_name:
-            index_of_name[name] = len(materials)
-            materials.append(_material(name, library, file))
-        indices.append(index_of_name.get(name, 0))
-    return materials, np.array(indices)[choice_of_face]
+    library = _library(lines["mtllib"].names(), file)
+    # Name of the material of each line "usemtl", after None for faces before these lines.
+    names = [None, *lines["usemtl"].names()]
+    choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
+    used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
+    index_of_name = {name: index for index, name in enumerate(used)}
+    materials = [_Material() if name is None else _material(name, library, file) for name in used]
+    return materials, np.array([index_of_name.get(name, 0) for name in names])[choice_of_face]
 
 
 def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
@@ -292,8 +253,8 @@ def _definitions(content: bytes, folder: str) -> dict[str, _Definition]:
     """Read the properties of the materials of the .mtl file in a folder by name."""
     definitions: dict[str, _Definition] = {}
     properties: list[tuple[str, str]] = []
-    for keyword, rest in re.findall(r"[ \t]*(\S+)(.*)\n", _cleaned(content).decode()):
-        text = rest.strip()
+    for word, rest in _LINE.findall(_cleaned(content)):
+        keyword, text = word.decode(), rest.decode().strip()
         if keyword.lower() != "newmtl":
             properties.append((keyword, text))
             continue

@@ -1,8 +1,8 @@
-"""Read .ply files in ASCII and binary form."""
+"""Read .ply, .off and .stl files, which have colors of vertices and faces."""
 
 import re
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,11 @@ from renderer.io.mesh_file import (
     colored_mesh,
     parse_numbers,
     product,
+    require_bounded,
     triangles_of,
     unit_colors,
+    without_comments,
+    words_per_line,
 )
 from renderer.mesh import NO_TEXTURE
 
@@ -211,7 +214,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     if form == "ascii":
         body = parse_numbers(body, np.float64).astype("<f8").tobytes()
     offset = 0
-    elements = {}
+    elements: dict[str, _Values] = {}
     for name, items in properties.items():
         if not items:
             raise ValueError(f"the element {name} has no properties")
@@ -220,9 +223,8 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
         stored = [_Property(item.name, "f8", item.length_type and "f8") for item in items]
         layout = stored if form == "ascii" else items
         values, offset = _rows(body, offset, counts[name], layout, _BYTE_ORDERS[form])
-        elements[name] = {
-            item.name: _cast(column, item) for column, item in zip(values, items, strict=True)
-        }
+        for column, item in zip(values, items, strict=True):
+            elements.setdefault(name, {})[item.name] = _cast(column, item)
     if form == "ascii" and offset != len(body):
         raise ValueError("the lines have more numbers than the header says")
     return elements, texture_names
@@ -236,22 +238,24 @@ def _rows(
     # could otherwise announce more rows than fit into memory.
     if not 0 <= count * len(properties) <= len(body) - offset:
         raise ValueError(_TRUNCATED)
-    if count:
-        # NumPy reads rows at once if their lists are as long as those of the first row.
-        try:
+    try:
+        if count:
+            # NumPy reads rows at once if their lists are as long as those of the first row.
             row = _first_row(body, offset, properties, order)
             end = offset + count * row.itemsize
             rows = np.frombuffer(body, row, count if end <= len(body) else 1, offset)
-        # NumPy refuses a list of negative length, or longer than the file.
-        except ValueError as error:
-            raise ValueError(_TRUNCATED) from error
-        lengths = {i: rows[f"length {i}"] for i, item in enumerate(properties) if item.length_type}
-        if end <= len(body) and all((column == column[0]).all() for column in lengths.values()):
-            columns: list[np.ndarray | _Lists] = [rows[str(i)] for i in range(len(properties))]
-            for index, column in lengths.items():
-                columns[index] = _Lists(column, rows[str(index)].ravel())
-            return columns, end
-    return _different_rows(body, offset, count, properties, order)
+            lengths = [rows[name] for name in row.names or () if name.startswith("length")]
+            if end <= len(body) and all((column == column[0]).all() for column in lengths):
+                return [
+                    _Lists(rows[f"length {i}"], rows[str(i)].ravel())
+                    if item.length_type
+                    else rows[str(i)]
+                    for i, item in enumerate(properties)
+                ], end
+        return _different_rows(body, offset, count, properties, order)
+    # NumPy refuses a list of negative length, or longer than the file.
+    except (ValueError, struct.error) as error:
+        raise ValueError(_TRUNCATED) from error
 
 
 def _first_row(body: bytes, offset: int, properties: list[_Property], order: str) -> np.dtype:
@@ -274,47 +278,203 @@ def _different_rows(
     """Read rows whose lists have different lengths."""
     numbers: list[list[float]] = [[] for _ in properties]
     lengths: list[list[int]] = [[] for _ in properties]
-    types = [
-        (np.dtype(item.type), item.length_type and np.dtype(item.length_type))
-        for item in properties
+    types = [np.dtype(item.type) for item in properties]
+    length_types = [item.length_type and np.dtype(item.length_type) for item in properties]
+    for _ in range(count):
+        for index, (number_type, length_type) in enumerate(zip(types, length_types, strict=True)):
+            length = 1
+            if length_type:
+                length = int(struct.unpack_from(order + length_type.char, body, offset)[0])
+                lengths[index].append(length)
+                offset += length_type.itemsize
+            numbers[index] += struct.unpack_from(f"{order}{length}{number_type.char}", body, offset)
+            offset += length * number_type.itemsize
+    columns = [
+        np.array(values, item.type) for values, item in zip(numbers, properties, strict=True)
     ]
-    try:
-        for _ in range(count):
-            for index, (number_type, length_type) in enumerate(types):
-                length = 1
-                if length_type:
-                    length = int(struct.unpack_from(order + length_type.char, body, offset)[0])
-                    lengths[index].append(length)
-                    offset += length_type.itemsize
-                numbers[index] += struct.unpack_from(
-                    f"{order}{length}{number_type.char}", body, offset
-                )
-                offset += length * number_type.itemsize
-    except struct.error as error:
-        raise ValueError(_TRUNCATED) from error
-    columns: list[np.ndarray | _Lists] = []
-    for index, item in enumerate(properties):
-        column = np.array(numbers[index], dtype=item.type)
-        is_list = bool(item.length_type)
-        columns.append(_Lists(np.array(lengths[index], np.int64), column) if is_list else column)
-    return columns, offset
+    return [
+        _Lists(np.array(lengths[i], np.int64), column) if properties[i].length_type else column
+        for i, column in enumerate(columns)
+    ], offset
 
 
-def _cast(values: np.ndarray | _Lists, item: _Property) -> np.ndarray | _Lists:
-    """Convert values to the types in the header, of which an ASCII file may have others."""
+def _cast(values: Any, item: _Property) -> Any:
+    """Convert values to the types in the header, and refuse whole numbers that would change.
+
+    An ASCII file may have values of other types.
+    """
     if isinstance(values, _Lists):
-        numbers = _as_type(values.numbers, item.type)
-        return _Lists(_as_type(values.lengths, item.length_type).astype(np.int64), numbers)
-    return _as_type(values, item.type)
-
-
-def _as_type(values: np.ndarray, name: str) -> np.ndarray:
-    """Convert numbers to a type, and refuse whole numbers that would change."""
-    if np.dtype(name).kind == "f":
+        lengths = _cast(values.lengths, _Property("", item.length_type))
+        numbers = _cast(values.numbers, _Property("", item.type))
+        return _Lists(lengths.astype(np.int64), numbers)
+    if item.type.startswith("f"):
         return values.astype(np.float64)
     # astype turns NaN into an arbitrary integer, with a warning.
     with np.errstate(invalid="ignore"):
-        cast = values.astype(name)
+        cast = values.astype(item.type)
     if (cast != values).any():
         raise ValueError("a value does not have the type that the header gives")
     return cast
+
+
+# Beginning of a file. It tells whether vertices have texture coordinates (ST), colors
+# (C), normals (N), a weight (4) or any number of coordinates (n). Some files have the
+# number of vertices directly after "OFF".
+_OFF_HEADER = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?:OFF|off)")
+
+
+def read_off(file: MeshFile) -> list[Part]:
+    """Read an .off file as one part, or none if the file has no faces."""
+    text = without_comments(as_utf8(file.content).replace(b"\r", b"\n"))
+    header = _OFF_HEADER.match(text)
+    if header is None:
+        raise ValueError("the file does not begin with OFF")
+    has_uvs, has_colors, has_normals, has_weights, has_dimension = map(bool, header.groups())
+    # A text without empty lines, and the end of each line.
+    text = re.sub(rb"\n\s*", b"\n", text[header.end() :].strip() + b"\n")
+    ends = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord("\n")) + 1
+    counts = text[: ends[0]].split()
+    is_plain = all(count.isdigit() for count in counts) and len(counts) >= 2
+    if has_weights or has_dimension or not is_plain:
+        raise ValueError("only .off files in ASCII form with three coordinates are supported")
+    vertex_count, face_count = map(int, counts[:2])
+    if len(ends) < 1 + vertex_count + face_count:
+        raise ValueError("the file is truncated: export it again")
+    vertex_text = text[ends[0] : ends[vertex_count]]
+    face_text = text[ends[vertex_count] : ends[vertex_count + face_count]]
+
+    lengths = words_per_line(vertex_text)
+    width = lengths.max(initial=3)
+    color_start = 3 + 3 * has_normals
+    color_width = width - color_start - 2 * has_uvs
+    if (lengths != width).any() or color_width not in ((3, 4) if has_colors else (0,)):
+        raise ValueError(f"the vertices have other numbers than {header[0].decode()} announces")
+    table = parse_numbers(vertex_text, np.float64).reshape(-1, width)
+    vertices = table[:, :3]
+    is_color = np.zeros(table.shape, dtype=bool)
+    is_color[:, color_start : color_start + color_width] = True
+    color_widths = np.full(vertex_count, color_width)
+    vertex_colors = _colors(vertex_text, table.ravel(), is_color.ravel(), color_widths, file)
+
+    numbers = parse_numbers(face_text, np.float64)
+    lengths = words_per_line(face_text)
+    whole_numbers = numbers.astype(np.int64)
+    # Place of each number in its line, in which the number of corners is first.
+    places = np.arange(len(numbers)) - (np.cumsum(lengths) - lengths).repeat(lengths)
+    sizes = whole_numbers[places == 0]
+    is_index = places <= sizes.repeat(lengths)
+    color_widths = lengths - 1 - sizes
+    if not np.isin(color_widths, (0, 3, 4)).all() or (whole_numbers != numbers)[is_index].any():
+        raise ValueError("a face is not a number of vertices, the vertices, and maybe a color")
+    face_colors = _colors(face_text, numbers, ~is_index, color_widths, file)
+    indices = whole_numbers[is_index & (places > 0)]
+    corners, polygons = triangles_of(file, vertices, indices, sizes)
+    if not len(corners):
+        return []
+    faces = indices[corners]
+    colors = product(vertex_colors[faces], face_colors[polygons, None])
+    normals = table[:, 3:6][faces] if has_normals else None
+    return [Part(colored_mesh(vertices, faces, colors), normals)]
+
+
+def _colors(
+    text: bytes, numbers: np.ndarray, is_color: np.ndarray, widths: np.ndarray, file: MeshFile
+) -> np.ndarray:
+    """Convert rows of 3 or 4 numbers to sRGB-encoded colors, which are white for empty rows.
+
+    The numbers are the words of the text. `is_color` selects those of the colors.
+    """
+    colors = np.ones((len(widths), 4))
+    is_given = np.arange(4) < widths[:, None]
+    colors[is_given] = numbers[is_color]
+    # Bytes are written as whole numbers, and other colors with a point.
+    given = colors[is_given]
+    highest = given.max(initial=0)
+    is_whole = (given == given.astype(np.uint8)).all()
+    # As bytes, colors of only 0 and 1 are almost black, and an opacity of 1 is almost transparent.
+    if is_whole and highest == 1 and (widths == 3).any():
+        words = np.array(text.split())[is_color]
+        if not any(b"." in word for word in words):
+            raise ValueError(
+                "the colors are only 0 and 1, and 1 may be white or almost black: "
+                "write colors from 0 to 255, or with a point such as 1.0"
+            )
+    values = given.astype(np.uint8) if is_whole and highest > 1 else given
+    colors[is_given] = unit_colors(values, file)
+    if colors[:, 3].min(initial=1) < OPAQUE:
+        raise ValueError("the file has transparent colors, which are not supported")
+    return colors[:, :3]
+
+
+# Face of a binary file. Some programs store a color in `attribute`.
+_STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# Size of the header of a binary file, with the number of faces at its end.
+_HEADER_SIZE = 84
+# Bit of `attribute` that says that the face has a color, or, with
+# the convention of Materialise Magics, that it has none of its own.
+_FLAG = 0x8000
+# First word of a line of a text file that no facet has. Some programs add lines of their own.
+_OTHER_LINE = re.compile(
+    rb"^\s*(?!(?:solid|facet|outer|vertex|endloop|endfacet|endsolid)\b)([a-z]\w*)",
+    re.MULTILINE | re.IGNORECASE,
+)
+
+
+def read_stl(file: MeshFile) -> list[Part]:
+    """Read an .stl file as one part, or none if the file has no faces."""
+    content = file.content
+    header = content[:_HEADER_SIZE]
+    face_count = int.from_bytes(header[-4:], "little")
+    # A binary file may begin with "solid", too, but has NUL bytes.
+    if re.match(rb"\W*solid", content, re.IGNORECASE) and b"\0" not in content:
+        corners = _text_corners(content, file)
+        colors = np.ones((1, 3))
+    elif (
+        len(content) < _HEADER_SIZE + face_count * _STL_FACE.itemsize or len(header) < _HEADER_SIZE
+    ):
+        raise ValueError("the file is truncated: export it again")
+    else:
+        faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
+        corners = faces["corners"].astype(np.float64)
+        colors = _face_colors(header, faces["attribute"].astype(np.int64), file)
+    if not len(corners):
+        return []
+    require_bounded(coordinates=corners)
+    vertex_ids = np.arange(corners.size // 3).reshape(-1, 3)
+    return [Part(colored_mesh(corners.reshape(-1, 3), vertex_ids, colors))]
+
+
+def _text_corners(content: bytes, file: MeshFile) -> np.ndarray:
+    """Parse the corners of the faces of a text file, shape (F, 3, 3)."""
+    text = as_utf8(content).replace(b"\r", b"\n")
+    for keyword in dict.fromkeys(_OTHER_LINE.findall(text)):
+        if re.match(rb"colou?r|rgb", keyword, re.IGNORECASE):
+            raise ValueError("colors in the text form of STL are not supported: export it as PLY")
+        file.ignore(keyword.decode())
+    vertices = re.findall(rb"^\s*vertex\b(.*)", text, re.MULTILINE | re.IGNORECASE)
+    face_count = len(re.findall(rb"^\s*endfacet\b", text, re.MULTILINE | re.IGNORECASE))
+    coordinates = parse_numbers(b"\n".join(vertices), np.float64)
+    if len(coordinates) != 9 * face_count or len(vertices) != 3 * face_count:
+        raise ValueError("a facet does not have three vertices with three coordinates")
+    return coordinates.reshape(-1, 3, 3)
+
+
+def _face_colors(header: bytes, attributes: np.ndarray, file: MeshFile) -> np.ndarray:
+    """Decode the color of each face, which is white without a color, shape (F, 1, 3).
+
+    VisCAM and SolidView store blue in the lowest bits. Magics stores red there, and
+    the color of faces without a color of their own after "COLOR=" in the header.
+    """
+    channels = np.stack([attributes >> shift & 31 for shift in (0, 5, 10)], axis=1) / 31
+    has_flag = attributes & _FLAG != 0
+    default = header[:-4].partition(b"COLOR=")[2][:4]
+    if len(default) < 4:
+        if attributes[~has_flag].any():
+            file.ignore("attributes without a color")
+        return np.where(has_flag[:, None], channels[:, ::-1], 1)[:, None]
+    if b"MATERIAL=" in header:
+        file.ignore("MATERIAL")
+    red, green, blue, alpha = np.frombuffer(default, np.uint8) / 255
+    if alpha < OPAQUE:
+        raise ValueError("the color of the file is transparent, which is not supported")
+    return np.where(has_flag[:, None], [red, green, blue], channels)[:, None]
