@@ -211,7 +211,7 @@ def _box_filter(
         # Irradiance of each seen face from a light with a single coefficient of 1: one row for
         # each face, one column for each coefficient.
         face_values = basis.irradiance(surface.face_planes)
-        entry_to_pixel, entry_to_face, sample_count = fragments.groups
+        entry_to_pixel, entry_to_face, sample_count, _ = fragments.groups
         if albedo.shape[1] == 1:
             weights = sample_count.double()[:, None] / fragments.samples**2
         else:

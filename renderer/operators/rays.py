@@ -219,22 +219,19 @@ class Rays:
             # pixels use different samples for the same direction.
             rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
             sample_of_ray = first_sample[block, None] + rank_in_pixel
-            cosine = _dot(surface.normals[sample_of_ray], directions).clamp(min=0)
-            height = _dot(plane_normals[sample_of_ray], directions)
+            cosine = dot(surface.normals[sample_of_ray], directions).clamp(min=0)
+            height = dot(plane_normals[sample_of_ray], directions)
             # Pairs of a pixel and a direction that need a ray: the direction is above the
             # face, and in front of the shading normal.
             cast = torch.nonzero((cosine > 0) & (height > 0), as_tuple=True)
             start_sample = sample_of_ray[cast]
-            _, cast_direction = cast
             origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
-            hit_face = self.first_hit(origins, directions[cast_direction])
+            hit_face = self.first_hit(origins, directions[cast[1]])
             face_of_ray = torch.full_like(sample_of_ray, NO_FACE).index_put_(cast, hit_face)
             # The sky is not visible in directions below the plane of the face (height < 0).
             is_sky = (face_of_ray == NO_FACE) & (height >= 0)
             weight = (cosine * samples_in_pixel * solid_angle).masked_fill(is_sky, 0)
-            yield RayHits(
-                pixels=block, sample_of_ray=sample_of_ray, weight=weight, face_of_ray=face_of_ray
-            )
+            yield RayHits(block, sample_of_ray, weight, face_of_ray)
 
     @cached_property
     def _scene(self) -> Any:
@@ -313,14 +310,9 @@ class Rays:
         return torch.from_numpy(faces).long()
 
 
-def _dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> Float[Tensor, "B D"]:
+def dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> Float[Tensor, "B D"]:
     """Compute scalar products of vectors, one for each pixel and direction, with directions."""
     return torch.einsum("bdi,di->bd", vectors, directions)
-
-
-def directions_of_pixel(samples: int) -> Float[Tensor, "D 3"]:
-    """Compute the directions of the rays that the samples² samples of a pixel divide."""
-    return sphere(max(DIRECTIONS, DIRECTIONS_PER_SAMPLE * samples**2))
 
 
 @cache_tensors
@@ -442,12 +434,7 @@ def unoccluded(
         is_above_plane = (directions.T * plane_of_path).sum(1) > 0
         hits_nothing = rays.first_hit(origins, directions.T, lengths) == NO_FACE
         is_unblocked = is_above_plane & hits_nothing
-    return LightPaths(
-        point=paths.point[is_unblocked],
-        function=paths.function[is_unblocked],
-        source=paths.source[is_unblocked],
-        irradiance=paths.irradiance[is_unblocked],
-    )
+    return LightPaths(*(field[is_unblocked] for field in paths))
 
 
 class LocalLightView:
@@ -479,14 +466,10 @@ class LocalLightView:
         vertices: Tensor | None = None,
         gloss: Gloss | None = None,
     ):
-        """Compute the points and normals at the samples. Rays are cast in the first render."""
-        self._rays = rays
+        """Prepare the view. Rays are cast in the first render."""
         vertices = None if vertices is None else vertices.cpu()
+        self._rays = rays
         self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
-        # Reading these properties computes them now, and not in the first render.
-        self._points = self._surface.points
-        self._normals = self._surface.normals
-        self._planes = self._surface.planes
         # For each light that stays in place, its paths to samples that no face blocks.
         self._fixed_paths: dict[LocalBasis, LightPaths] = {}
 
@@ -503,18 +486,14 @@ class LocalLightView:
         The result is differentiable with respect to all tensors and to the
         vertices of the view. The arguments are those of `local_radiance` and `unoccluded`.
         """
+        surface = self._surface
+        moved = positions.cpu().double() if basis.is_movable and positions is not None else None
+        paths = self._fixed_paths.get(basis) if moved is None else None
+        if paths is None:
+            samples = surface.points, surface.normals, surface.planes
+            paths = unoccluded(self._rays, basis, *samples, moved)
+        if moved is None:
+            self._fixed_paths[basis] = paths
         fragments = None if fragments is None else fragments.to("cpu")
-        if basis.is_movable and positions is not None:
-            paths = self._find_paths(basis, positions.cpu().double())
-        else:
-            if basis not in self._fixed_paths:
-                self._fixed_paths[basis] = self._find_paths(basis, None)
-            paths = self._fixed_paths[basis]
-        radiance = local_radiance(
-            self._surface, albedo.cpu().double(), paths, light.cpu().double(), fragments
-        )
-        return radiance.to(light)
-
-    def _find_paths(self, basis: LocalBasis, positions: Float[Tensor, "L 3"] | None) -> LightPaths:
-        """Find the paths from a local light to the samples of the view that no face blocks."""
-        return unoccluded(self._rays, basis, self._points, self._normals, self._planes, positions)
+        arguments = albedo.cpu().double(), paths, light.cpu().double(), fragments
+        return local_radiance(surface, *arguments).to(light)

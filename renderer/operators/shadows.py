@@ -100,8 +100,15 @@ class Patches:
         # One entry for each side: the fronts of all small faces (pieces), then all backs.
         facing = np.repeat(sides, piece_count)[:, None]
         piece_of_side = np.tile(np.arange(piece_count), len(sides))
-        cell_width = math.sqrt(patch_area)
-        patch_of_side = _group_sides(pieces, piece_of_side, facing, cell_width)
+        # Two sides belong to the same patch if the centers of their pieces lie in the same cell of
+        # a cubic grid, if the normals are equal after each component is rounded to -1, 0 or 1, and
+        # if both sides are fronts or both are backs.
+        centers = pieces.vertices[pieces.faces].mean(axis=1)
+        cells = np.floor(centers / math.sqrt(patch_area))
+        keys = np.hstack([cells, np.rint(pieces.face_normals())])[piece_of_side]
+        _, patch_of_side = np.unique(np.hstack([keys, facing]), axis=0, return_inverse=True)
+        # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
+        patch_of_side = patch_of_side.ravel()
         # Each side becomes a sample. Sort them by patch, because `Fragments` needs the
         # samples of a pixel (here, a patch) next to each other.
         sample_to_side = np.argsort(patch_of_side, kind="stable")
@@ -130,9 +137,7 @@ class Patches:
         # One row for the fronts of all faces, one for their backs. A closed mesh has no row
         # for backs, because rays never hit them. `expand` then repeats the first row.
         patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
-        return Patches(
-            pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
-        )
+        return Patches(pieces, view, fractions[:, None], patch_by_side)
 
     def mean(self, values: Float[Tensor, "S D"]) -> Float[Tensor, "N D"]:
         """Average values over each of the N patches.
@@ -169,29 +174,6 @@ class Patches:
         return torch.from_numpy(self.pieces.face_normals())
 
 
-def _group_sides(
-    pieces: Mesh,
-    piece_of_side: Int[np.ndarray, " S"],
-    facing: Float[np.ndarray, "S 1"],
-    cell_width: float,
-) -> Int[np.ndarray, " S"]:
-    """Group the S sides (fronts and backs) of the faces of a mesh into patches.
-
-    The faces of the mesh are small. They are called pieces. Two sides belong to the same patch if
-    the centers of their pieces lie in the same cell of a cubic grid, if the normals are equal after
-    each component is rounded to -1, 0 or 1, and if both sides are fronts or both are backs. The
-    width of a cell is in world units. The result is the index of the patch of each side.
-    """
-    centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
-    normals = pieces.face_normals()[piece_of_side]
-    # Columns: three numbers of the grid cell, three of the rounded normal, front or back.
-    # Sides with equal rows belong to the same patch.
-    keys = np.hstack([np.floor(centers / cell_width), np.rint(normals), facing])
-    _, patch_of_side = np.unique(keys, axis=0, return_inverse=True)
-    # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
-    return patch_of_side.ravel()
-
-
 class Transport:
     """Computes how shadows and bounced light change the images of a mesh.
 
@@ -218,7 +200,8 @@ class Transport:
         # consist.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
-        self._directions = rays.directions_of_pixel(settings.samples)
+        ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
+        self._directions = rays.sphere(ray_count)
         # Radiance of the sky: one row for each ray direction, one column for each SH
         # coefficient.
         self._sky = basis.radiance(self._directions)
@@ -245,9 +228,8 @@ class Transport:
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(
-                surface.normals, surface.toward
-            )
+            diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)
+            diffuse_albedo = albedo_by_channel * diffuse_factor
         for hits in self.rays.hits(surface, self._directions):
             if not hits.weight.any():
                 continue
@@ -259,8 +241,8 @@ class Transport:
                 # Two specular reflectances along each ray: one that is later multiplied by
                 # the albedo, because metals color reflections, and one that is white. Axes
                 # of both: pixel, direction.
-                metallic, white = self._reflect_rays(gloss, surface, sample_of_ray)
-                cosine = self._cosines(surface, sample_of_ray)
+                cosine = rays.dot(surface.normals[sample_of_ray], self._directions)
+                metallic, white = self._reflect_rays(gloss, surface, sample_of_ray, cosine)
                 # Fraction of the light that passes the coat to the diffuse layer below it.
                 transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
             for channel, channel_change in enumerate(change):
@@ -275,46 +257,32 @@ class Transport:
                 # coefficient, one column for each pixel.
                 channel_change[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
-                    received = self._received(self._patches, hits, blocked, channel)
-                    channel_change[:, hits.pixels] += received
+                    # Add the light that the pixels receive from patches and reflect.
+                    sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
+                    weights = self._patches.weights_by_patch(hits, self._directions, blocked)
+                    channel_change[:, hits.pixels] += torch.from_numpy(weights @ sent).T
         return change
 
-    def _received(
-        self, patches: Patches, hits: RayHits, blocked: Float[Tensor, "B D"], channel: int
-    ) -> Float[Tensor, "K B"]:
-        """Compute the light that B pixels receive from patches and reflect, in one color channel.
-
-        A patch is a group of small faces (pieces) of the mesh. `blocked` is the reflected
-        radiance per unit radiance from each direction, and 0 in directions of the sky.
-        """
-        # Radiance that the patches send: one row for each patch, one column for each SH
-        # coefficient.
-        sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
-        received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
-        return torch.from_numpy(received).T
-
-    def _cosines(self, surface: Surface, sample_of_ray: Int[Tensor, "B D"]) -> Float[Tensor, "B D"]:
-        """Compute the cosine between each ray and the shading normal at its start."""
-        normals = surface.normals[sample_of_ray]
-        return torch.einsum("bdi,di->bd", normals, self._directions)
-
     def _reflect_rays(
-        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Int[Tensor, "B D"]
+        self,
+        gloss: SampleGloss,
+        surface: Surface,
+        sample_of_ray: Int[Tensor, "B D"],
+        cosine: Float[Tensor, "B D"],
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular reflectance of B pixels for light along their rays.
 
         The specular reflection may be narrower than the angle between two of the D ray directions.
         The reflectances of a pixel are therefore scaled so that their sum over the directions is
         exact for uniform light. The first result is multiplied by the albedo, because metals color
-        reflections. The second has the color of the light.
+        reflections. The second has the color of the light. `cosine` is between ray and normal.
         """
         to_camera = at_samples(surface.toward, sample_of_ray)
         normals = surface.normals[sample_of_ray]
         colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, self._directions)
-        cosine = self._cosines(surface, sample_of_ray).clamp(min=0)
         # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
         # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
-        sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
+        sampled = ((colored + white) * cosine.clamp(min=0)).mean(1, keepdim=True) * 4
         exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
         if exact_colored is not None:
             exact = exact + exact_colored
@@ -376,60 +344,40 @@ def _radiosity(
     channel_count = 3 if has_colors else 1
     # Sent radiance per irradiance ρ_i / π. Axes: patch, one of size 1, color.
     reflectance = patch_albedo[:, None, :channel_count] / math.pi
-    links = _PatchLinks.trace(patches, rays, basis)
-    sent = links.from_sky * reflectance
+    from_sky, receiving, factors = _link_patches(patches, rays, basis)
+    sent = from_sky * reflectance
     for _ in range(settings.bounces - 1):
         # Irradiance from other patches. Axes: patch that sees others, SH coefficient, color.
-        from_patches = torch.from_numpy(links.factors @ sent.flatten(1).numpy())
+        from_patches = torch.from_numpy(factors @ sent.flatten(1).numpy())
         from_patches = from_patches.view(-1, *sent.shape[1:])
-        from_sky = links.from_sky.expand_as(sent)
-        sent = from_sky.index_add(0, links.receiving, from_patches) * reflectance
+        sent = from_sky.expand_as(sent).index_add(0, receiving, from_patches) * reflectance
     return sent
 
 
-@dataclass(frozen=True)
-class _PatchLinks:
-    """How strongly the sky and other patches light each of N patches.
+def _link_patches(
+    patches: Patches, rays: Rays, basis: Harmonics
+) -> tuple[Float[Tensor, "N K 1"], Int[Tensor, " M"], csr_matrix]:
+    """Cast rays from all N patches to find which parts of the sky and which patches they see.
 
-    Attributes:
-        from_sky: Irradiance from the visible part of the sky, per unit of each of
-            the K SH coefficients, shape (N, K, 1).
-        receiving: Indices of the M patches that see other patches, shape (M,).
-        factors: Irradiance of each of these M patches per unit radiance of each
-            of the N patches, as a sparse matrix, shape (M, N).
+    The results are the irradiance from the visible part of the sky, per unit of each of the K SH
+    coefficients; the indices of the M patches that see other patches; and the irradiance of each of
+    these patches per unit radiance of each of the N patches, shape (M, N).
     """
-
-    from_sky: Float[Tensor, "N K 1"]
-    receiving: Int[Tensor, " M"]
-    factors: csr_matrix
-
-    @staticmethod
-    def trace(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
-        """Cast rays from all patches to find which parts of the sky and which patches they see."""
-        surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
-        # One row for each patch, one column for each SH coefficient: the irradiance from the
-        # whole sky. The loop below subtracts the directions that the mesh blocks.
-        from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
-        from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
-        directions = sphere(PATCH_DIRECTIONS)
-        sky_radiance = basis.radiance(directions)
-        receiving = []
-        factors = []
-        for hits in rays.hits(surface, directions):
-            # A patch consists of several small faces (pieces). The weight of a ray contains
-            # the area of the piece from which it starts, divided by the area of the patch.
-            weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
-            from_sky[hits.pixels] -= weights @ sky_radiance
-            receiving.append(hits.pixels)
-            factors.append(patches.weights_by_patch(hits, directions, weights))
-        if not factors:
-            return _PatchLinks(
-                from_sky=from_sky[..., None],
-                receiving=torch.arange(0),
-                factors=csr_matrix((0, len(from_sky))),
-            )
-        return _PatchLinks(
-            from_sky=from_sky[..., None],
-            receiving=torch.cat(receiving),
-            factors=vstack(factors, format="csr"),
-        )
+    surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
+    patch_count = len(patches.view.pixels)
+    # One row for each patch, one column for each SH coefficient: the irradiance from the
+    # whole sky. The loop below subtracts the directions that the mesh blocks.
+    from_sky = surface.planes.new_zeros(patch_count, basis.size)
+    from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
+    directions = sphere(PATCH_DIRECTIONS)
+    sky_radiance = basis.radiance(directions)
+    receiving = [torch.arange(0)]
+    factors = [csr_matrix((0, patch_count))]
+    for hits in rays.hits(surface, directions):
+        # A patch consists of several small faces (pieces). The weight of a ray contains
+        # the area of the piece from which it starts, divided by the area of the patch.
+        weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
+        from_sky[hits.pixels] -= weights @ sky_radiance
+        receiving.append(hits.pixels)
+        factors.append(patches.weights_by_patch(hits, directions, weights))
+    return from_sky[..., None], torch.cat(receiving), vstack(factors, format="csr")

@@ -29,10 +29,6 @@ from renderer.visibility import Rasterizer
 # processor.
 BLOCK = 2**14
 
-# Name under which `cached_property` stores the barycentric weights in the dictionary
-# `vars(fragments)` once they are computed.
-_WEIGHTS = "barycentric"
-
 
 class PixelGroups(NamedTuple):
     """Groups of successive samples that show the same face in the same pixel.
@@ -45,11 +41,13 @@ class PixelGroups(NamedTuple):
         group_to_seen_face: Index into `Fragments.faces` of each group, int64,
             shape (R,).
         sample_count: Number of samples in each group, int64, shape (R,).
+        sample_to_group: Index of the group of each sample, int64, shape (S,).
     """
 
     group_to_pixel: Int[Tensor, " R"]
     group_to_seen_face: Int[Tensor, " R"]
     sample_count: Int[Tensor, " R"]
+    sample_to_group: Int[Tensor, " S"]
 
 
 @dataclass(frozen=True)
@@ -170,88 +168,57 @@ class Fragments:
 
         x points to the right and y up, and the image is [-1, 1] in both.
         """
+        resolution = self.size * self.samples
+        row, column = _divide(self._finer_pixels.double(), resolution)
+        # The image [-1, 1] is divided into square cells of width 2 / resolution. A sample
+        # is the center of its cell.
+        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
+
+    @cached_property
+    def _finer_pixels(self) -> Tensor:
+        """Row-major index of each covered sample among all samples of the image, shape (S,)."""
         # Dividing floating-point numbers takes a tenth of the time of dividing integers.
         pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
         pixel_row, pixel_column = _divide(pixel_index, self.size)
         row_in_pixel, column_in_pixel = _divide(number_in_pixel, self.samples)
-        resolution = self.size * self.samples
-        # Row and column of each sample among all samples of the image.
-        column = pixel_column * self.samples + column_in_pixel
         row = pixel_row * self.samples + row_in_pixel
-        # The image [-1, 1] is divided into square cells of width 2 / resolution. A sample
-        # is the center of its cell.
-        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
+        column = pixel_column * self.samples + column_in_pixel
+        return (row * (self.size * self.samples) + column).long()
 
     def by_sample(self) -> "Fragments":
         """Return a copy for a finer image, in which each sample is a pixel.
 
         The samples keep their order, and the finer image has one sample per pixel.
         """
-        resolution = self.size * self.samples
-        # Row-major index of each pixel of the finer image.
-        finer_indices = torch.arange(resolution**2, device=self.sample_numbers.device)
-        # Axes: row of a pixel, row in the pixel, column of a pixel, column in the pixel.
-        finer_indices = finer_indices.view(self.size, self.samples, self.size, -1)
-        # `sample_numbers` counts all samples of the first pixel, then all samples of the
-        # second pixel, and so on. The transpose brings the indices into this order.
-        indices_by_pixel = finer_indices.transpose(1, 2).flatten()
-        finer_pixels = indices_by_pixel.index_select(0, self.sample_numbers)
+        sample_count = len(self.sample_numbers)
         finer = replace(
             self,
-            size=resolution,
+            size=self.size * self.samples,
             samples=1,
-            pixels=finer_pixels,
-            coverage=self.coverage.new_ones(len(finer_pixels)),
-            sample_to_pixel=torch.arange(len(finer_pixels), device=finer_pixels.device),
-            sample_numbers=finer_pixels,
+            pixels=self._finer_pixels,
+            coverage=self.coverage.new_ones(sample_count),
+            sample_to_pixel=torch.arange(sample_count, device=self.sample_numbers.device),
+            sample_numbers=self._finer_pixels,
         )
-        return self._share_weights(finer, slice(None))
-
-    def select(self, samples: Int[Tensor, " N"]) -> "Fragments":
-        """Return a copy that keeps only some of the S samples.
-
-        `pixels` and `coverage` stay the same.
-        """
-        selected = replace(
-            self,
-            sample_to_pixel=self.sample_to_pixel.index_select(0, samples),
-            sample_to_seen_face=self.sample_to_seen_face.index_select(0, samples),
-            sample_numbers=self.sample_numbers.index_select(0, samples),
-        )
-        return self._share_weights(selected, samples)
-
-    def _share_weights(self, copied: "Fragments", samples: Tensor | slice) -> "Fragments":
-        """Give a copy with some of these samples the barycentric weights of its samples.
-
-        The copy then does not compute the weights again. Nothing happens if the
-        weights have not been computed yet.
-        """
-        is_computed = _WEIGHTS in vars(self)
-        if is_computed:
-            vars(copied)[_WEIGHTS] = self.barycentric[samples]
-        return copied
+        # The copy does not compute the weights again.
+        vars(finer)["barycentric"] = self.barycentric
+        return finer
 
     def image_of_samples(self, values: Num[Tensor, " S"], empty: float) -> Num[Tensor, "_ _"]:
         """Arrange values at samples as an image with one pixel per sample.
 
         Samples that show no mesh get the value `empty`. Row 0 is at the top.
         """
-        image = values.new_full((self.size**2 * self.samples**2,), empty)
-        image.index_copy_(0, self.sample_numbers, values)
-        # Axes: row of a pixel, column of a pixel, row in the pixel, column in the pixel.
-        # The transpose exchanges the second and the third axis.
-        by_pixel = image.view(self.size, self.size, self.samples, self.samples)
-        return by_pixel.transpose(1, 2).reshape(self.size * self.samples, -1)
+        resolution = self.size * self.samples
+        image = values.new_full((resolution**2,), empty)
+        return image.index_copy_(0, self._finer_pixels, values).view(resolution, resolution)
 
     def of_image(self, image: Float[Tensor, "_ _"]) -> Float[Tensor, " S"]:
         """Read the values of the covered samples from an image with one pixel per sample.
 
         This is the inverse of `image_of_samples`.
         """
-        # Axes: row of a pixel, row in the pixel, column of a pixel, column in the pixel.
-        # The transpose exchanges the second and the third axis.
-        by_row = image.view(self.size, self.samples, self.size, self.samples)
-        return by_row.transpose(1, 2).flatten().index_select(0, self.sample_numbers)
+        return image.flatten().index_select(0, self._finer_pixels)
 
     def interpolate(self, corners: Float[Tensor, "G 3 D"]) -> Float[Tensor, "S D"]:
         """Interpolate values at the corners of faces to the S samples.
@@ -263,15 +230,19 @@ class Fragments:
         corner_rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(corner_rows, self.sample_to_seen_face, self.barycentric.T).T
 
-    def distribute(self, values: Float[Tensor, "S D"]) -> Float[Tensor, "G 3 D"]:
-        """Add up values at samples for each corner of the faces that the samples show.
+    def distribute(
+        self, values: Float[Tensor, "N D"], samples: Int[Tensor, " N"]
+    ) -> Float[Tensor, "G 3 D"]:
+        """Add up values at N of the samples for each corner of the faces that the samples show.
 
         Each value is multiplied by the barycentric weight of the corner at the
         sample. This is the transpose of `interpolate`, as in backpropagation.
         """
-        corner_rows_shape = (3 * values.shape[1], len(self.faces))
         corner_rows = _distribute(
-            values.T, self.sample_to_seen_face, self.barycentric.T, corner_rows_shape
+            values.T,
+            self.sample_to_seen_face.index_select(0, samples),
+            self.barycentric[samples].T,
+            (3 * values.shape[1], len(self.faces)),
         )
         # The axes corner, value, seen face become seen face, corner, value.
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
@@ -284,38 +255,24 @@ class Fragments:
         `pixels`, the index into `faces`, and the sum of the albedo divided by the number of
         samples of a pixel, which is differentiable.
         """
-        if self.samples == 1 or len(self.sample_to_pixel) == 0:
-            # Each sample is a group of its own if a pixel has one sample.
-            return self.sample_to_pixel, self.sample_to_seen_face, albedo
         groups = self.groups
-        samples_per_group = groups.sample_count.cpu().numpy()
-        # `np.repeat` takes a quarter of the time of the function of torch.
-        sample_to_group = np.repeat(np.arange(len(samples_per_group)), samples_per_group)
+        zeros = albedo.new_zeros(albedo.shape[1], len(groups.sample_count))
         scaled_albedo = albedo.T / self.samples**2
-        zeros = albedo.new_zeros(albedo.shape[1], len(samples_per_group))
-        albedo_of_groups = zeros.index_add(
-            1, torch.from_numpy(sample_to_group).to(albedo.device), scaled_albedo
-        )
+        albedo_of_groups = zeros.index_add(1, groups.sample_to_group, scaled_albedo)
         return groups.group_to_pixel, groups.group_to_seen_face, albedo_of_groups.T
 
     @cached_property
     def groups(self) -> PixelGroups:
         """Groups of successive samples that show the same face in the same pixel."""
-        pixel = self.sample_to_pixel
-        seen_face = self.sample_to_seen_face
-        # True if the pixel or the face of a sample differs from the sample before. An
-        # additional last entry marks the end of the last group.
-        is_start = torch.ones(len(pixel) + 1, dtype=torch.bool, device=pixel.device)
-        torch.ne(pixel[1:], pixel[:-1], out=is_start[1:-1])
-        is_start[1:-1] |= seen_face[1:] != seen_face[:-1]
-        # `np.flatnonzero` takes a quarter of the time of `torch.nonzero`.
-        start_indices = np.flatnonzero(is_start.cpu().numpy())
-        starts = torch.from_numpy(start_indices).to(pixel.device)
-        return PixelGroups(
-            group_to_pixel=pixel.index_select(0, starts[:-1]),
-            group_to_seen_face=seen_face.index_select(0, starts[:-1]),
-            sample_count=starts.diff(),
+        # Pixel and face are combined to one number.
+        keys, sample_to_group, sample_count = torch.unique_consecutive(
+            self.sample_to_pixel * len(self.faces) + self.sample_to_seen_face,
+            return_inverse=True,
+            return_counts=True,
         )
+        pixel = keys.div(len(self.faces), rounding_mode="floor")
+        seen_face = keys - pixel * len(self.faces)
+        return PixelGroups(pixel, seen_face, sample_count, sample_to_group)
 
     def to(self, device: torch.device | str) -> "Fragments":
         """Return a copy with all tensors on a device."""
@@ -430,23 +387,6 @@ def build_fragments(
     return views
 
 
-class _CoveredSamples(NamedTuple):
-    """Pixels that contain the S covered samples (those that show a mesh) of one view.
-
-    Attributes:
-        pixels: Row-major indices of the P pixels with covered samples,
-            shape (P,).
-        sample_count: Number of covered samples in each of these pixels,
-            shape (P,).
-        sample_to_pixel: Index into `pixels` of the pixel of each sample,
-            shape (S,).
-    """
-
-    pixels: Int[np.ndarray, " P"]
-    sample_count: Int[np.ndarray, " P"]
-    sample_to_pixel: Int[np.ndarray, " S"]
-
-
 def _fragments_of_view(
     camera: Camera,
     projected: Float[np.ndarray, "V 3"],
@@ -461,15 +401,13 @@ def _fragments_of_view(
     """
     size = settings.size
     samples = settings.samples
-    # Neighboring samples in a row of the same pixel become one item, which is faster to
-    # move. Axes: row of the pixel in the image, row of the samples in the pixel, column of the
-    # pixel in the image.
-    pixel_rows = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
     # All face ids of the first pixel, then all of the second pixel, and so on.
-    ids_by_pixel = pixel_rows.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)
+    ids_by_pixel = face_ids.reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
     covered_samples = np.flatnonzero(ids_by_pixel >= 0)
     seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
-    covered = _group_by_pixel(covered_samples, size, samples)
+    counts_of_all_pixels = np.bincount(covered_samples // samples**2, minlength=size**2)
+    pixels = np.flatnonzero(counts_of_all_pixels)
+    sample_count = counts_of_all_pixels[pixels]
     # One row for each corner, one column for each seen face. Rows are contiguous in
     # memory, because later code reads all first corners together.
     corners = np.ascontiguousarray(faces.take(seen_faces, axis=0).T)
@@ -481,42 +419,17 @@ def _fragments_of_view(
     return Fragments(
         size=size,
         samples=samples,
-        pixels=torch.from_numpy(covered.pixels),
-        coverage=torch.from_numpy(covered.sample_count / samples**2),
+        pixels=torch.from_numpy(pixels),
+        coverage=torch.from_numpy(sample_count / samples**2),
         faces=torch.from_numpy(seen_faces),
         corners=torch.from_numpy(corners).T,
         facing=torch.from_numpy(np.where(is_seen_from_behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        sample_to_pixel=torch.from_numpy(covered.sample_to_pixel),
+        sample_to_pixel=torch.from_numpy(np.repeat(np.arange(len(pixels)), sample_count)),
         sample_to_seen_face=torch.from_numpy(sample_to_seen_face),
         sample_numbers=torch.from_numpy(covered_samples),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
         camera=camera,
-    )
-
-
-def _group_by_pixel(
-    covered_samples: Int[np.ndarray, " S"], size: int, samples: int
-) -> _CoveredSamples:
-    """Find the pixels to which the S covered samples of an image belong.
-
-    The samples are ascending numbers, and all samples of the image are numbered pixel by pixel.
-    """
-    if samples == 1:
-        # Sample numbers and pixel indices are the same if a pixel has one sample.
-        return _CoveredSamples(
-            pixels=covered_samples,
-            sample_count=np.ones(len(covered_samples), dtype=np.int64),
-            sample_to_pixel=np.arange(len(covered_samples)),
-        )
-    samples_per_pixel = samples**2
-    counts_of_all_pixels = np.bincount(covered_samples // samples_per_pixel, minlength=size**2)
-    pixels = np.flatnonzero(counts_of_all_pixels > 0)
-    sample_count = counts_of_all_pixels[pixels]
-    return _CoveredSamples(
-        pixels=pixels,
-        sample_count=sample_count,
-        sample_to_pixel=np.repeat(np.arange(len(pixels)), sample_count),
     )
 
 

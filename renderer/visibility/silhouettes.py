@@ -37,6 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -111,27 +112,17 @@ def moving_outlines(
     )
     # Index of each sample of the image among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
-    crossings_on_cpu = _find_crossings(
-        fragments.to("cpu"),
-        _to_numpy(positions),
-        _to_numpy(nearness),
-        faces=_to_numpy(faces),
-        sample_grid=_to_numpy(sample_grid),
+    silhouettes = _Silhouettes(
+        fragments.to("cpu"), *map(_to_numpy, (positions, nearness, faces, sample_grid))
     )
-    crossings = Crossings(*(values.to(sample_grid.device) for values in crossings_on_cpu))
+    crossings = Crossings(*(array.to(sample_grid.device) for array in silhouettes.crossings()))
     # True for pixels that show no mesh, but have a sample beside a visible silhouette.
     is_uncovered = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
     is_uncovered.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
     is_uncovered.index_fill_(0, fragments.pixels, False)
     uncovered_pixels = is_uncovered.nonzero().squeeze(1)
-    view = _MovingView(
-        fragments=fragments,
-        crossings=crossings,
-        sample_grid=sample_grid,
-        uncovered_pixels=uncovered_pixels,
-        radiance=radiance.detach(),
-        background=background.detach(),
-    )
+    constants = radiance.detach(), background.detach()
+    view = _MovingView(fragments, crossings, sample_grid, uncovered_pixels, *constants)
     return uncovered_pixels, _ZerosWithGradient.apply(positions, view)
 
 
@@ -214,24 +205,23 @@ class _MovingView:
         # Most samples have neighbors of the same color. Their gradient is 0.
         has_gradient = (gradient_right != 0) | (gradient_down != 0)
         samples = torch.nonzero(has_gradient).squeeze(1)
-        selected = fragments.select(samples)
         # Gradient with respect to the image position (x, y) of each selected sample. The
         # minus sign is there because y points up.
         sample_gradients = torch.stack(
             [gradient_right.index_select(0, samples), -gradient_down.index_select(0, samples)]
         ).T
         if fragments.depths is not None:
-            depth = selected.interpolate(positions[:, 2:][selected.corners])
-            sample_gradients = _to_homogeneous(sample_gradients, selected.positions(), depth)
+            depth = fragments.interpolate(positions[:, 2:][fragments.corners])[samples]
+            places = fragments.positions()[samples]
+            sample_gradients = _to_homogeneous(sample_gradients, places, depth)
         # Distribute the gradients to the corners of faces: one row for each coordinate, one
         # column for each corner.
-        corner_gradients = (
-            selected.distribute(sample_gradients).permute(2, 1, 0).flatten(1).double()
-        )
+        corner_gradients = fragments.distribute(sample_gradients, samples)
+        corner_gradients = corner_gradients.permute(2, 1, 0).flatten(1).double()
         gradient = positions.new_zeros(positions.shape[::-1])
         # Without perspective, only the first two coordinates have a gradient.
         coordinate_count = sample_gradients.shape[1]
-        gradient[:coordinate_count].index_add_(1, selected.corners.T.flatten(), corner_gradients)
+        gradient[:coordinate_count].index_add_(1, fragments.corners.T.flatten(), corner_gradients)
         return gradient.T
 
     def _gradient_along(
@@ -245,57 +235,33 @@ class _MovingView:
         `axis` is X for movements to the right, or Y for movements down. The image is
         radiance times upstream gradient, summed over the colors, and NaN where no mesh is.
         """
-        # Rows are dimension 0 of the image, so the axis X (0) is dimension 1.
-        dim = 1 - axis
-        steps = len(self.sample_grid) - 1
-        # Value of each sample minus the value of the next sample along the axis.
-        difference = torch.zeros_like(weighted_image)
-        torch.sub(
-            weighted_image.narrow(dim, 0, steps),
-            weighted_image.narrow(dim, 1, steps),
-            out=difference.narrow(dim, 0, steps),
-        )
-        # The difference is NaN if one of the two samples shows no mesh.
-        difference.nan_to_num_(0)
-        self._correct_pixel_borders(dim, difference, upstream_at_samples)
-        # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
-        is_in_row = self.crossings.horizontal
-        is_along_axis = is_in_row if axis == X else ~is_in_row
-        difference.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
-        # The gradient of a sample is the sum of its differences to both neighbors.
-        gradient = difference.clone()
-        gradient.narrow(dim, 1, steps).add_(difference.narrow(dim, 0, steps))
-        return self.fragments.of_image(gradient)
-
-    def _correct_pixel_borders(
-        self, dim: int, difference: Float[Tensor, "_ _"], upstream_at_samples: Float[Tensor, "3 S"]
-    ) -> None:
-        """Replace the differences between samples of two neighboring pixels, in place.
-
-        The two pixels have different upstream gradients. The correct difference is
-        the difference of the two radiances times the mean of the two upstream
-        gradients. `difference` is the product of radiance and upstream gradient of a sample
-        minus that of the next one along `dim`.
-        """
         samples = self.fragments.samples
-        # Slices of the image for the last samples of all pixels but the last one (before),
-        # and for the first samples of the next pixels (after).
-        before: Any = (slice(None), slice(samples - 1, -1, samples))
-        after: Any = (slice(None), slice(samples, None, samples))
-        # Use the same slices for the rows of the image instead of the columns.
-        if dim == 0:
-            before = before[::-1]
-            after = after[::-1]
         grid = self.sample_grid
-        are_covered = (grid[before] >= 0) & (grid[after] >= 0)
-        sample_before = grid[before][are_covered]
-        sample_after = grid[after][are_covered]
-        upstream_before = upstream_at_samples.index_select(1, sample_before)
-        upstream_sum = upstream_before + upstream_at_samples.index_select(1, sample_after)
-        radiance_before = self.radiance.index_select(1, sample_before)
-        radiance_difference = radiance_before - self.radiance.index_select(1, sample_after)
+        # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
+        is_along_axis = self.crossings.horizontal if axis == X else ~self.crossings.horizontal
+        crossed = list(_divmod(self.crossings.cells[0, is_along_axis], len(grid)))
+        if axis == Y:
+            # Make rows of the image of its columns.
+            weighted_image, grid = weighted_image.T, grid.T
+            crossed.reverse()
+        # Value of each sample minus the value of the next sample along the axis. The difference
+        # is NaN if one of the two samples shows no mesh.
+        difference = (weighted_image[:, :-1] - weighted_image[:, 1:]).nan_to_num_(0)
+        # Two neighboring pixels have different upstream gradients. The correct difference between
+        # the last sample of a pixel and the first of the next is the difference of the two
+        # radiances times the mean of the two upstream gradients.
+        before, after = grid[:, samples - 1 : -1 : samples], grid[:, samples::samples]
+        are_covered = (before >= 0) & (after >= 0)
+        before, after = before[are_covered], after[are_covered]
+        upstream_sum = upstream_at_samples[:, before] + upstream_at_samples[:, after]
+        radiance_difference = self.radiance[:, before] - self.radiance[:, after]
         corrected = (radiance_difference * upstream_sum).sum(0) / 2
-        difference[before].masked_scatter_(are_covered, corrected)
+        difference[:, samples - 1 :: samples].masked_scatter_(are_covered, corrected)
+        difference[tuple(crossed)] = 0
+        # The gradient of a sample is the sum of its differences to both neighbors.
+        gradient = F.pad(difference, (0, 1))
+        gradient[:, 1:] += difference
+        return self.fragments.of_image(gradient if axis == X else gradient.T)
 
     def gradient_of_silhouettes(
         self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]
@@ -372,63 +338,55 @@ def _to_homogeneous(
     return torch.cat([gradients, depth_gradient], dim=1) / depth
 
 
+def _divmod(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
+    """Divide whole numbers into quotients and remainders."""
+    return numbers // divisor, numbers % divisor
+
+
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     """Find the row-major pixels to which samples, row-major in the whole image, belong."""
     samples = fragments.samples
-    resolution = fragments.size * samples
-    row = cells // resolution // samples
-    column = cells % resolution // samples
-    return row * fragments.size + column
+    row, column = _divmod(cells, fragments.size * samples)
+    return row // samples * fragments.size + column // samples
 
 
-def _find_crossings(
-    fragments: Fragments,
-    positions: Float[np.ndarray, "V 3"],
-    nearness: Float[np.ndarray, " V"],
-    faces: Int[np.ndarray, "F 3"],
-    sample_grid: Int[np.ndarray, "_ _"],
-) -> Crossings:
-    """Find where visible silhouette edges pass between neighboring samples.
-
-    `nearness` is larger for nearer points, and linear in the image position on each face.
-    Crossings with rows of samples come first, then those with columns.
-    """
-    x, y, w = positions.T
-    points = np.stack([x / w, y / w, nearness]).T
-    # Positions (x, y), y down, in units of samples, rounded to subsamples as in rasterizers.
-    places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
-    ends = _silhouette_edges(places, faces)
-    if len(fragments.sample_to_seen_face) == 0:
-        ends = ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
-    start = places[:, ends[0]]
-    end = places[:, ends[1]]
-    # An edge (a, b) with y down has the normal (b, a) with y up.
-    normal = np.stack([end[1] - start[1], end[0] - start[0]])
-    # Edges without length divide by a small number instead of 0.
-    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
-    silhouettes = _Silhouettes(fragments, places, nearness, sample_grid, ends, normal)
-    in_rows = silhouettes.crossings_along(X)
-    in_columns = silhouettes.crossings_along(Y)
-    both = [np.concatenate(pair, axis=-1) for pair in zip(in_rows, in_columns, strict=True)]
-    return Crossings(*map(torch.from_numpy, both))
-
-
-@dataclass(frozen=True)
 class _Silhouettes:
-    """N silhouette edges of a view, and what is needed to find their visible parts.
+    """Silhouette edges of a view, which may be hidden.
 
-    `places` are the positions of the vertices in units of samples, x to the right and y
-    down. `nearness` is larger for nearer points, and linear in the image on each face.
-    `sample_grid` is that of `_MovingView`. `ends` are the vertices at both ends of each
-    edge, and `normal` is its unit normal in the image.
+    In `places`, vertices are in units of samples, x to the right and y down. `nearness` is larger
+    for nearer points, and linear in the image on each face. `sample_grid` is that of
+    `_MovingView`. `ends` are the vertices at both ends of each edge, and `normal` is its unit
+    normal in the image.
     """
 
-    fragments: Fragments
-    places: Float[np.ndarray, "2 V"]
-    nearness: Float[np.ndarray, " V"]
-    sample_grid: Int[np.ndarray, "_ _"]
-    ends: Int[np.ndarray, "2 N"]
-    normal: Float[np.ndarray, "2 N"]
+    def __init__(
+        self,
+        fragments: Fragments,
+        positions: Float[np.ndarray, "V 3"],
+        nearness: Float[np.ndarray, " V"],
+        faces: Int[np.ndarray, "F 3"],
+        sample_grid: Int[np.ndarray, "_ _"],
+    ):
+        """Find the silhouette edges, from homogeneous positions."""
+        self.fragments = fragments
+        self.nearness = nearness
+        self.sample_grid = sample_grid
+        x, y, w = positions.T
+        points = np.stack([x / w, y / w, nearness]).T
+        # Positions are rounded to subsamples as in rasterizers.
+        self.places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
+        self.ends = _silhouette_edges(self.places, faces)
+        if len(fragments.sample_to_seen_face) == 0:
+            self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
+        # An edge (a, b) with y down has the normal (b, a) with y up.
+        normal = np.diff(self.places[:, self.ends], axis=1)[::-1, 0]
+        # Edges without length divide by a small number instead of 0.
+        self.normal = normal / np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
+
+    def crossings(self) -> Crossings:
+        """Find where visible silhouettes pass between neighboring samples, in rows first."""
+        both = zip(self.crossings_along(X), self.crossings_along(Y), strict=True)
+        return Crossings(*(torch.from_numpy(np.concatenate(pair, axis=-1)) for pair in both))
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
         """Find where visible silhouettes pass between samples that are neighbors along an axis.
@@ -439,12 +397,9 @@ class _Silhouettes:
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
+        across_and_along = [1 - axis, axis]
         edge, line, fraction, next_sample = _cut_edges(
-            start_across=start[1 - axis],
-            end_across=end[1 - axis],
-            start_along=start[axis],
-            end_along=end[axis],
-            resolution=resolution,
+            start[across_and_along], end[across_and_along], resolution
         )
         # Row-major indices of the first sample after each cut, and of the sample before.
         if axis == X:
@@ -512,35 +467,31 @@ class _Silhouettes:
 
 
 def _cut_edges(
-    start_across: Float[np.ndarray, " N"],
-    end_across: Float[np.ndarray, " N"],
-    start_along: Float[np.ndarray, " N"],
-    end_along: Float[np.ndarray, " N"],
-    resolution: int,
+    start: Float[np.ndarray, "2 N"], end: Float[np.ndarray, "2 N"], resolution: int
 ) -> tuple[np.ndarray, ...]:
     """Find where N edges cross rows of samples, or columns of samples.
 
-    Rows and columns are both called lines. For rows, y is the coordinate across the lines, and x
-    the coordinate along the lines. For columns, it is the other way round. Coordinates are in units
-    of samples. Line i has the coordinate i. Crossings before the first sample or after the last
-    sample of a line are left out. The results are, for each of K crossings, the index of the edge,
-    the index of the line, the position on the edge from 0 (start) to 1 (end), and the index in the
-    line of the first sample at or after the crossing.
+    Rows and columns are both called lines. The first coordinate of the ends of the edges is across
+    the lines, and the second one along the lines, in units of samples. Line i has the coordinate i.
+    Crossings before the first sample or after the last sample of a line are left out. The results
+    are, for each of K crossings, the index of the edge, the index of the line, the position on the
+    edge from 0 (start) to 1 (end), and the index in the line of the first sample at or after the
+    crossing.
     """
-    lower = np.minimum(start_across, end_across)
-    upper = np.maximum(start_across, end_across)
+    lower = np.minimum(start[0], end[0])
+    upper = np.maximum(start[0], end[0])
     # Each edge crosses the lines from `first_line` to `end_line` - 1.
     first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
     end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
     cuts_per_edge = end_line - first_line
     # One entry for each pair of an edge and a line (row or column of samples) that the edge
     # crosses. The index of an edge is repeated for all lines that it crosses.
-    edge = np.repeat(np.arange(len(start_across)), cuts_per_edge)
+    edge = np.repeat(np.arange(len(lower)), cuts_per_edge)
     cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
     line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
-    fraction = (line - start_across[edge]) / (end_across - start_across)[edge]
-    position = start_along[edge] + fraction * (end_along - start_along)[edge]
+    fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
+    position = start[1, edge] + fraction * (end[1] - start[1])[edge]
     next_sample = np.ceil(position).astype(np.int64)
     is_inside = (next_sample > 0) & (next_sample < resolution)
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]

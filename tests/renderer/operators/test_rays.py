@@ -1,5 +1,7 @@
 """How pixels divide the directions of rays among their samples."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -33,7 +35,9 @@ def starts_of_rays(sample_count: int) -> Tensor:
     settings = ImageSettings(SIZE, SAMPLES)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [ABOVE], settings, choose("numpy"))
     in_pixel = torch.arange(SAMPLES**2).repeat(SIZE**2)
-    fragments = fragments.select(torch.nonzero(in_pixel < sample_count).flatten())
+    names = ("sample_to_pixel", "sample_to_seen_face", "sample_numbers")
+    kept = {name: getattr(fragments, name)[in_pixel < sample_count] for name in names}
+    fragments = replace(fragments, **kept)
     surface = Surface(mesh, fragments, settings)
     [hits] = Rays(mesh).hits(surface, sphere(DIRECTIONS))
     assert hits.pixels.tolist() == list(range(SIZE**2))
