@@ -27,7 +27,7 @@ from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, as_path, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
-from train.data.cache import content_hash
+from train.data.sets import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
 from train.settings import NetworkSettings, published

@@ -29,8 +29,7 @@ from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
 from train import checkpoints, run_folder
 from train.cli import USER_ERROR
-from train.data.cache import content_hash
-from train.data.sets import load_folder, load_npz
+from train.data.sets import content_hash, load_folder, load_npz
 
 from .conftest import MAX_SECONDS, RENDERER, TRAINING, run_here
 

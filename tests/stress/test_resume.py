@@ -16,7 +16,7 @@ import pytest
 
 from train import checkpoints, run_folder
 from train.cli import USER_ERROR
-from train.data.cache import content_hash
+from train.data.sets import content_hash
 from train.run_folder import METRICS, read_metrics
 
 from .conftest import MAX_SECONDS, TRAINING, Process, end, run_here, start_command

@@ -20,7 +20,7 @@ from train import user_errors as errors
 from train.cli import USER_ERROR, Command, HelpText
 from train.commands.compare import CompareSettings
 from train.commands.experiment import logged_to
-from train.data.cache import content_hash
+from train.data.sets import content_hash
 from train.run_folder import LAST, locked
 from train.system import take_flag
 from train.user_errors import writable_folder

@@ -12,7 +12,7 @@ from renderer.errors import InputError
 from renderer.io.images import read_image
 from train import checkpoints, run_folder
 from train.checkpoints import load_run, load_selected
-from train.data.cache import content_hash
+from train.data.sets import content_hash
 from train.results.store import summarize
 from train.run_folder import PUBLISHED
 

@@ -1,12 +1,15 @@
 """A small labeled data set of renders of generated solids in soft front lighting.
 
-It is rendered when it is first used, so that training needs no download.
+It is rendered when it is first used, so that training needs no download, and is then cached.
 """
 
+import io
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -22,52 +25,97 @@ from augment.scene.scene import Scene
 from renderer.camera import OrthographicCamera
 from renderer.errors import require_memory
 from renderer.image import to_bytes
+from renderer.io.files import atomic_write
 from renderer.light.files import ambient, directional
 from renderer.mesh import Mesh, normalize
 from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid
 from renderer.visibility import choose
 from train import console
-from train.data.cache import TensorCache, content_hash, source_key
-from train.data.sets import DataSet, Split
+from train.data.sets import DataSet, Split, content_hash
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
 # Each generated solid is rendered once for each pair of a camera and a background.
 CAMERAS = 5
 BACKGROUNDS = 4
-# Hash of the code that renders the data set. It is part of the key in the cache,
-# so that the data set is rendered again after a change of the code.
+
+
+def source_key(*packages: Path) -> str:
+    """Hash the source code of packages, and the versions of torch and NumPy.
+
+    As part of the key of a cache, the hash makes cached results of other code unused.
+    """
+    files = []
+    for folder in packages:
+        for path in folder.rglob("*.py"):
+            files.append((path.relative_to(folder).as_posix(), path.read_bytes()))
+    return content_hash([torch.__version__, np.__version__, sorted(files)])
+
+
+# The data set is rendered again after a change of the code that renders it.
 _MODULES = (renderer.__file__, augment.__file__, __file__)
 CODE = source_key(*(Path(module).parent for module in _MODULES))
 
 
-def load_shapes(
-    train: int,
-    test: int,
-    size: int,
-    seed: int,
-    cache: TensorCache | None = None,
-) -> DataSet:
-    """Render a data set with one class for each kind of solid, or read it from a cache.
+def cache_folder(choice: str | None) -> Path | None:
+    """Return the folder of the cache that a user chooses.
+
+    "auto" is a folder in $XDG_CACHE_HOME or ~/.cache, and None is no cache.
+    """
+    if not choice:
+        return None
+    if choice != "auto":
+        return Path(os.path.expanduser(choice))
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(caches, "parametric-norm-balls") if os.path.isabs(caches) else None
+
+
+def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None = None) -> DataSet:
+    """Render a data set with one class for each kind of solid, or read it from the folder `cache`.
 
     `train` and `test` are numbers of images of each class. Every 20 of them show another shape.
     """
     count = len(CLASSES) * (train + test)
     require_memory(f"{count} images of {size} pixels", 3 * size**2 * count, torch.device("cpu"))
-    cache = cache or TensorCache()
     settings = replace(SETTINGS, size=size)
     splits = []
     for split_name, images_per_class in (("train", train), ("test", test)):
         key = content_hash([CODE, CLASSES, images_per_class, seed, split_name, settings])
-        cached = cache.read(key)
-        if cached is None:
-            cached = {"images": _render(split_name, images_per_class, seed, settings)}
-            cache.write(key, cached)
-        console.debug("%s images: %d", split_name, len(cached["images"]))
+        images = read_cached(cache, key)
+        if images is None:
+            images = _render(split_name, images_per_class, seed, settings)
+            write_cached(cache, key, images)
+        console.debug("%s images: %d", split_name, len(images))
         labels = torch.arange(len(CLASSES)).repeat_interleave(images_per_class)
-        splits.append(Split(cached["images"], labels))
+        splits.append(Split(images, labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
+
+
+def read_cached(cache: Path | None, key: str) -> Tensor | None:
+    """Read a tensor from a folder. None if there is no such file, or if it is damaged."""
+    if cache is None:
+        return None
+    try:
+        # zipfile compares the checksum of the array.
+        with open(cache / f"{key}.npz", "rb") as file, np.load(file) as archive:
+            return torch.from_numpy(archive["images"])
+    # zipfile and NumPy raise errors of many types for a damaged file.
+    except Exception:
+        return None
+
+
+def write_cached(cache: Path | None, key: str, images: Tensor) -> None:
+    """Write a tensor to a folder, so that other processes never read a partly written file."""
+    if cache is None:
+        return
+    content = io.BytesIO()
+    np.savez(content, images=images.numpy())
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        atomic_write(cache / f"{key}.npz", content.getvalue())
+    except OSError as error:
+        console.warning(f"the rendered images are not cached: {error}")
 
 
 def soft_front_light(

@@ -1,9 +1,11 @@
 """Data sets of images: CIFAR-100, an .npz file, class folders, or a folder without labels."""
 
-from collections.abc import Iterable, Iterator, Sequence
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +17,6 @@ from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, single_line
 from train import console
-from train.data.cache import content_hash
 from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
 from train.data.photographs import (
     Photograph,
@@ -32,6 +33,36 @@ SPLIT_NAMES = ("train", "training", "val", "valid", "validation", "dev", "test",
 # Largest number of unlabeled images that are held out from training. 1000 images are
 # enough to measure to about 1% on which fraction of the images two networks agree.
 HELD_OUT = 1000
+
+
+def content_hash(state: Any) -> str:
+    """Compute a SHA-256 hash of nested values, such as the content of a checkpoint.
+
+    It depends on all keys, values, types and shapes.
+    """
+    digest = hashlib.sha256()
+    _update(digest, state)
+    return digest.hexdigest()
+
+
+def _update(digest: Any, value: Any) -> None:
+    """Add a value, with all values inside it, to a hash."""
+    match value:
+        case Tensor():
+            on_cpu = value.detach().cpu().contiguous()
+            digest.update(f"{on_cpu.dtype}{tuple(on_cpu.shape)}".encode())
+            # The bytes of the tensor, without a copy.
+            digest.update(on_cpu.flatten().view(torch.uint8).numpy().data)
+        case Mapping():
+            for key, item in value.items():
+                digest.update(f"{key!r}:".encode())
+                _update(digest, item)
+        case list() | tuple():
+            digest.update(f"[{len(value)}]".encode())
+            for item in value:
+                _update(digest, item)
+        case _:
+            digest.update(f"{value!r};".encode())
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ from renderer.errors import InputError, require_range
 from renderer.settings import MAX_SIZE
 from train import console
 from train.class_names import class_name, require_others
-from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import find_photographs, load_photographs
-from train.data.rendered_shapes import load_shapes
+from train.data.rendered_shapes import cache_folder, load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled, relabeled
 from train.device import choose_rasterizer
 from train.processes import main_process_first
@@ -62,13 +61,12 @@ def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> D
         return load_npz(data.path)
     size = settings.size or (initial.size if initial else SIZE)
     if name == "shapes":
-        cache = TensorCache(cache_folder(settings.train.cache))
         return load_shapes(
             train=data.train_per_class,
             test=data.test_per_class,
             size=size,
             seed=data.seed,
-            cache=cache,
+            cache=cache_folder(settings.train.cache),
         )
     is_labeled = name == "folder"
     load_images = load_folder if is_labeled else load_unlabeled

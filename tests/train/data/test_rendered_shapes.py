@@ -1,10 +1,20 @@
+import errno
+import shutil
+from pathlib import Path
+
 import pytest
 import torch
 
+import renderer
 from renderer.errors import InputError
 from train.data import rendered_shapes
-from train.data.cache import TensorCache
-from train.data.rendered_shapes import load_shapes
+from train.data.rendered_shapes import (
+    cache_folder,
+    load_shapes,
+    read_cached,
+    source_key,
+    write_cached,
+)
 from train.data.sets import relabeled
 
 SIZE = 8
@@ -49,14 +59,8 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
 ):
     def load(**settings):
         before = len(instances)
-        arguments = {
-            "train": 1,
-            "test": 2,
-            "size": SIZE,
-            "seed": 0,
-            "cache": TensorCache(tmp_path),
-        } | settings
-        return load_shapes(**arguments), len(instances) - before
+        arguments = {"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings
+        return load_shapes(**arguments, cache=tmp_path), len(instances) - before
 
     first, rendered = load()
     again, cached = load()
@@ -73,3 +77,66 @@ def test_labels_count_the_classes_of_another_network():
     assert data.train.labels.tolist() == data.test.labels.tolist() == [3, 2, 0]
     with pytest.raises(InputError, match="lamp"):
         relabeled(data, ("plate", "orange"), "data=shapes")
+
+
+def test_any_change_of_the_sources_is_another_key(tmp_path):
+    package = tmp_path / "package"
+    shutil.copytree(
+        Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    assert source_key(package) == source_key(Path(renderer.__file__).parent)
+    module = package / "camera.py"
+    keys = {source_key(package)}
+    for change in (
+        lambda: module.write_text(module.read_text() + "\n"),
+        lambda: module.rename(package / "other.py"),
+        lambda: (package / "new.py").touch(),
+    ):
+        change()
+        keys.add(source_key(package))
+    assert len(keys) == 4
+
+
+def test_no_flipped_bit_and_no_cut_of_a_cached_file_gives_other_images(tmp_path):
+    """Every bit of some bytes, one bit of the others, and every length."""
+    images = torch.arange(48, dtype=torch.uint8).view(1, 3, 4, 4)
+    write_cached(tmp_path, "key", images)
+    (path,) = tmp_path.iterdir()
+    content = path.read_bytes()
+    for position in range(len(content)):
+        path.write_bytes(content[:position])
+        assert read_cached(tmp_path, "key") is None, position
+        for bit in range(8) if position % 16 == 0 else [position % 8]:
+            flipped = content[position] ^ 1 << bit
+            path.write_bytes(content[:position] + bytes([flipped]) + content[position + 1 :])
+            read = read_cached(tmp_path, "key")
+            # Some bits, such as those of the date, do not matter.
+            assert read is None or torch.equal(read, images), (position, bit)
+    path.write_bytes(content)
+    assert torch.equal(read_cached(tmp_path, "key"), images)
+
+
+def test_a_full_disk_stops_no_run(tmp_path, monkeypatch, caplog):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    load_shapes(train=1, test=1, size=SIZE, seed=0, cache=tmp_path)
+    assert "No space left on device" in caplog.text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("choice", "caches", "folder"),
+    [
+        ("auto", "/caches", "/caches/parametric-norm-balls"),
+        ("auto", "", "/home/user/.cache/parametric-norm-balls"),
+        ("auto", "relative", None),
+        ("~/here", "", "/home/user/here"),
+        (None, "/caches", None),
+    ],
+)
+def test_the_folder_is_the_users_cache_folder_unless_chosen(choice, caches, folder, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/user")
+    monkeypatch.setenv("XDG_CACHE_HOME", caches)
+    assert cache_folder(choice) == (folder and Path(folder))

@@ -23,8 +23,7 @@ from train import checkpoints, run_folder
 from train.checkpoints import load_run
 from train.command_settings import LabSettings
 from train.data import batches
-from train.data.cache import content_hash
-from train.data.sets import Split
+from train.data.sets import Split, content_hash
 from train.processes import Interrupted
 from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
