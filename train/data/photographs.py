@@ -4,7 +4,6 @@ import csv
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import prod
@@ -24,18 +23,7 @@ from train import console
 from train.data.photo import Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
 
-SUFFIXES = (
-    ".jpg",
-    ".jpeg",
-    ".jpe",
-    ".jfif",
-    ".png",
-    ".webp",
-    ".bmp",
-    ".tif",
-    ".tiff",
-    ".gif",
-)
+SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 # macOS adds a folder of this name to zip archives. It has no photographs.
 MACOS_FOLDER = "__MACOSX"
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
@@ -45,25 +33,10 @@ MAX_LABELS = 50
 TABLE = "photos.csv"
 # pnb-lab writes a file of this name to its folder of renders.
 DESCRIPTION = "lab.json"
-# End of the error message about files that cannot be read.
-SKIP_ADVICE = ", or set skip_unreadable=True to skip them"
-
-
-@dataclass(frozen=True)
-class _Row:
-    """Row of the table photos.csv about one photograph.
-
-    Attributes:
-        source: Name of the collection that the photograph comes from. None if
-            it is unknown.
-        hard_negatives: Names of other sources, whose negatives the photograph
-            is ranked against.
-        mesh: Name of the photographed object. None if it is unknown.
-    """
-
-    source: str | None = None
-    hard_negatives: tuple[str, ...] = ()
-    mesh: str | None = None
+# Source, sources of hard negatives and mesh of a photograph that photos.csv does not name.
+NO_ROW = (None, (), None)
+# What `Photograph` has after its path and label.
+Row = tuple[str | None, tuple[str, ...], str | None]
 
 
 def require_outside(out: Path, folder: Path) -> None:
@@ -111,45 +84,29 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
             f"{folder} has no class folders, and label names several classes: "
             "move the images of the folder into one subfolder per class",
         )
-    rows = _read_table(folder / TABLE)
-    _require_files_of_rows(folder / TABLE, rows, files, paths[0])
-
+    table = folder / TABLE
+    rows = _read_table(table)
+    missing = sorted(rows.keys() - set(map(_composed_path, files)))
+    if missing and len(missing) == len(rows):
+        raise InputError(
+            f"{table} names a missing file in each of its {len(rows)} rows, such as "
+            f"{missing[0]}: give paths relative to the folder, such as {paths[0]}"
+        )
+    if missing:
+        counts = f"{len(missing)} of {len(rows)} rows"
+        _warn_once(f"{table} names a missing file in {counts}, such as {missing[0]}")
     photographs = []
     for path in paths:
-        row = rows.get(_composed_path(path), _Row())
         name = composed(path.parts[0]) if has_class_folders else labels[0]
-        photographs.append(Photograph(path, name, row.source, row.hard_negatives, row.mesh))
-    sources = {item.source for item in photographs}
+        photographs.append(Photograph(path, name, *rows.get(_composed_path(path), NO_ROW)))
     hard_negatives = {name for item in photographs for name in item.hard_negatives}
-    unknown = hard_negatives - sources
+    unknown = hard_negatives - {item.source for item in photographs}
     if unknown:
         raise InputError(
-            f"{folder / TABLE} names the source {min(unknown)!r} in the column hard_negatives, "
+            f"{table} names the source {min(unknown)!r} in the column hard_negatives, "
             "but no image has this source: correct or remove this name",
         )
     return photographs
-
-
-def _require_files_of_rows(
-    table: Path,
-    rows: dict[PurePosixPath, _Row],
-    files: Sequence[PurePosixPath],
-    example: PurePosixPath,
-) -> None:
-    """Check that the rows of photos.csv name files that exist.
-
-    A warning tells how many rows name a missing file.
-    """
-    missing = sorted(rows.keys() - set(map(_composed_path, files)))
-    if not missing:
-        return
-    if len(missing) == len(rows):
-        raise InputError(
-            f"{table} names a missing file in each of its {len(rows)} rows, such as "
-            f"{missing[0]}: give paths relative to the folder, such as {example}"
-        )
-    counts = f"{len(missing)} of {len(rows)} rows"
-    _warn_once(f"{table} names a missing file in {counts}, such as {missing[0]}")
 
 
 def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
@@ -284,12 +241,11 @@ def _has_class_folders(
     Only a folder without subfolders has none; wrong names raise InputError.
     """
     names = folder_names(folder)
-    no_classes = [
-        name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)
-    ]
-    has_no_class = no_classes == names
+    known = [name for name in names if name in classes or name.startswith(OTHER_PREFIX)]
+    no_classes = [name for name in names if name not in known]
     for name in no_classes:
-        if has_no_class or any(_is_like(name, label) for label in labels):
+        is_misspelled = any(label in name.lower() for label in labels)
+        if not known or is_misspelled or get_close_matches(name.lower(), labels):
             suggestions = nearest(name, classes)
             raise InputError(
                 f"{folder / name} is not named after a class of the network "
@@ -311,17 +267,12 @@ def _has_class_folders(
     return bool(names)
 
 
-def _is_like(name: str, label: str) -> bool:
-    """Return whether the name of a folder contains the name of a class, or is similar to it."""
-    return label in name.lower() or bool(get_close_matches(name.lower(), [label]))
-
-
-def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
+def _read_table(table: Path) -> dict[PurePosixPath, Row]:
     """Read the table photos.csv, which has the source and the object of each photograph.
 
     It is empty if the file is missing.
     """
-    rows: dict[PurePosixPath, _Row] = {}
+    rows: dict[PurePosixPath, Row] = {}
     if not os.path.lexists(table):
         return rows
     try:
@@ -332,7 +283,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
             composed_lines = (composed(line) for line in file)
             for line in csv.DictReader(composed_lines, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
-                row = _Row(
+                row = (
                     line["source_tag"] or None,
                     split_sources(line.get("hard_negatives", "")),
                     line.get("mesh") or None,
@@ -352,7 +303,6 @@ def load_photographs(
     photographs: Sequence[Photograph],
     size: int = 32,
     skip_unreadable: bool = False,
-    advice: str = SKIP_ADVICE,
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 
@@ -367,47 +317,28 @@ def load_photographs(
     cpu = torch.device("cpu")
     require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), cpu)
     images = torch.empty(shape, dtype=torch.uint8)
-    errors = _read_into(images, folder, photographs)
-
-    readable = []
-    unreadable = []
-    for index, (photograph, error) in enumerate(zip(photographs, errors, strict=True)):
-        if error is None:
-            readable.append(index)
-        else:
-            unreadable.append((photograph.path, error))
-    if unreadable and not (readable and skip_unreadable):
-        path, error = unreadable[0]
-        skip_advice = advice if readable else ""
-        raise InputError(
-            f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
-            f"the first being {folder / path} ({error}): replace them{skip_advice}",
-        )
-    if unreadable:
-        images = images[readable]
-    unreadable_paths = [str(path) for path, _ in unreadable]
-    return [photographs[index] for index in readable], images, unreadable_paths
-
-
-def _read_into(
-    images: UInt8[Tensor, "N 3 size size"],
-    folder: Path,
-    photographs: Sequence[Photograph],
-) -> list[Exception | None]:
-    """Read the central squares of photographs into a tensor, in several threads.
-
-    Return the error for each photograph, or None.
-    """
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
     # it decodes and resizes.
     pool = ThreadPoolExecutor()
     try:
-        errors = pool.map(_read_image, images, paths)
-        return list(progress(errors, "photographs", len(paths)))
+        errors = [*progress(pool.map(_read_image, images, paths), "photographs", len(paths))]
     finally:
         # If Ctrl-C is pressed, images that no thread has begun to read are not read.
         pool.shutdown(cancel_futures=True)
+    readable = [index for index, error in enumerate(errors) if error is None]
+    unreadable = [index for index, error in enumerate(errors) if error is not None]
+    if unreadable and not (readable and skip_unreadable):
+        first = unreadable[0]
+        advice = ", or set skip_unreadable=True to skip them" if readable else ""
+        raise InputError(
+            f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
+            f"the first being {paths[first]} ({errors[first]}): replace them{advice}",
+        )
+    if unreadable:
+        images = images[readable]
+    unreadable_paths = [str(photographs[index].path) for index in unreadable]
+    return [photographs[index] for index in readable], images, unreadable_paths
 
 
 def _read_image(image: UInt8[Tensor, "3 size size"], path: Path) -> Exception | None:

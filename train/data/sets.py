@@ -197,11 +197,9 @@ def channel_statistics(images: UInt8[Tensor, "N 3 H W"]) -> tuple[list[float], l
     means = []
     deviations = []
     for channel in range(3):
-        pixels = images[:, channel].flatten()
-        histogram = torch.bincount(pixels, minlength=256).double()
-        pixel_count = histogram.sum()
-        mean = float(histogram @ values / pixel_count)
-        variance = histogram @ (values - mean) ** 2 / pixel_count
+        histogram = torch.bincount(images[:, channel].flatten(), minlength=256).double()
+        mean = float(histogram @ values / histogram.sum())
+        variance = histogram @ (values - mean) ** 2 / histogram.sum()
         means.append(mean)
         deviations.append(max(float(variance.sqrt()), 1e-3))
     return means, deviations
@@ -247,7 +245,17 @@ def load_npz(path: str) -> DataSet:
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return _read_npz(archive)
+            classes = archive["classes"]
+            if classes.ndim != 1 or classes.dtype.kind != "U" or len({*classes}) != len(classes):
+                raise ValueError("classes must be distinct strings, one per class")
+            splits = []
+            for name in progress(("train", "test"), "reading the data"):
+                arrays = archive[f"{name}_images"], archive[f"{name}_labels"]
+                splits.append(_npz_split(*arrays, len(classes)))
+        train, test = splits
+        if train.images.shape[1:] != test.images.shape[1:]:
+            raise ValueError("train_images and test_images differ in size")
+        return DataSet(tuple(classes.tolist()), train, test)
     # zipfile, zlib and NumPy raise errors of many types for a damaged file.
     except Exception as error:
         raise InputError(
@@ -256,23 +264,6 @@ def load_npz(path: str) -> DataSet:
             "and classes",
             "path",
         ) from error
-
-
-def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
-    """Read a data set from the arrays of an open .npz file."""
-    classes = archive["classes"]
-    splits = []
-    for split_name in progress(("train", "test"), "reading the data"):
-        images = archive[f"{split_name}_images"]
-        labels = archive[f"{split_name}_labels"]
-        splits.append(_npz_split(images, labels, classes.size))
-    train, test = splits
-    names = classes.tolist()
-    if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(names)) != len(classes):
-        raise ValueError("classes must be distinct strings, one per class")
-    if train.images.shape[1:] != test.images.shape[1:]:
-        raise ValueError("train_images and test_images differ in size")
-    return DataSet(tuple(names), train, test)
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
@@ -330,7 +321,8 @@ def load_folder(
         shown = ", ".join(map(str, other_files[:3]))
         console.warning("%d files in %s are not images: %s", len(other_files), root, shown)
 
-    train = _folder_split(train_root, classes, size, skip_unreadable, workers)
+    options = (size, skip_unreadable, workers)
+    train = _read(train_root, find_photographs(train_root, classes, classes[0]), classes, *options)
     empty_classes = set(range(len(classes))).difference(train.labels.tolist())
     if empty_classes:
         name = classes[min(empty_classes)]
@@ -338,57 +330,48 @@ def load_folder(
             f"{train_root / name} holds no image: put images there, or remove the folder"
         )
     if split_names:
-        test = _folder_split(root / "test", classes, size, skip_unreadable, workers)
-        return DataSet(classes, train, test)
+        found = find_photographs(root / "test", classes, classes[0])
+        return DataSet(classes, train, _read(root / "test", found, classes, *options))
     is_test = held_out_rows(train, test_fraction, seed=0, argument="test_fraction")
     return DataSet(classes, train[~is_test], train[is_test])
 
 
 def load_unlabeled(
-    path: str,
-    size: int,
-    test_fraction: float,
-    skip_unreadable: bool,
-    workers: int,
+    path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int
 ) -> DataSet:
     """Load all images of a folder and its subfolders as an unlabeled data set.
 
     It has no classes, every label is 0, and at most HELD_OUT images are test images.
     """
     found = find_unlabeled(Path(path))
-    _, images = _read(Path(path), found, size, skip_unreadable, workers)
-    split = Split(images, torch.zeros(len(images), dtype=torch.int64))
+    split = _read(Path(path), found, None, size, skip_unreadable, workers)
     fraction = min(test_fraction, HELD_OUT / len(split))
     is_test = held_out_rows(split, fraction, seed=0, argument="test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 
-def _folder_split(
+def _read(
     root: Path,
-    classes: tuple[str, ...],
+    found: list[Photograph],
+    classes: Sequence[str] | None,
     size: int,
     skip_unreadable: bool,
     workers: int,
 ) -> Split:
-    """Load the images of a folder that has a subfolder for each class."""
-    found = find_photographs(root, classes, classes[0])
-    found, images = _read(root, found, size, skip_unreadable, workers)
-    labels = [class_index(classes, item.label, str(root)) for item in found]
-    return Split(images, torch.tensor(labels))
-
-
-def _read(
-    root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
-) -> tuple[list[Photograph], Tensor | ImageFiles]:
     """Read photographs into memory if `size` is small. Otherwise leave them on disk.
 
-    Unreadable photographs are missing in both results; files on disk are not read yet.
+    Unreadable photographs are left out, but files on disk are not read yet. Without `classes`,
+    every label is 0.
     """
+    images: Tensor | ImageFiles
     if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
-        return found, ImageFiles(root, paths, size, workers, skip_unreadable)
-    readable, images, broken = load_photographs(root, found, size, skip_unreadable)
-    if broken:
-        counts = f"{len(broken)} of {len(found)} images cannot be read and are skipped"
-        console.warning("%s: %s", counts, broken[0])
-    return readable, images
+        images = ImageFiles(root, paths, size, workers, skip_unreadable)
+    else:
+        count = len(found)
+        found, images, broken = load_photographs(root, found, size, skip_unreadable)
+        if broken:
+            counts = f"{len(broken)} of {count} images cannot be read and are skipped"
+            console.warning("%s: %s", counts, broken[0])
+    labels = [class_index(classes, item.label, str(root)) if classes else 0 for item in found]
+    return Split(images, torch.tensor(labels))

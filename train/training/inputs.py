@@ -238,7 +238,9 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, T
     label_of_negative = complementary_label(label_of_class[positive_classes[0]])
     with keyed("augment.folder"):
         found = find_photographs(folder, data.classes, positive_classes)
-        found, images, _ = load_photographs(folder, found, data.size, advice="")
+        found, images, _ = load_photographs(
+            folder, found, data.size, settings.evaluate.skip_unreadable
+        )
         missing = set(positive_classes) - {item.label for item in found}
         if missing:
             name = min(missing)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from renderer.errors import InputError
-from train.data.masks import read_mask
+from train.commands.fit import read_mask
 
 # The object is not symmetric, and neither is the image.
 IS_OBJECT = np.zeros((12, 16), dtype=bool)
