@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -93,12 +93,8 @@ class ImageFiles:
         square.
         """
         errors: ReadErrors = {}
-        loader: DataLoader = DataLoader(
-            _Reader(self),
-            batch_sampler=list(batches),
-            num_workers=self.workers,
-            collate_fn=_collate,
-        )
+        options: dict[str, Any] = {"num_workers": self.workers, "collate_fn": _collate}
+        loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch
             if errors and not self.skip:
@@ -125,60 +121,44 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         from torchvision.transforms import v2
 
         self._files = files
-        crop = v2.RandomResizedCrop(
-            files.size,
-            scale=(MIN_CROP_AREA, 1.0),
-            interpolation=v2.InterpolationMode.BICUBIC,
-        )
+        area = (MIN_CROP_AREA, 1.0)
+        bicubic = v2.InterpolationMode.BICUBIC
+        crop = v2.RandomResizedCrop(files.size, area, interpolation=bicubic)
         self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
 
     def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
         """Read an image, or another image of its subfolder if it cannot be read.
 
-        It is black if none can be read. The dictionary has the error of each unreadable file.
+        The next one in the list of paths comes first, and the image is black if none can be read.
+        The dictionary has the error of each unreadable file.
         """
         index, seed = key
+        paths, size = self._files.paths, self._files.size
         errors: ReadErrors = {}
-        for path in self._candidates(index):
+        for path in (*paths[index:], *paths[:index]):
+            if path.parent != paths[index].parent:
+                continue
             try:
-                image = read_rgb(self._files.folder / path, DECODED_SCALE * self._files.size)
+                image = read_rgb(self._files.folder / path, DECODED_SCALE * size)
             # Pillow raises errors of almost any type for a damaged file.
             except Exception as error:
                 errors[path] = str(error)
                 if self._files.skip:
                     continue
                 break
-            pixels = np.array(self._crop_image(image, seed))
-            return torch.from_numpy(pixels).permute(2, 0, 1), errors
-        size = self._files.size
+            if seed is None:
+                image = central_square(image, size)
+            else:
+                with torch.random.fork_rng(devices=[]):
+                    # `torch.manual_seed` would also seed the generators of GPUs.
+                    torch.default_generator.manual_seed(seed)
+                    image = self._crop(image)
+            return torch.from_numpy(np.array(image)).permute(2, 0, 1), errors
         return torch.zeros(3, size, size, dtype=torch.uint8), errors
-
-    def _candidates(self, index: int) -> Iterator[PurePosixPath]:
-        """Yield the path of an image, and then the paths that can replace it.
-
-        These are the paths of the other images in the same subfolder. The next
-        one in the list of paths comes first.
-        """
-        paths = self._files.paths
-        for path in (*paths[index:], *paths[:index]):
-            if path.parent == paths[index].parent:
-                yield path
-
-    def _crop_image(self, image: Image.Image, seed: int | None) -> Image.Image:
-        """Return the central square of an image, or a random crop if there is a seed."""
-        if seed is None:
-            return central_square(image, self._files.size)
-        with torch.random.fork_rng(devices=[]):
-            # `torch.manual_seed` is not used, because it also seeds the generators of GPUs.
-            torch.default_generator.manual_seed(seed)
-            return self._crop(image)
 
 
 def _collate(items: Sequence[tuple[Tensor, ReadErrors]]) -> tuple[Tensor, ReadErrors]:
     """Stack the images of a batch, and join their error messages."""
-    all_errors: ReadErrors = {}
-    for _, errors in items:
-        all_errors |= errors
-    if not items:
-        return torch.empty(0), all_errors
-    return torch.stack([image for image, _ in items]), all_errors
+    errors = {path: error for _, of_image in items for path, error in of_image.items()}
+    images = [image for image, _ in items]
+    return torch.stack(images) if images else torch.empty(0), errors

@@ -1,4 +1,8 @@
-"""Render the path-traced test set of pnb-lab, and write it as a folder of photographs."""
+"""Render the path-traced test set of pnb-lab, and write it as a folder of photographs.
+
+After a training, such a test set shows the same classes as the training, but other objects in other
+lighting.
+"""
 
 import csv
 import io
@@ -29,12 +33,19 @@ from renderer.light.environment import read_panorama, to_map
 from renderer.light.files import PROBES, load_light
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
-from renderer.solids import HARD_NEGATIVES
-from train.command_settings import LabSettings
+from renderer.solids import HARD_NEGATIVES, SOLIDS
+from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photographs import DESCRIPTION, TABLE
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.run_folder import LOCK, read_json, sole_writer
-from train.settings import OTHER_PREFIX, label_names, read_object, solid_name
+from train.settings import (
+    OTHER_PREFIX,
+    ExperimentSettings,
+    label_names,
+    read_object,
+    simplified,
+    solid_name,
+)
 from train.user_errors import writable_folder
 
 # Glob pattern of the renders in the folder of the test set. Their paths are
@@ -54,6 +65,16 @@ BUILT_IN_MAP_HEIGHT = 64
 PLANE_HALF_WIDTH = 100.0
 # Mitsuba takes seeds from 0 to 2^32 - 1.
 SEED_COUNT = 2**32
+# The generated solids for testing have the seeds 2001, 2002 and so on. Training uses
+# lower seeds, or draws seeds that are far larger.
+FIRST_SEED = 2001
+# Number of generated solids of each positive class.
+POSITIVE_COUNT = 6
+# Number of generated solids for each name in NEGATIVES.
+NEGATIVE_COUNT = 2
+# Solids that a network may confuse with the positive class: fruit, a vegetable and a
+# ball. A solid of a positive class is left out.
+NEGATIVES = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
 
 
 class Subject(NamedTuple):
@@ -76,30 +97,21 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
     The parts have smooth normals, except at sharp edges. `albedo_scale` multiplies the linear
     colors, which are then limited to [0, 1].
     """
-    normals = mesh.written_normals("smooth")
+
+    def scaled(albedo: np.ndarray) -> np.ndarray:
+        return np.clip(albedo_scale * albedo, 0, 1).astype(np.float32)
+
     parts = []
-    for part in split_parts(mesh, normals, "srgb"):
+    for part in split_parts(mesh, mesh.written_normals("smooth"), "srgb"):
         texture = part.texture
         if texture is not None:
-            linear = decode(torch.from_numpy(texture / 255), "srgb").numpy()
-            texture = _scale_albedo(linear, albedo_scale)
-        colors = _scale_albedo(part.colors, albedo_scale)
-        parts.append(replace(part, colors=colors, texture=texture))
+            texture = scaled(decode(torch.from_numpy(texture / 255), "srgb").numpy())
+        parts.append(replace(part, colors=scaled(part.colors), texture=texture))
     return parts
 
 
-def _scale_albedo(albedo: np.ndarray, factor: float) -> np.ndarray:
-    """Multiply the albedo of a surface by a factor, and limit the products to [0, 1]."""
-    return np.clip(factor * albedo, 0, 1).astype(np.float32)
-
-
 def path_traced(
-    parts: Sequence[Part],
-    shot: Shot,
-    size: int,
-    spp: int,
-    bounces: int,
-    seed: int,
+    parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int
 ) -> Float[np.ndarray, "size size 3"]:
     """Render an object with the path tracer of Mitsuba 3.
 
@@ -159,31 +171,21 @@ def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> di
 
 def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """Create a Mitsuba shape for each part of an object in the pose of a shot."""
-    positions_by_part = []
-    for part in parts:
-        positions = shot.scale * part.positions @ shot.rotation.T
-        positions_by_part.append(positions.reshape(-1, 3))
-    min_height = min(positions[:, 2].min() for positions in positions_by_part)
+    turned = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
+    min_height = min(positions[:, 2].min() for positions in turned)
     shapes = []
-    for part, positions in zip(parts, positions_by_part, strict=True):
+    for part, positions in zip(parts, turned, strict=True):
         albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
         if part.texture is not None:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
         surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
+        two_sided = {"type": "twosided", "surface": surface}
+        placed = positions - [0, 0, min_height]
         # Faces share no vertices: face i has the vertices 3i, 3i + 1 and 3i + 2.
         faces = np.arange(len(positions)).reshape(-1, 3)
         normals = (part.normals @ shot.rotation.T).reshape(-1, 3)
-        shapes.append(
-            shape(
-                module,
-                {"type": "twosided", "surface": surface},
-                positions - [0, 0, min_height],
-                faces,
-                normals,
-                part.uvs.reshape(-1, 2),
-                part.colors.reshape(-1, 3),
-            )
-        )
+        uvs, colors = part.uvs.reshape(-1, 2), part.colors.reshape(-1, 3)
+        shapes.append(shape(module, two_sided, placed, faces, normals, uvs, colors))
     return shapes
 
 
@@ -196,18 +198,26 @@ def write_laboratory(settings: LabSettings) -> int:
     versions of the packages give the same bytes. Return the number of renders.
     """
     out = writable_folder(settings.out, "out")
-    subjects = []
-    for index, item in enumerate(progress(settings.meshes, "meshes")):
-        subjects.append(read_subject(item, index))
+    meshes = progress(settings.meshes, "meshes")
+    subjects = [read_subject(item, index) for index, item in enumerate(meshes)]
     paths = [Path(path) for path in settings.environments]
     environments = {path.stem: _read_environment(path) for path in paths}
     groups = _group_subjects(subjects, label_names(settings.label))
-    # Pictures that a projector can show.
-    slides = [_read_slide(path) for path in settings.slides]
+    # Pictures that a projector can show: linear RGB, shape (LAB_RESOLUTION, LAB_RESOLUTION, 3).
+    pictures = [decode(read_image(path, LAB_RESOLUTION), "srgb") for path in settings.slides]
+    slides = [picture.permute(1, 2, 0).numpy() for picture in pictures]
     # A shot, or setup, is a random lighting, camera and pose in which objects are rendered.
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
-        _require_empty(out, settings.overwrite)
+        if settings.overwrite:
+            # Only renders are removed, no other files. lab.json says that they are complete.
+            for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
+                file.unlink(missing_ok=True)
+        elif any(path.name != LOCK for path in out.iterdir()):
+            raise InputError(
+                f"out={out} holds files, but the renders need an empty folder: "
+                "choose another folder, or set overwrite=true to replace earlier renders in it",
+            )
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             for group in groups:
@@ -243,44 +253,19 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
     others. With a single positive class, meshes of another class are needed. The last group has all
     other meshes, if there are any.
     """
+    groups = [[subject for subject in subjects if subject.label == label] for label in labels]
     negatives = [subject for subject in subjects if subject.label not in labels]
-    needs_negatives = len(labels) == 1
-    groups = []
-    for label in labels:
-        group = [subject for subject in subjects if subject.label == label]
-        if not group or (needs_negatives and not negatives):
+    for label, group in zip(labels, groups, strict=True):
+        if not group or (len(labels) == 1 and not negatives):
             raise InputError(
                 f"meshes has {len(group)} meshes of the class label={label} and "
                 f"{len(negatives)} of other classes: name at least one of each"
             )
-        groups.append(group)
-    if negatives:
-        groups.append(negatives)
-    return groups
-
-
-def _require_empty(out: Path, overwrite: bool) -> None:
-    """Check that the folder of the test set is empty, or remove earlier renders.
-
-    Only renders are removed, no other files.
-    """
-    if overwrite:
-        # lab.json says that the renders are complete.
-        for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
-            file.unlink(missing_ok=True)
-    elif any(path.name != LOCK for path in out.iterdir()):
-        raise InputError(
-            f"out={out} holds files, but the renders need an empty folder: "
-            "choose another folder, or set overwrite=true to replace earlier renders in it",
-        )
+    return [*groups, negatives] if negatives else groups
 
 
 def _write_render(
-    out: Path,
-    settings: LabSettings,
-    subject: Subject,
-    shot: Shot,
-    number: int,
+    out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int
 ) -> str:
     """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file.
 
@@ -294,11 +279,6 @@ def _write_render(
     (out / path).parent.mkdir(parents=True, exist_ok=True)
     write_image(out / path, Image.fromarray(pixels.numpy()))
     return path.as_posix()
-
-
-def _read_slide(path: str) -> np.ndarray:
-    """Read a picture for a projector as linear RGB, shape (LAB_RESOLUTION, LAB_RESOLUTION, 3)."""
-    return decode(read_image(path, LAB_RESOLUTION), "srgb").permute(1, 2, 0).numpy()
 
 
 def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
@@ -344,3 +324,56 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
         )
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)
+
+
+def kept_aside_settings(
+    settings: ExperimentSettings, classes: Sequence[str], size: int, out: Path
+) -> LabSettings:
+    """Choose objects and lighting for test renders that training does not use.
+
+    If a positive class is the name of a generated solid, new solids are
+    generated. Otherwise the meshes of training are rendered in other lighting. The number of setups
+    is a multiple of the number of projected patterns.
+    """
+    labels = label_names(settings.label)
+    meshes: list[Any] = []
+    for label in labels:
+        if can_be_generated(label):
+            meshes += _generated(_solid_name(label), label, POSITIVE_COUNT)
+        else:
+            trained = settings.objects.values()
+            meshes += [asdict(item) for item in trained if item.label == label]
+    # Names are compared in lower case and with spaces instead of "_" and "-", as `simplified`
+    # returns them.
+    class_of_simplified = {simplified(name): name for name in classes}
+    for name in NEGATIVES:
+        if simplified(name) not in map(simplified, labels):
+            # A solid that is no class of the network gets a label that marks it as another object.
+            label = class_of_simplified.get(simplified(name), OTHER_PREFIX + name)
+            meshes += _generated(name, label, NEGATIVE_COUNT)
+    return LabSettings(
+        out=str(out),
+        label=settings.label,
+        meshes=meshes,
+        setups=settings.evaluate.laboratory_setups,
+        patterns=[*OTHER_PATTERNS],
+        size=size,
+        seed=FIRST_SEED + settings.seed,
+        overwrite=True,
+    )
+
+
+def can_be_generated(label: str) -> bool:
+    """Return whether a class has generated solids."""
+    return _solid_name(label) in {*SOLIDS, *HARD_NEGATIVES}
+
+
+def _solid_name(label: str) -> str:
+    """Return the name that the solid of a class would have, such as "golf_ball"."""
+    return simplified(label).replace(" ", "_")
+
+
+def _generated(name: str, label: str, count: int) -> list[Any]:
+    """Return the settings of generated solids of the same kind with different seeds."""
+    seeds = range(FIRST_SEED, FIRST_SEED + count)
+    return [{"mesh": f"solid:{name}:{seed}", "label": label} for seed in seeds]

@@ -125,22 +125,18 @@ def draw_shots(
 
 
 def _scale_environment(
-    radiance: Float[np.ndarray, "H W 3"],
-    brightness: float,
-    rng: np.random.Generator,
+    radiance: Float[np.ndarray, "H W 3"], brightness: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "H W 3"]:
     """Rotate an environment map about the vertical axis by a random angle, and scale it.
 
     `brightness` is the radiance of a white diffuse surface that faces up.
     """
     directions, solid_angles = equirectangular(*radiance.shape[:2])
-    cosines = directions[..., 2].clamp(min=0)
-    weights = cosines * solid_angles
+    weights = directions[..., 2].clamp(min=0) * solid_angles
     irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
     white_radiance = float(irradiance.mean()) / math.pi
     # A map whose columns are shifted is rotated about the vertical axis.
-    column_offset = rng.integers(radiance.shape[1])
-    rotated = np.roll(radiance, column_offset, axis=1)
+    rotated = np.roll(radiance, rng.integers(radiance.shape[1]), axis=1)
     return (brightness / white_radiance * rotated).astype(np.float32)
 
 
@@ -158,70 +154,39 @@ def _draw_shot(
     what later versions added, so that older draws do not change.
     """
     first_pattern, *other_patterns = pattern_names.split("+")
+    sources = [(first_pattern, rng), *((name, extra_rng) for name in other_patterns)]
     azimuth = rng.uniform(0, 360)
     half_width = rng.uniform(*HALF_WIDTHS)
     scale = rng.uniform(*SCALES)
     center = np.array([0, 0, CENTER_HEIGHT * scale])
     aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
-    roughness = _draw_between(settings.roughness, extra_rng)
-    patterns = [draw_lab_pattern(first_pattern, rng, slides)]
-    patterns += [draw_lab_pattern(name, extra_rng, slides) for name in other_patterns]
-    ambient = _draw_between(settings.ambient, rng) * draw_lab_color(rng)
-    table = _draw_between(settings.albedo, rng) * draw_lab_color(rng)
-    projectors = [center + _draw_projector(settings, azimuth, rng)]
-    projectors += [center + _draw_projector(settings, azimuth, extra_rng) for _ in other_patterns]
+    roughness = extra_rng.uniform(*settings.roughness)
+    patterns = [draw_lab_pattern(name, draws, slides) for name, draws in sources]
+    ambient = rng.uniform(*settings.ambient) * draw_lab_color(rng)
+    table = rng.uniform(*settings.albedo) * draw_lab_color(rng)
+    projectors = []
+    for _, draws in sources:
+        projector_azimuth = azimuth + draws.uniform(*settings.azimuth)
+        elevation = draws.uniform(*settings.elevation)
+        distance = draws.uniform(*PROJECTOR_DISTANCES)
+        projectors.append(center + _from_angles(projector_azimuth, elevation, distance))
     camera_distance = half_width / math.tan(math.radians(FOV / 2))
     camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
     angles = rng.uniform(0, MAX_EULER_ANGLES)
     rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
-    to_wall = _draw_wall(azimuth, extra_rng)
+    # The wall stands behind the object, as seen from the camera. `to_wall` leads from the center
+    # of the object to the nearest point of the wall.
+    wall_azimuth = azimuth + 180 + extra_rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
+    to_wall = _from_angles(wall_azimuth, 0, extra_rng.uniform(*WALL_DISTANCES))
     wants_wall = extra_rng.uniform() < settings.walls
     # `to_wall` is normal to the wall, so its dot product with a vector is larger than
     # its squared length only if the vector ends behind the wall.
     is_behind_wall = [(position - center) @ to_wall >= to_wall @ to_wall for position in projectors]
-    return Shot(
-        lighting=pattern_names,
-        brightness=brightness,
-        patterns=patterns,
-        ambient=ambient,
-        table=table,
-        projectors=projectors,
-        camera=camera,
-        center=center,
-        aim=aim,
-        rotation=rotation,
-        scale=scale,
-        roughness=roughness,
-        # A wall between a projector and the object would block the light.
-        wall=center + to_wall if wants_wall and not any(is_behind_wall) else None,
-    )
-
-
-def _draw_projector(
-    settings: LabSettings, azimuth: float, rng: np.random.Generator
-) -> Float[np.ndarray, " 3"]:
-    """Draw the position of a projector, relative to the point that it faces.
-
-    `azimuth` is that of the camera in degrees.
-    """
-    projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
-    elevation = _draw_between(settings.elevation, rng)
-    return _from_angles(projector_azimuth, elevation, rng.uniform(*PROJECTOR_DISTANCES))
-
-
-def _draw_wall(azimuth: float, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """Draw the position of a vertical wall behind the object, as seen from the camera.
-
-    It is the vector from the center of the object to the nearest point of the wall. `azimuth` is in
-    degrees.
-    """
-    wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
-    return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))
-
-
-def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw a random number from the uniform distribution between two limits."""
-    return rng.uniform(limits[0], limits[1])
+    # A wall between a projector and the object would block the light.
+    wall = center + to_wall if wants_wall and not any(is_behind_wall) else None
+    lights = (patterns, ambient, table, projectors)
+    places = (camera, center, aim, rotation, scale)
+    return Shot(pattern_names, brightness, *lights, *places, roughness, wall)
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, " 3"]:
@@ -229,9 +194,6 @@ def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.
 
     `azimuth` is the angle from +x toward +y in degrees, and `elevation` that above z = 0.
     """
-    azimuth_radians = math.radians(azimuth)
-    elevation_radians = math.radians(elevation)
-    horizontal = math.cos(elevation_radians)
-    x = horizontal * math.cos(azimuth_radians)
-    y = horizontal * math.sin(azimuth_radians)
-    return distance * np.array([x, y, math.sin(elevation_radians)])
+    turn, rise = math.radians(azimuth), math.radians(elevation)
+    x, y = math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn)
+    return distance * np.array([x, y, math.sin(rise)])

@@ -18,7 +18,7 @@ from augment.augmentation_settings import MODES
 from augment.progress import progress_message
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.laboratory.kept_aside import can_be_generated
+from train.laboratory.laboratory import can_be_generated
 from train.results import compare, store
 from train.results.first_screen import (
     NETWORKS,

@@ -34,8 +34,7 @@ from train.device import (
     choose_threads,
     set_deterministic,
 )
-from train.laboratory.kept_aside import kept_aside_settings
-from train.laboratory.laboratory import is_laboratory, write_laboratory
+from train.laboratory.laboratory import is_laboratory, kept_aside_settings, write_laboratory
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run

@@ -4,7 +4,7 @@ import pytest
 
 from train.__main__ import main as train_command
 from train.command_settings import TRAINED_PATTERNS
-from train.laboratory.kept_aside import can_be_generated, kept_aside_settings
+from train.laboratory.laboratory import can_be_generated, kept_aside_settings
 from train.settings import ExperimentSettings
 
 
