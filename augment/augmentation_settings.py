@@ -6,6 +6,7 @@ This module imports neither torch nor NumPy; see `renderer.settings`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from augment.attack_settings import AttackSettings, StepSettings
 from renderer.errors import MAX_SCALE, InputError, describe
@@ -27,6 +28,12 @@ MIN_FOV = 1.0
 MAX_FOV = 45.0
 UNCHANGED = (1.0, 1.0)  # Range of a factor that is always 1.
 NONE = (0.0, 0.0)  # Range of a number that is always 0.
+# Facts about the fields below: a fraction, a factor, a pair of either, and an angle.
+FRACTION: dict[str, Any] = {"minimum": 0, "maximum": 1}
+FRACTIONS = {**FRACTION, "is_pair": True}
+FACTOR: dict[str, Any] = {"minimum": 1 / MAX_SCALE, "maximum": MAX_SCALE}
+FACTORS = {**FACTOR, "is_pair": True}
+ANGLE: dict[str, Any] = {"unit": "degrees", "minimum": 0, "maximum": 180}
 
 
 @dataclass
@@ -41,11 +48,7 @@ class SpecularLayerSettings(Settings):
         is_pair=True,
     )
     specular_factor: list[float] = setting(
-        list(NONE),
-        "Smallest and largest strength. [0, 0]: no layer.",
-        minimum=0,
-        maximum=1,
-        is_pair=True,
+        list(NONE), "Smallest and largest strength. [0, 0]: no layer.", **FRACTIONS
     )
 
 
@@ -58,7 +61,7 @@ class CameraEffectSettings(Settings):
     """
 
     pattern_fraction: float = setting(
-        0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1
+        0.0, "Fraction of renders under a projected pattern.", **FRACTION
     )
     slides: str | None = setting(
         None, "Folder of photographs, which half of the patterns show. null: none."
@@ -66,9 +69,7 @@ class CameraEffectSettings(Settings):
     pattern_fill: list[float] = setting(
         list(NONE),
         "Smallest and largest factor of the lighting of the scene beneath the pattern.",
-        minimum=0,
-        maximum=1,
-        is_pair=True,
+        **FRACTIONS,
     )
     white_balance: float = setting(
         0.0, "Largest change of each channel.", "stops", minimum=0, maximum=5
@@ -76,9 +77,7 @@ class CameraEffectSettings(Settings):
     blur: float = setting(
         0.0, "Largest standard deviation of the blur.", "pixels", minimum=0, maximum=MAX_BLUR
     )
-    noise: float = setting(
-        0.0, "Largest standard deviation of the pixel noise.", minimum=0, maximum=1
-    )
+    noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", **FRACTION)
 
 
 @dataclass
@@ -96,22 +95,13 @@ class VariationSettings(Settings):
     shift: float = setting(
         0.0,
         "Largest distance of the mesh from the center of the image, as a fraction of its width.",
-        minimum=0,
-        maximum=1,
+        **FRACTION,
     )
     scale: list[float] = setting(
-        list(UNCHANGED),
-        "Smallest and largest factor of the size in the image.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
-        is_pair=True,
+        list(UNCHANGED), "Smallest and largest factor of the size in the image.", **FACTORS
     )
     exposure: list[float] = setting(
-        list(UNCHANGED),
-        "Smallest and largest factor of the lighting.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
-        is_pair=True,
+        list(UNCHANGED), "Smallest and largest factor of the lighting.", **FACTORS
     )
     backgrounds: str | None = setting(
         None, "Folder of images that replace scene.backgrounds. null: none."
@@ -122,9 +112,7 @@ class VariationSettings(Settings):
     azimuth: float = setting(
         0.0,
         "Largest motion of the camera around the mesh, to either side and up and down.",
-        "degrees",
-        minimum=0,
-        maximum=180,
+        **ANGLE,
     )
     fov: list[float] = setting(
         list(NONE),
@@ -135,13 +123,7 @@ class VariationSettings(Settings):
         maximum=MAX_FOV,
         is_pair=True,
     )
-    rotation: float = setting(
-        0.0,
-        "Largest rotation of the mesh about a random axis.",
-        "degrees",
-        minimum=0,
-        maximum=180,
-    )
+    rotation: float = setting(0.0, "Largest rotation of the mesh about a random axis.", **ANGLE)
     environments: list[str] = setting(
         [], "Environment lightings that replace scene.light, one of them for each render."
     )
@@ -149,29 +131,22 @@ class VariationSettings(Settings):
         0.0,
         "Fraction of renders in directional lighting from the side of the camera, up to 70 "
         "degrees from it.",
-        minimum=0,
-        maximum=1,
+        **FRACTION,
     )
     fill_light: list[float] = setting(
         list(NONE),
         "Smallest and largest factor of the environment lighting of these renders.",
-        minimum=0,
-        maximum=1,
-        is_pair=True,
+        **FRACTIONS,
     )
     lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
     tables: float = setting(
         0.0,
         "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the "
         "object.",
-        minimum=0,
-        maximum=1,
+        **FRACTION,
     )
     background_saturation: float = setting(
-        0.0,
-        "Largest saturation of a random color that multiplies each background.",
-        minimum=0,
-        maximum=1,
+        0.0, "Largest saturation of a random color that multiplies each background.", **FRACTION
     )
     gloss: SpecularLayerSettings = setting(
         SpecularLayerSettings, "A specular layer on each object, which replaces its own material."
@@ -206,15 +181,13 @@ class RandomLightSettings(Settings):
     amplitude: float = setting(
         0.5,
         "Each coefficient changes by a uniform draw between minus and plus this value.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
+        **FACTOR,
     )
     radius: float | None = setting(
         None,
         "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: "
         "the amplitude applies.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
+        **FACTOR,
     )
 
 

@@ -146,16 +146,19 @@ class AugmentationService:
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
         require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
-        self.positive_classes = [
-            int(label) for label in as_integers("positive_classes", self.positive_classes)
-        ]
+        self.positive_classes = as_integers("positive_classes", self.positive_classes).tolist()
         if self.scene is not None and self.labels.shape != (len(self.scene),):
             raise InputError(
                 f"labels has shape {tuple(self.labels.shape)}: "
                 f"give one label for each of the {len(self.scene)} examples",
             )
         if self.images is not None:
-            self._check_images(self.images)
+            require_kind("images", self.images, Tensor, "a tensor of bytes, or None")
+            if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
+                raise InputError(
+                    f"images is {describe(self.images)}: give bytes (E, 3, H, W), one for each "
+                    "label",
+                )
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(
@@ -167,14 +170,6 @@ class AugmentationService:
             self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
             if not attack.allow_negative:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
-
-    def _check_images(self, images: UInt8[Tensor, "E 3 H W"]) -> None:
-        """Check the type, the dtype and the shape of the images of a folder."""
-        require_kind("images", images, Tensor, "a tensor of bytes, or None")
-        if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
-            raise InputError(
-                f"images is {describe(images)}: give bytes (E, 3, H, W), one for each label",
-            )
 
     @classmethod
     def from_meshes(
@@ -219,14 +214,9 @@ class AugmentationService:
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_whole("seed", seed)
-        paper: dict[str, Any] = {
-            "views": 10,
-            "samples": 8,
-            "normals": "flat",
-            "backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0],
-        }
+        paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
+        options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
         settings = settings or AugmentationSettings()
-        options = paper | of_scene
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
         for item in scene.objects:
             require_whole(f"meshes: the label of {item.name}", item.label)
@@ -238,9 +228,8 @@ class AugmentationService:
         """Return the number of renders that `regenerate` returns."""
         if self.images is None:
             return len(self.labels) if self.settings.renders else 0
-        if self.settings.examples is None:
-            return len(self.labels)
-        return self.settings.examples
+        examples = self.settings.examples
+        return len(self.labels) if examples is None else examples
 
     def regenerate(self, model: nn.Module, number: int) -> Renders:
         """Make the renders for the current weights of a network.
@@ -323,10 +312,8 @@ class AugmentationService:
         Numbers are rounded first, so that the same settings have the same hash on all machines.
         """
         shown: list[object] = [self.labels.tolist(), list(self.positive_classes)]
-        if self.images is not None:
-            shown.append(tuple(self.images.shape))
-        if self.scene is not None:
-            shown.append(_describe_scene(self.scene))
+        shown += [] if self.images is None else [tuple(self.images.shape)]
+        shown += [] if self.scene is None else [_describe_scene(self.scene)]
         digest = hashlib.sha256(repr(shown).encode()).digest()
         return torch.tensor(list(digest), dtype=torch.uint8)
 
@@ -339,19 +326,14 @@ class AugmentationService:
         may begin in one pass and end in another. `number` tells how many selections were made
         before.
         """
-        image_count = len(images)
-        # Imagine all passes one after the other. These are the positions of the first and the
-        # last selected image.
-        first = number * len(self)
-        last = first + len(self) - 1
-        first_pass = first // image_count
-        last_pass = last // image_count
+        count, image_count = len(self), len(images)
+        # Imagine all passes one after the other. The first selected image is at this position.
+        first = number * count
         orders = []
-        for index in range(first_pass, last_pass + 1):
+        for index in range(first // image_count, (first + count - 1) // image_count + 1):
             draws = generator(self.seed, index, "folder")
             orders.append(torch.randperm(image_count, generator=draws))
-        offset = first - first_pass * image_count
-        rows = torch.cat(orders)[offset : offset + len(self)].to(images.device)
+        rows = torch.cat(orders)[first % image_count :][:count].to(images.device)
         selected = to_unit(images[rows])
         labels = self.labels[rows]
         _, diagnostics = self._classify(model, selected, labels)
@@ -383,8 +365,9 @@ class AugmentationService:
             batch_size = self.settings.attack.batch_size
             logits = compute_outputs(attacked_model, images[rows], batch_size)
         require_known(labels, logits)
-        is_misclassified = ~is_correct(logits.argmax(1), labels[rows], self.positive_classes[1:])
-        loss = label_loss(logits, labels[rows], absent=self.positive_classes[1:])
+        absent = self.positive_classes[1:]
+        is_misclassified = ~is_correct(logits.argmax(1), labels[rows], absent)
+        loss = label_loss(logits, labels[rows], absent=absent)
         is_error = torch.zeros_like(labels, dtype=torch.bool)
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
@@ -423,9 +406,8 @@ class AugmentationService:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
         diagnostics |= _changes(problem, result.values)
         is_new_success = success & ~result.success_before
-        examples = select_examples_to_log(
-            model, problem, result.values, is_new_success, self.labels
-        )
+        values = result.values
+        examples = select_examples_to_log(model, problem, values, is_new_success, self.labels)
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(
@@ -493,21 +475,22 @@ def _describe_scene(scene: Scene) -> list[object]:
     It contains texts, whole numbers and rounded numbers about objects, cameras, backgrounds and
     lights.
     """
-    described: list[object] = [scene.settings.size, scene.settings.encoding, str(scene.basis)]
+    objects = []
     for item in scene.objects:
-        extent = item.mesh.vertices.std(axis=0)
         counts = (len(item.mesh.vertices), len(item.mesh.faces))
+        extent = _rounded(item.mesh.vertices.std(axis=0))
         scale = f"{item.albedo_scale:.3g}"
-        described.append((str(item.label), item.name, counts, _rounded(extent), scale))
+        objects.append((str(item.label), item.name, counts, extent, scale))
+    examples = []
     for example in scene.examples:
         cameras = [_rounded(vars(camera.fixed()).values()) for camera in example.cameras]
         exposure = f"{example.exposure:.3g}"
-        described.append((example.object, example.background, exposure, cameras))
-    backgrounds = scene.backgrounds.mean((2, 3)).flatten()
+        examples.append((example.object, example.background, exposure, cameras))
     lights = scene.lights.flatten(1).unique(dim=0).double()
-    described.append(_rounded(backgrounds.tolist()))
-    described.append(_rounded([*lights.sum(1).tolist(), *lights.norm(dim=1).tolist()]))
-    return described
+    sizes = [*lights.sum(1).tolist(), *lights.norm(dim=1).tolist()]
+    backgrounds = scene.backgrounds.mean((2, 3)).flatten().tolist()
+    settings = [scene.settings.size, scene.settings.encoding, str(scene.basis)]
+    return [*settings, *objects, *examples, _rounded(backgrounds), _rounded(sizes)]
 
 
 def _rounded(values: Iterable[float]) -> list[str]:
@@ -528,29 +511,18 @@ def select_examples_to_log(
     the network is restored afterwards.
     """
     successful = torch.nonzero(success).squeeze(1)
-    count = min(SHOWN_EXAMPLES, len(successful))
     last = max(len(successful) - 1, 0)
-    chosen = torch.linspace(0, last, count).round().long()
+    chosen = torch.linspace(0, last, min(SHOWN_EXAMPLES, len(successful))).round().long()
     rows = successful[chosen.to(successful.device)]
     before = problem.conditions(problem.start[rows], rows)
     after = problem.conditions(values[rows], rows)
-    images = []
-    predictions = []
     with frozen_eval_mode(model), torch.no_grad():
-        for conditions in (before, after):
-            rendered = problem.scene.render(conditions, rows)[:, 0]
-            images.append(rendered)
-            if len(rows):
-                predictions.append(model(rendered).float().softmax(1))
-            else:
-                predictions.append(rendered.new_zeros(0, 0))
-    return AttackExamples(
-        images=torch.stack(images),
-        lights=torch.stack([before.light, after.light]),
-        predictions=torch.stack(predictions),
-        labels=labels[rows],
-        basis=problem.scene.basis,
-    )
+        images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
+        logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
+    predictions = torch.stack(logits).softmax(2)
+    lights = torch.stack([before.light, after.light])
+    basis = problem.scene.basis
+    return AttackExamples(torch.stack(images), lights, predictions, labels[rows], basis)
 
 
 def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from train.data.sets import DataSet
 from train.settings import ExperimentSettings
-from train.training.initial import load_initial, with_label
-from train.training.inputs import load_data
+from train.training.inputs import load_data, load_initial, with_label
 from train.training.run import Run
 
 

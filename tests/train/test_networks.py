@@ -12,7 +12,7 @@ from renderer.errors import InputError
 from train.checkpoints import load_network, load_run, load_selected, save, write_published
 from train.networks import Dropout, WideResNet, build_network, describe
 from train.run_folder import BEST, PUBLISHED
-from train.training.initial import Initial
+from train.training.inputs import Initial
 
 CLASSES = ("apple", "orange", "pear")
 MEAN = (0.4, 0.5, 0.6)

@@ -30,7 +30,7 @@ from train.run_config import CONFIG, format_command, require_same_run, resume_co
 from train.run_folder import sole_writer
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
 from train.system import is_verbose, program
-from train.training.initial import with_label
+from train.training.inputs import with_label
 from train.training.run import make_runs
 from train.user_errors import keyed, writable_folder
 

@@ -45,8 +45,7 @@ from train.settings import (
     read_objects,
 )
 from train.train_settings import TrainSettings
-from train.training.initial import initial_of
-from train.training.inputs import load_data
+from train.training.inputs import initial_of, load_data
 from train.training.run import Run
 
 # Values of some settings of a group, such as "train", by name. None for the defaults.

@@ -33,7 +33,7 @@ from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state
 from train.settings import ExperimentSettings
 from train.system import is_verbose, shortened
-from train.training.initial import with_label
+from train.training.inputs import with_label
 from train.training.run import Run, load_inputs, make_runs
 from train.user_errors import user_message, writable_folder
 

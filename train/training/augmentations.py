@@ -5,7 +5,7 @@ adversarial attacks on pixels (PGD). "relight" shows the images in the light of 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,9 +48,7 @@ class Baseline:
         self._model = model
         self._seed = seed
         self._absent = absent
-        self._transform: Callable[[Tensor], Tensor] | None = None
-        if name not in ("none", "pgd"):
-            self._transform = _transform(name)
+        self._transform = None if name in ("none", "pgd") else _transform(name)
 
     def apply(
         self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
@@ -105,14 +103,9 @@ def pgd(
     complementary: the image shows neither this class nor the classes `absent`.
     """
     problem = _Pixels(images)
-    settings = AttackSettings(
-        max_steps=PGD_STEPS, quantized=False, sensor_noise=0.0, batch_size=len(images)
-    )
-    objective = Objective(model, _LossOfLabels(labels[:, None], absent=absent), settings)
-    rows = torch.arange(len(images), device=images.device)
-    optimizer = Gradient(problem, settings, seed=0)
-    found = minimize_from(problem.sample(draws), optimizer, objective, rows, scores_last=False)
-    return to_bytes(found.values.view(images.shape))
+    criterion = _LossOfLabels(labels[:, None], absent=absent)
+    values = _attack(problem, problem.sample(draws), model, criterion, PGD_STEPS)
+    return to_bytes(values.view(images.shape))
 
 
 class _Pixels(NormBalls):
@@ -165,11 +158,7 @@ class RelitBatches:
     """
 
     def __init__(
-        self,
-        settings: TrainSettings,
-        model: nn.Module,
-        teacher: nn.Module | None,
-        seed: int,
+        self, settings: TrainSettings, model: nn.Module, teacher: nn.Module | None, seed: int
     ):
         """Store the arguments.
 
@@ -196,28 +185,25 @@ class RelitBatches:
         problem = RelitPhotographs(albedo, light, CELLS, self._radius, self._steps)
         values = problem.sample(draws)
         if self._steps and self._radius and self._teacher is not None:
-            values = self._attack(problem, values, unit)
+            with torch.no_grad():
+                criterion = Criterion(self._teacher(unit).argmax(1)[:, None])
+            values = _attack(problem, values, self._model, criterion, self._steps)
         with torch.no_grad():
             return to_bytes(light.expose(albedo, problem.log_gain(values)))
 
-    def _attack(
-        self,
-        problem: RelitPhotographs,
-        start: Float[Tensor, "B D"],
-        images: Float[Tensor, "B 3 size size"],
-    ) -> Float[Tensor, "B D"]:
-        """Take all steps away from the classes that the teacher predicts for the images."""
-        assert self._teacher is not None
-        with torch.no_grad():
-            original_classes = self._teacher(images).argmax(1)
-        settings = AttackSettings(
-            max_steps=self._steps,
-            margin=MAX_SCALE,
-            quantized=False,
-            sensor_noise=0.0,
-            batch_size=len(images),
-        )
-        objective = Objective(self._model, Criterion(original_classes[:, None]), settings)
-        rows = torch.arange(len(images), device=images.device)
-        optimizer = Gradient(problem, settings, seed=0)
-        return minimize_from(start, optimizer, objective, rows, scores_last=False).values
+
+def _attack(
+    problem: _Pixels | RelitPhotographs,
+    start: Float[Tensor, "B D"],
+    model: nn.Module,
+    criterion: Criterion,
+    steps: int,
+) -> Float[Tensor, "B D"]:
+    """Attack the images of a batch along the gradient. With this margin, no attack ends early."""
+    settings = AttackSettings(
+        max_steps=steps, margin=MAX_SCALE, quantized=False, sensor_noise=0.0, batch_size=len(start)
+    )
+    rows = torch.arange(len(start), device=start.device)
+    objective = Objective(model, criterion, settings)
+    optimizer = Gradient(problem, settings, seed=0)
+    return minimize_from(start, optimizer, objective, rows, scores_last=False).values

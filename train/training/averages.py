@@ -30,11 +30,7 @@ class MovingAverage(AveragedModel):
     """Exponential moving average of the parameters and buffers of a model.
 
     An update computes average = decay * average + (1 - decay) * model. The first
-    update copies the model.
-
-    Args:
-        model: The model.
-        decay: Weight of the old average in an update, in [0, 1).
+    update copies the model. `decay` is in [0, 1).
     """
 
     def __init__(self, model: nn.Module, decay: float):
@@ -50,17 +46,13 @@ class MovingAverage(AveragedModel):
         if self.n_averaged == 0:
             return super().update_parameters(model)
         averages = [*self.module.parameters(), *self.module.buffers()]
-        latest = [*model.parameters(), *model.buffers()]
-        # The function of torch that averages lists of tensors needs lists in which
-        # either all tensors or none have floating-point numbers.
+        pairs = [*zip(averages, [*model.parameters(), *model.buffers()], strict=True)]
+        # The function of torch needs lists in which either all tensors or none are floating.
         for is_floating in (True, False):
-            old = []
-            new = []
-            for average, value in zip(averages, latest, strict=True):
-                if average.is_floating_point() == is_floating:
-                    old.append(average.detach())
-                    new.append(value.detach())
-            if old:
+            chosen = [pair for pair in pairs if pair[0].is_floating_point() == is_floating]
+            if chosen:
+                old = [average.detach() for average, _ in chosen]
+                new = [value.detach() for _, value in chosen]
                 self._average(old, new, None)
         self.n_averaged += 1
 
@@ -78,11 +70,7 @@ class Averages:
     """
 
     def __init__(
-        self,
-        model: MixedPrecision,
-        ema_decay: float,
-        soup: bool,
-        keeps_latest: bool = False,
+        self, model: MixedPrecision, ema_decay: float, soup: bool, keeps_latest: bool = False
     ):
         """Create the averages, which are empty at first.
 
@@ -90,12 +78,9 @@ class Averages:
         soup, the last network is kept instead of the one with the highest validation accuracy.
         """
         self._model = model
-        self._ema: MovingAverage | None = None
-        if ema_decay:
-            self._ema = MovingAverage(model, ema_decay)
-        self._soup: AveragedModel | None = None
-        if soup:
-            self._soup = AveragedModel(model, avg_fn=get_swa_avg_fn(), use_buffers=True)
+        self._ema = MovingAverage(model, ema_decay) if ema_decay else None
+        mean = get_swa_avg_fn()
+        self._soup = AveragedModel(model, avg_fn=mean, use_buffers=True) if soup else None
         self._keeps_latest = soup or keeps_latest
         self._best_accuracy = -1.0
         average = self._soup or self._ema
@@ -174,26 +159,19 @@ def interpolate(
     device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
-    # Key of the random stream of the light. All factors are tried in the same light.
-    light_key = (seed, "validation")
-    lowest_loss = float("inf")
-    best_factor = FACTORS[0]
+    losses = {}
     for factor in FACTORS:
         selected.network.load_state_dict(mix(initial_weights, trained, factor))
         unchanged = predict(selected, validation, device)
-        relit = predict(selected, validation, device, *light_key)
-        loss_unchanged = weights[0] * divergence(unchanged, targets)
-        loss = loss_unchanged + weights[1] * divergence(relit, targets)
-        console.debug(
-            "weights %.2f: loss %.4f, agreement %.4f, relit %.4f",
-            factor,
-            loss,
-            agreement(unchanged, targets),
-            agreement(relit, targets),
-        )
-        if loss < lowest_loss:
-            lowest_loss = loss
-            best_factor = factor
+        # All factors are tried in the same light, of which these are the keys of random numbers.
+        relit = predict(selected, validation, device, seed, "validation")
+        both = (unchanged, relit)
+        divergences = [float(kl_divergence(logits, targets).mean()) for logits in both]
+        losses[factor] = weights[0] * divergences[0] + weights[1] * divergences[1]
+        agreements = [agreement(logits, targets) for logits in both]
+        line = "weights %.2f: loss %.4f, agreement %.4f, relit %.4f"
+        console.debug(line, factor, losses[factor], *agreements)
+    best_factor = min(losses, key=losses.__getitem__)
     percentage = 100 * best_factor
     console.info("weights: %.0f%% trained, %.0f%% original", percentage, 100 - percentage)
     return mix(initial_weights, trained, best_factor), best_factor
@@ -217,11 +195,6 @@ def mix(
 def agreement(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N classes"]) -> float:
     """Return the fraction of images for which two networks predict the same class."""
     return float((logits.argmax(1) == targets.argmax(1)).double().mean())
-
-
-def divergence(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N classes"]) -> float:
-    """Return the mean Kullback-Leibler divergence of predictions from those of another network."""
-    return float(kl_divergence(logits, targets).mean())
 
 
 def predict(

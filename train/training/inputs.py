@@ -1,85 +1,289 @@
-"""The inputs of a run: its data set, and the service that renders its training images."""
+"""The inputs of a run: its initial network, its data set, and the service that renders images."""
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment import distributed
 from augment.attacks.objective import complementary_label
-from augment.classifier import class_index
+from augment.classifier import Classifier, class_index
+from augment.files import is_network_file
+from augment.network import without_normalized_light
+from augment.plain_networks import as_facts, require_no_facts
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
-from renderer.errors import InputError, require_range
+from augment.sources import load_source
+from renderer.errors import InputError, as_path, require_range
 from renderer.settings import MAX_SIZE
-from train import console
-from train.class_names import class_name, require_others
+from train import checkpoints, console
+from train.class_names import (
+    class_name,
+    class_of_name,
+    name_of_mesh,
+    require_others,
+    with_class_names,
+)
+from train.data import sets
 from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
-from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled, relabeled
 from train.device import choose_rasterizer
+from train.networks import CLASSIFIER, PYTHON, describe
 from train.processes import main_process_first
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
-from train.training.initial import Initial, load_initial
+from train.train_settings import WIDERESNET
 from train.user_errors import keyed, keys_of
 
+# Entries in the description of a network. They must be equal in two networks if the
+# weights of one are copied to the other.
+SHARED = ("classes", "size", "name", "depth", "width")
+# Default fraction of the training images that validate the network.
+VALIDATION = 0.1
 # Pixels per side of the images if neither the setting `size` nor the network with
 # whose weights a run begins gives a size.
 SIZE = 32
 
 
-def load_inputs(settings: ExperimentSettings) -> tuple[DataSet, Initial | None]:
+@dataclass(frozen=True)
+class Initial:
+    """Initial network: the network with whose weights a run begins.
+
+    The setting `network` names the network. If the network has a wrapper
+    that normalizes the light of images, `weights` and `network` are those inside
+    the wrapper.
+
+    Attributes:
+        source: File of the network of another run, or name of a classifier.
+        architecture: Description of the network, with the arguments of
+            `build_network`.
+        weights: State dict of the network.
+        network: The network itself, of which the run trains a copy. None if
+            `build_network` can build it from the description.
+        assumed: Which of "size" and "normalization" are assumed.
+    """
+
+    source: Path
+    architecture: dict[str, Any]
+    weights: dict[str, Tensor]
+    network: nn.Module | None = None
+    assumed: Sequence[str] = ()
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the outputs of the network."""
+        return tuple(self.architecture["classes"])
+
+    @property
+    def size(self) -> int:
+        """Pixels per side of the images that the network takes."""
+        return self.architecture["size"]
+
+    @property
+    def is_classifier(self) -> bool:
+        """Whether the network is a classifier that the library did not train from random weights.
+
+        It can come from torchvision, timm or a file of the user, and may have
+        been trained by an earlier run.
+        """
+        return CLASSIFIER in self.architecture
+
+    def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
+        """Copy the weights of the initial network to the network of the run.
+
+        Networks that differ in classes, image size or architecture raise InputError.
+        """
+        own = {"name": WIDERESNET, **self.architecture}
+        other = {"name": WIDERESNET, **description}
+        for key in SHARED:
+            if key in own and own[key] != other.get(key):
+                difference = f"{key} {own[key]}, not {other.get(key)}"
+                if key == "classes":
+                    difference = "other classes"
+                raise InputError(
+                    f"network={self.source} was trained with {difference}: "
+                    f"give this run the same {key}",
+                )
+        with checkpoints.checks_architecture(self.source):
+            network.load_state_dict(self.weights)
+
+
+def load_initial(settings: ExperimentSettings) -> Initial | None:
+    """Load the initial network, with whose weights a run begins. None stands for random weights."""
+    name = settings.network
+    if not name:
+        return None
+    if checkpoints.is_classifier(name):
+        return _load_classifier(settings, name)
+    source = Path(name.removeprefix(checkpoints.RUN))
+    if checkpoints.is_state_dict(source):
+        raise InputError(
+            f"network={name} contains weights, but not their architecture: "
+            "give the architecture and the weights, as in "
+            f"network=torchvision:resnet50 weights={source}",
+            "network",
+        )
+    if settings.weights is not None:
+        raise InputError(
+            f"weights={settings.weights} cannot replace the weights of "
+            f"network={name}: leave weights out",
+            "weights",
+        )
+    # The network of a run has its own classes and its own normalization.
+    given = as_facts(settings.classes, None, settings.normalization)
+    require_no_facts(f"network={name}", given)
+    with keyed(run="network"):
+        path, state = checkpoints.load_selected(source)
+    built_by = str(state["architecture"].get("name"))
+    if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
+        raise InputError(
+            f"the network in {path} is built by {built_by}: give model.name={built_by} to run "
+            "that code",
+            "network",
+        )
+    return Initial(path, state["architecture"], checkpoints.plain_weights(state))
+
+
+def with_label(settings: ExperimentSettings) -> ExperimentSettings:
+    """Replace a missing label, or a label that is an index, by the names of the classes.
+
+    The label lists the positive classes. If it is missing, these are the classes
+    of the meshes. The names of the classes are known from the initial network. Without one, the
+    settings stay.
+    """
+    names = [] if settings.label is None else label_names(settings.label)
+    # A number can be the index of a class.
+    may_have_index = any(name.isdecimal() for name in names)
+    if len(names) == 1 and settings.augment.renders:
+        files = [item for item in settings.meshes if isinstance(item, str)]
+        others = [file for file in files if class_of_name(name_of_mesh(file), names) is None]
+        if others:
+            console.warning("label=%s is the class of %s", names[0], ", ".join(others))
+    if not (may_have_index or settings.label_follows_from_meshes):
+        return settings
+    initial = load_initial(settings)
+    # Without an initial network, `Run` checks the label when it knows the classes of the data.
+    return with_class_names(settings, initial.classes) if initial else settings
+
+
+def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
+    """Load a classifier, from another library or from a file, as the initial network."""
+    size = settings.size
+    is_file = is_network_file(name)
+    with keyed(name="network", size="size"):
+        # A file may not record the size of its images, so it gets the size of the settings.
+        # Any other classifier has a size of its own.
+        facts = as_facts(settings.classes, size if is_file else None, settings.normalization)
+        weights = None if settings.weights is None else as_path("weights", settings.weights)
+        classifier = load_source(name, weights, facts, settings.trust)
+    network = cast(nn.Module, classifier.network)
+    if not list(network.parameters()):
+        raise InputError(
+            f"network={name} is a network without weights that can be trained: "
+            "give a file of the network in the format of TorchScript or torch.export",
+            "network",
+        )
+    # The absolute path of a file is recorded, so that it is found from any folder.
+    shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
+    architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    assumed = [fact for fact in classifier.assumed if size is None or fact != "size"]
+    return Initial(Path(name), architecture, network.state_dict(), assumed=assumed)
+
+
+def initial_of(classifier: Classifier, size: int | None) -> Initial:
+    """Use a classifier in memory as the initial network of a run.
+
+    `size` is None for the size that the classifier takes.
+    """
+    network = without_normalized_light(classifier.network)
+    shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
+    if classifier.normalized_light is not None:
+        shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
+    architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    return Initial(Path(classifier.name), architecture, network.state_dict(), network)
+
+
+def choose_validation(
+    settings: ExperimentSettings, data: sets.DataSet, initial: Initial | None
+) -> tuple[float, dict[str, Any] | None]:
+    """Choose which fraction of the training images validates the network of a run.
+
+    Networks of one data set leave out nested sets of images: a smaller fraction is a subset of a
+    larger one. The smallest fraction of a network and of the networks with whose weights it began
+    is therefore the fraction from which none of them has learned. Without `data.validation`, it is
+    the fraction that the initial network left out, or else VALIDATION.
+
+    Return the fraction, and the record of the images from which neither this network nor those with
+    whose weights it began have learned. The record is stored with the weights. It is None if these
+    images are unknown.
+    """
+    asked = settings.data.validation
+    # Of data without labels, at most HELD_OUT images validate.
+    default = VALIDATION if data.labeled else min(VALIDATION, sets.HELD_OUT / len(data.train))
+    fraction = default if asked is None else asked
+    # What determines which training images the run leaves out for validation.
+    record = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
+    if data.rendered:
+        record["data"] = "shapes"
+    stored = initial.architecture.get("validation") if initial else None
+    earlier = stored if isinstance(stored, dict) else {}
+    left_out = earlier.get("fraction")
+    # Only a network that was trained on rendered images records the entry "data".
+    is_of_other_kind = data.rendered and left_out is not None and "data" not in earlier
+    if initial is None or is_of_other_kind:
+        return fraction, record
+    # The records of the same images differ only in the fraction.
+    if not isinstance(left_out, float) or {**record, "fraction": left_out} != earlier:
+        name = settings.network
+        console.debug("validation: %s does not say whether it learned from these images, too", name)
+        return fraction, None
+    if asked is None:
+        fraction = left_out
+    if fraction > left_out:
+        fault = f"it left out only data.validation={left_out}"
+        console.debug("validation: %s learned from part of it: %s", settings.network, fault)
+    return fraction, record | {"fraction": min(fraction, left_out)}
+
+
+def load_inputs(settings: ExperimentSettings) -> tuple[sets.DataSet, Initial | None]:
     """Load the data set of a run, and the initial network if the run has one."""
     initial = load_initial(settings)
     return load_data(settings, initial), initial
 
 
-def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> DataSet:
+def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> sets.DataSet:
     """Load the data set of a run.
 
     Without a size in the settings, the images get the size that `initial` takes.
     """
-    name = settings.data.name
-    console.debug("data: %s", name)
-    group = UNLABELED if name == UNLABELED else ""
-    with main_process_first(), keyed(group, **keys_of("data", settings.data)):
-        data = _load(name, settings, initial)
-    with keyed("data.path"):
-        require_range("image size", data.size, MIN_SIZE, MAX_SIZE)
-    return data
-
-
-def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
-    """Load a data set by its name."""
     data = settings.data
-    if name == "cifar100":
-        return load_cifar100(data.path)
-    if name == "npz":
-        return load_npz(data.path)
+    name = data.name
+    console.debug("data: %s", name)
     size = settings.size or (initial.size if initial else SIZE)
-    if name == "shapes":
-        return load_shapes(
-            train=data.train_per_class,
-            test=data.test_per_class,
-            size=size,
-            seed=data.seed,
-            cache=cache_folder(settings.train.cache),
-        )
-    is_labeled = name == "folder"
-    load_images = load_folder if is_labeled else load_unlabeled
-    return load_images(
-        data.path if is_labeled else str(settings.unlabeled),
-        size=size,
-        test_fraction=data.test_fraction,
-        skip_unreadable=settings.evaluate.skip_unreadable,
-        workers=data.workers,
-    )
+    skip = settings.evaluate.skip_unreadable
+    group = UNLABELED if name == UNLABELED else ""
+    with main_process_first(), keyed(group, **keys_of("data", data)):
+        if name == "cifar100":
+            loaded = sets.load_cifar100(data.path)
+        elif name == "npz":
+            loaded = sets.load_npz(data.path)
+        elif name == "shapes":
+            counts = (data.train_per_class, data.test_per_class)
+            loaded = load_shapes(*counts, size, data.seed, cache_folder(settings.train.cache))
+        else:
+            load = sets.load_folder if name == "folder" else sets.load_unlabeled
+            path = data.path if name == "folder" else str(settings.unlabeled)
+            loaded = load(path, size, data.test_fraction, skip, data.workers)
+    with keyed("data.path"):
+        require_range("image size", loaded.size, MIN_SIZE, MAX_SIZE)
+    return loaded
 
 
-def require_label(settings: ExperimentSettings, data: DataSet) -> None:
+def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     """Check that the positive class is known, and that photographs can have it as a folder.
 
     The sub-folders of photographs have names of classes, and no indices.
@@ -98,7 +302,9 @@ def require_label(settings: ExperimentSettings, data: DataSet) -> None:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
 
 
-def relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
+def relabel(
+    settings: ExperimentSettings, data: sets.DataSet, initial: Initial | None
+) -> sets.DataSet:
     """Convert the labels of the data to indices into the classes of the network.
 
     A data set and the initial network can have different lists of classes. Without an initial
@@ -112,11 +318,11 @@ def relabel(settings: ExperimentSettings, data: DataSet, initial: Initial | None
             )
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
-        return relabeled(data, initial.classes, f"data.name={settings.data.name}")
+        return sets.relabeled(data, initial.classes, f"data.name={settings.data.name}")
     return data
 
 
-def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
+def describe_test_images(settings: ExperimentSettings, data: sets.DataSet) -> str:
     """Describe in words what the test accuracy of a run is measured on.
 
     An example is "rendered solids of 5 of the network's 1000 classes".
@@ -133,9 +339,7 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
 
 
 def build_service(
-    settings: ExperimentSettings,
-    data: DataSet,
-    device: torch.device,
+    settings: ExperimentSettings, data: sets.DataSet, device: torch.device
 ) -> AugmentationService:
     """Build the service that renders the training images of a run anew in each round.
 
@@ -161,10 +365,13 @@ def build_service(
     elif settings.augment.renders:
         positive_names = [data.classes[index] for index in positive_classes]
         require_others(settings.negative_objects, positive_names, data.classes)
-        label_of_class = _class_indices(settings, data)
         # An object of no class of the network has a complementary label: the negative
         # number says only that it is not of a positive class.
-        label_of_class[OTHER] = complementary_label(positive_classes[0])
+        label_of_class = {OTHER: complementary_label(positive_classes[0])}
+        for key, item in settings.objects.items():
+            if item.label != OTHER:
+                index = class_index(data.classes, item.label, f"label of {key}")
+                label_of_class[item.label] = index
         scene = _build_scene(settings, data.size, device, phases)
         labels = torch.tensor([label_of_class[name] for name in scene.labels], device=device)
 
@@ -188,20 +395,14 @@ def build_service(
 
 
 def _build_scene(
-    settings: ExperimentSettings,
-    size: int,
-    device: torch.device,
-    phases: Phases,
+    settings: ExperimentSettings, size: int, device: torch.device, phases: Phases
 ) -> Scene:
     """Build the scene with meshes and hard negatives, in the first process before the others."""
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.debug("rasterizer: %s", rasterizer.description)
-    with (
-        phases("operators"),
-        main_process_first(),
-        keyed("scene", **keys_of("scene", settings.scene)),
-    ):
+    keys = keys_of("scene", settings.scene)
+    with phases("operators"), main_process_first(), keyed("scene", **keys):
         return build_scene(
             list(settings.objects.values()),
             size,
@@ -215,19 +416,7 @@ def _build_scene(
         )
 
 
-def _class_indices(settings: ExperimentSettings, data: DataSet) -> dict[str | int, int]:
-    """Return the index of each class that a mesh or a hard negative of a run has.
-
-    The class "other", which no network has, is left out.
-    """
-    indices: dict[str | int, int] = {}
-    for key, item in settings.objects.items():
-        if item.label != OTHER:
-            indices[item.label] = class_index(data.classes, item.label, f"label of {key}")
-    return indices
-
-
-def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, Tensor]:
+def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tensor, Tensor]:
     """Load images that are used as renders from the folder in the setting `augment.folder`.
 
     A label is the index of a class, or the complementary label in a subfolder that is no class.

@@ -7,7 +7,7 @@ checkpoints are also written in between.
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
 from train.checkpoints import random_state, restore_random_state
-from train.data.batches import Batch, Round, TrainingImages, rounds_of_epoch, training_batches
+from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.processes import SignalHandler, all_reduce_sum
@@ -132,35 +132,21 @@ class Trainer:
         self._random_state: dict[str, Any] = {}
         # Whether best.pt has yet to be written.
         self._best_is_new = False
-        # Time at which the last checkpoint was written or, before that, of the start.
-        self._saved_at = time.perf_counter()
-        # Seconds that it took to write the last checkpoint.
-        self._saving_took = 0.0
+        # Time of the last checkpoint or, before that, of the start; and seconds that it took.
+        self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
         self.model = model
         self.device = next(model.parameters()).device
         self.initial: MixedPrecision | None = None
         if has_initial:
             self.initial = deepcopy(model).eval().requires_grad_(False)
-        self.averages = Averages(
-            model,
-            settings.ema_decay,
-            settings.soup,
-            # The validation accuracy of data without labels is the agreement with the initial
-            # network. It is highest before any training, and cannot choose an epoch.
-            keeps_latest=not labeled,
-        )
+        # The validation accuracy of data without labels is the agreement with the initial
+        # network. It is highest before any training, and cannot choose an epoch.
+        self.averages = Averages(model, settings.ema_decay, settings.soup, keeps_latest=not labeled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
-        self.step = TrainingStep(
-            settings,
-            model,
-            self.averages,
-            teacher=self.initial if has_teacher else None,
-            positive_classes=service.positive_classes,
-            seed=service.seed,
-            size=architecture["size"],
-            labeled=labeled,
-        )
+        teacher = self.initial if has_teacher else None
+        size = architecture["size"]
+        self.step = TrainingStep(settings, model, self.averages, teacher, service, size, labeled)
 
     @property
     def selected(self) -> MixedPrecision:
@@ -178,7 +164,12 @@ class Trainer:
         self._log = log
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
-        self._limit_batch_size(split, len(train))
+        # The batch size is limited to the images of a round and to the memory.
+        limits = (self.settings.images_per_epoch, self.service.settings.regenerate_every)
+        in_round = min([len(train), *filter(None, limits)]) + len(self.service)
+        size = split.images.shape[-1]
+        batch_size = fitting_batch_size(self.settings, self.model, in_round, size)
+        self.settings = replace(self.settings, batch_size=batch_size)
         with SignalHandler() as signals:
             while self.epoch < self.settings.epochs:
                 if self._train_epoch(split, train, signals):
@@ -190,14 +181,6 @@ class Trainer:
                     self._save()
                 if is_stopping:
                     signals.stop()
-
-    def _limit_batch_size(self, split: Split, image_count: int) -> None:
-        """Limit the batch size to the images of a round and to the memory."""
-        limits = (self.settings.images_per_epoch, self.service.settings.regenerate_every)
-        in_round = min([image_count, *filter(None, limits)]) + len(self.service)
-        size = split.images.shape[-1]
-        batch_size = fitting_batch_size(self.settings, self.model, in_round, size)
-        self.settings = replace(self.settings, batch_size=batch_size)
 
     def _train_epoch(self, split: Split, rows: Int[Tensor, " N"], signals: SignalHandler) -> bool:
         """Take the training steps of an epoch that remain.
@@ -215,7 +198,15 @@ class Trainer:
             images_per_round=self.service.settings.regenerate_every,
         )
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
-        state = self._begin_epoch(rounds[0])
+        if self._epoch_state:
+            # A resumed run continues within an epoch, with the random numbers of the first attempt.
+            restore_random_state(self._random_state)
+        else:
+            self.averages.begin_epoch(self.initial, self.step.optimizer)
+            renders = self._regenerate(rounds[0])
+            sums = torch.zeros(2, device=self.device)
+            self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
+        state = self._epoch_state
         # The state has the diagnostics of each round that has begun.
         begun = len(state.diagnostics)
         for index, now in enumerate(rounds):
@@ -229,8 +220,13 @@ class Trainer:
                 title += f", round {index + 1} of {len(rounds)}"
             # Number of the steps of this round that were taken before.
             first = state.step - sum(steps[:index])
+            renders = Split(to_bytes(state.renders.images), state.renders.labels)
+            images = TrainingImages(split, rows, renders)
             with self.phases("training"):
-                batches = self._batches(split, rows, now, first)
+                set_training_mode(self.model, settings)
+                batches = training_batches(
+                    images, settings.batch_size, self.seed, now, settings.flips, first
+                )
                 for batch in progress(batches, title, steps[index], first):
                     done = state.step / sum(steps)
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
@@ -244,35 +240,6 @@ class Trainer:
                     if state.step < sum(steps) and self._saving_is_due():
                         self._save()
         return True
-
-    def _begin_epoch(self, first_round: Round) -> EpochState:
-        """Begin an epoch by rendering the images of its first round, or continue it.
-
-        A resumed run continues within an epoch, with the random numbers of the first attempt.
-        """
-        if self._epoch_state:
-            restore_random_state(self._random_state)
-            return self._epoch_state
-        self.averages.begin_epoch(self.initial, self.step.optimizer)
-        renders = self._regenerate(first_round)
-        sums = torch.zeros(2, device=self.device)
-        self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
-        return self._epoch_state
-
-    def _batches(
-        self, split: Split, rows: Int[Tensor, " N"], now: Round, first: int
-    ) -> Iterator[Batch]:
-        """Put the network in training mode, and yield the batches of a round from `first` on."""
-        renders = cast(EpochState, self._epoch_state).renders
-        set_training_mode(self.model, self.settings)
-        return training_batches(
-            TrainingImages(split, rows, Split(to_bytes(renders.images), renders.labels)),
-            batch_size=self.settings.batch_size,
-            seed=self.seed,
-            this_round=now,
-            flips=self.settings.flips,
-            first=first,
-        )
 
     def _regenerate(self, now: Round) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
@@ -330,11 +297,10 @@ class Trainer:
         weights = self.model.network.state_dict().values()
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
-            settings = self.settings
+            rate, decay = self.settings.learning_rate, self.settings.weight_decay
             raise InputError(
-                f"learning_rate={settings.learning_rate} with weight_decay={settings.weight_decay} "
-                f"made the loss or weights NaN or infinite in epoch {epoch}: "
-                "set lower values",
+                f"learning_rate={rate} with weight_decay={decay} made the loss or weights NaN or "
+                f"infinite in epoch {epoch}: set lower values",
                 "learning_rate",
             )
 
@@ -413,26 +379,22 @@ class Trainer:
         if "values" in state["service"]:
             self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
-        if state["under_way"]:
-            self._epoch_state = self._restore_epoch(state["under_way"])
-
-    def _restore_epoch(self, state: Mapping[str, Any]) -> EpochState:
-        """Restore the state of an epoch that had begun when a checkpoint was written."""
-        images = to_unit(state["images"]).to(self.device)
-        labels = state["labels"].to(self.device)
-        renders = Renders(images, labels, state["diagnostics"][-1])
-        sums = state["sums"].to(self.device)
-        if distributed.rank() > 0:
+        begun = state["under_way"]
+        if begun:
             # The stored sums are those of all processes together. Only the first process
             # continues with them, so that they are counted once.
-            sums = torch.zeros_like(sums)
-        return EpochState(renders, sums, state["diagnostics"], state["step"])
+            sums = begun["sums"].to(self.device) * (distributed.rank() == 0)
+            images = to_unit(begun["images"]).to(self.device)
+            renders = Renders(images, begun["labels"].to(self.device), begun["diagnostics"][-1])
+            self._epoch_state = EpochState(renders, sums, begun["diagnostics"], begun["step"])
 
     def resume(self) -> None:
         """Restore the newest undamaged checkpoint in the folder of the run."""
         state, problem = checkpoints.load_newest(self.folder)
         try:
-            self._require_own_architecture(state)
+            # An older checkpoint may lack entries, which are then not compared.
+            if self.architecture | state["architecture"] != self.architecture:
+                raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = single_line(error)
@@ -440,7 +402,9 @@ class Trainer:
                 f"this run cannot continue from the checkpoint in {self.folder} ({reason}): "
                 f"restore {run_folder.LAST}, or start in another folder",
             ) from error
-        self._require_own_best()
+        if self.epoch:
+            # It is read before the training, so that no time is lost if it is damaged.
+            self.best = checkpoints.load(self.folder / run_folder.BEST)
         if problem:
             console.warning("%s: continuing from the checkpoint before it", problem)
             # last.pt is damaged. It is removed, since it would otherwise replace the
@@ -448,37 +412,6 @@ class Trainer:
             (self.folder / run_folder.LAST).unlink(missing_ok=True)
         steps = self._epoch_state.step if self._epoch_state else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
-
-    def _require_own_best(self) -> None:
-        """Raise InputError if best.pt is missing, damaged or of another run.
-
-        The network in this file is scored after the training. A resumed run
-        checks it before the training, so that no time is lost.
-        """
-        if not self.epoch:
-            # best.pt is written at the end of the first epoch.
-            return
-        path = self.folder / run_folder.BEST
-        try:
-            best = checkpoints.load(path)
-            self._require_own_architecture(best)
-            own = self._description()
-            if (best["seed"], best["mode"]) != (own["seed"], own["mode"]):
-                raise ValueError("it is of another run")
-            self.best = best
-        except (LookupError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{path} is not the best network of this run ({single_line(error)}): "
-                f"restore {run_folder.BEST}, or start in another folder",
-            ) from error
-
-    def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
-        """Raise ValueError if a checkpoint has another architecture or other classes than the run.
-
-        An older checkpoint may lack entries, which are then not compared.
-        """
-        if self.architecture | state["architecture"] != self.architecture:
-            raise ValueError("it has another architecture or other classes")
 
 
 @torch.no_grad()
@@ -495,17 +428,13 @@ def evaluate(
     if rows is None:
         rows = torch.arange(len(split))
     rows = rows.to(device)
-    totals = torch.zeros(2, device=device)
-    # Both numbers are views of `totals`: adding to them in place changes `totals`.
-    loss_sum, hits = totals
     # Each of n processes scores every n-th image.
     own_rows = rows[distributed.rank() :: distributed.world_size()]
     batches = own_rows.split(EVALUATION_BATCH)
     shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
-    all_logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
-    for batch, logits in zip(batches, all_logits.split(EVALUATION_BATCH), strict=True):
-        labels = split.labels[batch]
-        loss_sum += F.cross_entropy(logits, labels, reduction="sum")
-        hits += (logits.argmax(1) == labels).sum()
-    loss_sum, hits = all_reduce_sum(totals).tolist()
+    logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
+    labels = split.labels[own_rows]
+    loss_sum = F.cross_entropy(logits, labels, reduction="sum")
+    hits = (logits.argmax(1) == labels).sum()
+    loss_sum, hits = all_reduce_sum(torch.stack([loss_sum, hits])).tolist()
     return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

@@ -13,19 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from augment import distributed
-from augment.network import (
-    light_settings,
-    unwrapped,
-    with_normalized_light,
-    without_normalized_light,
-)
+from augment import network as wrappers
 from augment.plain_networks import say_inputs
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
-from train.checkpoints import NORMALIZE_LIGHT, export
-from train.data.photographs import choose_labels, find_photographs, require_outside
+from train.data import photographs as photos
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import (
     MixedPrecision,
@@ -42,15 +36,10 @@ from train.results.scoring import Model, Predictor, evaluate_photographs, format
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, WEIGHTS
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
+from train.train_settings import WIDERESNET
+from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
-from train.training.initial import Initial, ValidationPart, choose_validation
-from train.training.inputs import (
-    build_service,
-    describe_test_images,
-    load_inputs,
-    relabel,
-    require_label,
-)
+from train.training.inputs import Initial
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.run_log import RunLog
@@ -85,31 +74,39 @@ class Run:
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
         self.settings = settings
         # Labels of the data become indices into the classes of the network.
-        self.data = relabel(settings, data, initial)
+        self.data = inputs.relabel(settings, data, initial)
         self.folder = folder
         self.command = command
         self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
         self._initial_predictions: Tensor | None = None
-        require_label(settings, self.data)
-        for name, photographs in self.scored_folders.items():
-            require_outside(folder / name, photographs)
+        inputs.require_label(settings, self.data)
+        for name, scored in self.scored_folders.items():
+            photos.require_outside(folder / name, scored)
             with keyed("photos"):
-                labels = choose_labels(photographs, self.data.classes, settings.label)
-                find_photographs(photographs, self.data.classes, labels)
+                labels = photos.choose_labels(scored, self.data.classes, settings.label)
+                photos.find_photographs(scored, self.data.classes, labels)
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
-        earlier = self._require_folder()
+        earlier: DictConfig | None = None
+        resumes = settings.train.resume
+        if checkpoints.exists(folder) and not (settings.overwrite and not resumes):
+            if not resumes:
+                raise InputError(
+                    f"out={folder} holds a run already: set train.resume=true to continue it, "
+                    "overwrite=true to replace it, or run to another folder",
+                )
+            earlier = require_same_run(folder, settings)
         self._is_resumed = earlier is not None
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
         threads = settings.train.threads
         if earlier is not None:
             threads = threads or OmegaConf.select(earlier, "hardware.threads")
-        validation = choose_validation(settings, self.data, initial)
+        fraction, record = inputs.choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
-            self.held_out = held_out_rows(self.data.train, validation.fraction, seed=0)
-        self.trainer = _build_trainer(settings, self.data, folder, initial, validation, threads)
+            self.held_out = held_out_rows(self.data.train, fraction, seed=0)
+        self.trainer = _build_trainer(settings, self.data, folder, initial, record, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -130,17 +127,14 @@ class Run:
         is_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
         if is_left and not self._is_resumed:
             remove_run(self.folder, with_others=not self.settings.train.resume)
-        write_config(
-            self.folder,
-            self.settings,
-            hardware={
-                "device": str(self.trainer.device),
-                "precision": self.trainer.model.precision,
-                "threads": self._threads,
-            },
-            command=self.command,
-            test_images=describe_test_images(self.settings, self.data),
-        )
+        precision = self.trainer.model.precision
+        device = {"device": str(self.trainer.device), "precision": precision}
+        facts = {
+            "hardware": {**device, "threads": self._threads},
+            "command": self.command,
+            "test_images": inputs.describe_test_images(self.settings, self.data),
+        }
+        write_config(self.folder, self.settings, **facts)
 
     def train(self) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.
@@ -183,36 +177,16 @@ class Run:
         if CLASSIFIER not in self.trainer.architecture:
             return
         path = self.folder / WEIGHTS
-        export(path, self.trainer.selected.network)
-        # Name of the network of the user in the line of Python that is printed.
-        network = "network"
+        checkpoints.export(path, self.trainer.selected.network)
+        # The first value that a function of the user returns is the network.
         name = self.trainer.architecture["name"]
-        if name.startswith(PYTHON):
-            # The first value that the function of the user returns is the network.
-            function = name.removeprefix(PYTHON).replace(":", ".")
-            network = f"{function}()[0]"
+        function = name.removeprefix(PYTHON).replace(":", ".")
+        network = f"{function}()[0]" if name.startswith(PYTHON) else "network"
         console.info("%s.load_state_dict(torch.load(%r)) loads the result", network, str(path))
-        light = light_settings(self.trainer.selected.network)
+        light = wrappers.light_settings(self.trainer.selected.network)
         if light is not None:
             given = json.dumps(asdict(light))
             console.info("it needs images with normalized light: normalize_light=%s", given)
-
-    def _require_folder(self) -> DictConfig | None:
-        """Check that the run may write to its folder.
-
-        Return the settings of the earlier run that is resumed, or None.
-        """
-        resumes = self.settings.train.resume
-        overwrites = self.settings.overwrite and not resumes
-        if overwrites or not checkpoints.exists(self.folder):
-            return None
-        if not resumes:
-            raise InputError(
-                f"out={self.folder} holds a run already: "
-                "set train.resume=true to continue it, overwrite=true to replace it, "
-                "or run to another folder",
-            )
-        return require_same_run(self.folder, self.settings)
 
     def _warn_of_stretched_schedule(self, planned: int) -> None:
         """Warn if a resumed run has another number of epochs, and so another learning rate.
@@ -224,18 +198,13 @@ class Run:
         settings = self.trainer.settings
         if settings.epochs == planned or settings.soup:
             return
-        rates = [
-            learning_rate(settings, self.trainer.epoch / epochs)
-            for epochs in (settings.epochs, planned)
-        ]
-        console.warning(
+        both = (settings.epochs, planned)
+        rates = [learning_rate(settings, self.trainer.epoch / epochs) for epochs in both]
+        change = (
             "train.epochs=%d, not %d, stretches train.schedule=%s: "
-            "the learning rate goes on at %.3g, not %.3g",
-            settings.epochs,
-            planned,
-            settings.schedule,
-            *rates,
+            "the learning rate goes on at %.3g, not %.3g"
         )
+        console.warning(change, *both, settings.schedule, *rates)
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network on the test images and on photographs.
@@ -255,7 +224,7 @@ class Run:
             return {}
         accuracy = (predictions == self.data.test.labels).float().mean().item()
         if self.data.labeled:
-            images = describe_test_images(self.settings, self.data)
+            images = inputs.describe_test_images(self.settings, self.data)
             name = self.settings.network
             console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
         self._score_photographs(model, self.folder / BEFORE)
@@ -292,21 +261,14 @@ class Run:
         if self.settings.train.interpolate:
             self._interpolate()
         best = trainer.best
-        if best["epoch"] != trainer.epoch or INTERPOLATION in best:
+        epoch = best["epoch"]
+        if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
-        console.debug(
-            "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s",
-            selected,
-            best["epoch"],
-            last,
-            describe_test_images(self.settings, self.data),
-        )
-        scores = {
-            "test/accuracy": selected,
-            "test/accuracy_last": last,
-            "test/epoch": best["epoch"],
-        }
+        images = inputs.describe_test_images(self.settings, self.data)
+        both = "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s"
+        console.debug(both, selected, epoch, last, images)
+        scores = {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": epoch}
         if INTERPOLATION in best:
             scores["test/interpolation"] = best[INTERPOLATION]
         predictions = self._initial_predictions
@@ -374,15 +336,13 @@ class Run:
             scores = evaluate_photographs(
                 predictor,
                 folder=folder,
-                label=choose_labels(folder, self.data.classes, self.settings.label),
+                label=photos.choose_labels(folder, self.data.classes, self.settings.label),
                 out=out / name,
                 skip_unreadable=self.settings.evaluate.skip_unreadable,
             )
             console.debug("%s: %s", name, format_scores(scores))
-            metrics_by_prefix = {name: scores.overall}
-            for label, metrics in scores.by_label.items():
-                metrics_by_prefix[f"{name}/{label}"] = metrics
-            for prefix, metrics in metrics_by_prefix.items():
+            by_label = [(f"{name}/{label}", one) for label, one in scores.by_label.items()]
+            for prefix, metrics in [(name, scores.overall), *by_label]:
                 for metric in ("top5", *METRICS):
                     estimate = metrics.find(metric)
                     if estimate is not None and estimate.value is not None:
@@ -395,7 +355,7 @@ def make_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
 
     All of them have the data set and the initial network of the first one.
     """
-    data, initial = load_inputs(next(iter(methods.values())))
+    data, initial = inputs.load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
     # The main run is the last one. The baselines write to subfolders of its folder.
     for run in reversed(runs):
@@ -408,12 +368,13 @@ def _build_trainer(
     data: DataSet,
     folder: Path,
     initial: Initial | None,
-    validation: ValidationPart,
+    validation: dict[str, Any] | None,
     threads: int | None,
 ) -> Trainer:
     """Build the network, the optimizer and the scene of a run. No file is written.
 
-    Without `threads`, `choose_threads` chooses them.
+    `validation` is the record of the validation images. Without `threads`, `choose_threads`
+    chooses them.
     """
     keys = keys_of("train", settings.train)
     with keyed(**keys):
@@ -431,23 +392,20 @@ def _build_trainer(
             # The shape of a classifier has the normalization of the classifier.
             arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
             network = build_network(data.classes, data.size, trust_code=settings.trust, **arguments)
-    facts = {
-        "classes": list(data.classes),
-        "size": data.size,
-        "encoding": settings.renderer.encoding,
-        **shape,
-    }
+    encoding = settings.renderer.encoding
+    facts = {"classes": list(data.classes), "size": data.size, "encoding": encoding, **shape}
     if initial:
         initial.copy_to(network, facts)
         if initial.network is None:
             say_inputs(str(settings.network), network, data.size, initial.assumed)
-    light = settings.normalize_light or (initial.normalize_light if initial else None)
+    of_initial = initial.architecture.get(checkpoints.NORMALIZE_LIGHT) if initial else None
+    light = settings.normalize_light or of_initial
     if light is not None:
-        facts[NORMALIZE_LIGHT] = light
-        network = with_normalized_light(network, light)
+        facts[checkpoints.NORMALIZE_LIGHT] = light
+        network = wrappers.with_normalized_light(network, light)
     if settings.train.freeze:
         with keyed(stage="train.freeze"):
-            freeze(unwrapped(network), settings.train.freeze, data.size)
+            freeze(wrappers.unwrapped(network), settings.train.freeze, data.size)
     with keyed(**keys):
         precision = choose_precision(settings.train.precision, device, network)
     model = MixedPrecision(network.to(device), precision)
@@ -460,8 +418,10 @@ def _build_trainer(
     if rate != recipe.learning_rate:
         console.info("learning rate %.3g, by the norm of the features of the network", rate)
         recipe = replace(recipe, learning_rate=rate)
-    description = describe(without_normalized_light(network), **facts, validation=validation.record)
-    service = build_service(settings, data, device)
+    description = describe(
+        wrappers.without_normalized_light(network), **facts, validation=validation
+    )
+    service = inputs.build_service(settings, data, device)
     with keyed(**keys):
         has_initial = initial is not None
         return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
@@ -472,11 +432,12 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:
         return shape
-    name = shape.get("name", initial.name)
-    if name != initial.name:
+    own_name = initial.architecture.get("name", WIDERESNET)
+    name = shape.get("name", own_name)
+    if name != own_name:
         raise InputError(
             f"model.name={name} is not the architecture of network={initial.source}: "
             "leave model.name out",
         )
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
-    return {"name": initial.name, CLASSIFIER: True, **statistics}
+    return {"name": own_name, CLASSIFIER: True, **statistics}

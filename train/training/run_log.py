@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
-import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
@@ -85,10 +84,7 @@ class RunLog:
         self._board.add_image("renders", grid, epoch)
 
     def attack_examples(
-        self,
-        attack_examples: AttackExamples,
-        classes: Sequence[str],
-        epoch: int,
+        self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int
     ) -> None:
         """Write an image of successful attacks on training renders: renders/attacks_EPOCH.png.
 
@@ -96,41 +92,27 @@ class RunLog:
         white ball in the same lighting, and both after the attack. The predicted
         class and the true class stand below a render.
         """
-        labels = []
-        for label in attack_examples.labels:
-            # A negative number is a complementary label: the render shows another object
-            # than the positive class.
-            labels.append(classes[label] if label >= 0 else "negative")
+        # A negative label is complementary: the render shows no object of the positive class.
+        labels = [classes[one] if one >= 0 else "negative" for one in attack_examples.labels]
+        basis = attack_examples.basis
         columns = {}
         # The fields of `attack_examples` have the state before the attack at index 0,
         # and the state after it at index 1.
         for index, name in enumerate(("before", "after")):
             images = attack_examples.images[index]
-            captions = _captions(attack_examples.predictions[index], classes, labels)
-            size = min(EXAMPLE, images.shape[-1])
-            reduced = interpolate(images, size, mode="area")
+            highest, predicted = attack_examples.predictions[index].max(1)
+            captions = [
+                (f"{value:.0%} {classes[shown]}", label)
+                for value, shown, label in zip(highest, predicted, labels, strict=True)
+            ]
+            reduced = interpolate(images, min(EXAMPLE, images.shape[-1]), mode="area")
             columns[name] = tiles_of(reduced, captions, EXAMPLE)
-            basis = attack_examples.basis
             lights = attack_examples.lights[index]
             balls = (light_sphere(light, EXAMPLE // 2, basis=basis) for light in lights)
             columns[f"light {name}"] = tiles_of(balls)
         self._renders.mkdir(exist_ok=True)
-        rows = [*zip(*columns.values(), strict=True)]
-        grid = draw_grid(rows, [*columns])
+        grid = draw_grid([*zip(*columns.values(), strict=True)], [*columns])
         write_image(self._renders / f"attacks_{epoch:03d}.png", grid)
-
-
-def _captions(
-    probabilities: Float[Tensor, "N classes"],
-    classes: Sequence[str],
-    labels: Sequence[str],
-) -> list[tuple[str, str]]:
-    """Write the two lines of the caption of each image: predicted class and true class."""
-    highest, predicted = torch.max(probabilities, dim=1)
-    captions = []
-    for value, index, label in zip(highest.tolist(), predicted.tolist(), labels, strict=True):
-        captions.append((f"{value:.0%} {classes[index]}", label))
-    return captions
 
 
 def epoch_metrics(
@@ -144,23 +126,11 @@ def epoch_metrics(
     "augment/" has means of the diagnostics over all rounds, and "round_1/" those of one of several
     rounds.
     """
-    means = {}
-    for name in diagnostics[0]:
-        means[name] = fmean(of_round[name] for of_round in diagnostics)
-    groups = {
-        "train": trained,
-        "validation": validated,
-        "augment": means,
-        "seconds": seconds,
-    }
-    if len(diagnostics) > 1:
-        for number, of_round in enumerate(diagnostics, 1):
-            shown = {name: of_round[name] for name in SHOWN if name in of_round}
-            groups[f"round_{number}"] = shown
-    metrics: dict[str, float] = {}
-    for group, values in groups.items():
-        metrics |= {f"{group}/{name}": value for name, value in values.items()}
-    return metrics
+    means = {name: fmean(one[name] for one in diagnostics) for name in diagnostics[0]}
+    groups = {"train": trained, "validation": validated, "augment": means, "seconds": seconds}
+    for number, one in enumerate(diagnostics if len(diagnostics) > 1 else (), 1):
+        groups[f"round_{number}"] = {name: one[name] for name in SHOWN if name in one}
+    return {f"{group}/{key}": value for group, of in groups.items() for key, value in of.items()}
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:

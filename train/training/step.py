@@ -1,7 +1,7 @@
 """One training step: augment a batch, compute the gradient of its loss, and change the weights."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.network import eval_mode
 from augment.progress import progress_message
+from augment.service import AugmentationService
 from renderer.errors import InputError, require_memory
 from train import console
 from train.data.batches import Batch
@@ -20,9 +21,8 @@ from train.processes import wrap_ddp
 from train.train_settings import RELIGHT, TrainSettings
 from train.training.augmentations import Baseline, RelitBatches
 from train.training.averages import Averages
-from train.training.losses import TrainingLoss
+from train.training.losses import TrainingLoss, share_layers
 from train.training.recipe import build_optimizer, learning_rate
-from train.training.shared_teacher import share_layers
 from train.user_errors import keyed
 
 
@@ -43,8 +43,7 @@ class TrainingStep:
         model: MixedPrecision,
         averages: Averages,
         teacher: MixedPrecision | None,
-        positive_classes: Sequence[int],
-        seed: int,
+        service: AugmentationService,
         size: int,
         labeled: bool,
     ):
@@ -64,12 +63,13 @@ class TrainingStep:
             self.optimizer = build_optimizer(model, settings)
         is_scaled = model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self._device.type, enabled=is_scaled)
+        positive_classes = service.positive_classes
         self._augmentation: Baseline | RelitBatches
         if settings.augmentation == RELIGHT:
-            self._augmentation = RelitBatches(settings, model, teacher, seed)
+            self._augmentation = RelitBatches(settings, model, teacher, service.seed)
         else:
-            absent = positive_classes[1:]
-            self._augmentation = Baseline(settings.augmentation, model, seed, absent)
+            name, absent = settings.augmentation, positive_classes[1:]
+            self._augmentation = Baseline(name, model, service.seed, absent)
         with keyed(choice="compile"):
             is_compiled = compiles(settings.compile, self._device)
         # Module that computes the logits of the teacher. It may take the features from
@@ -157,12 +157,8 @@ def fitting_batch_size(
     shares = distributed.world_size() * settings.accumulation_steps
     batch_size = min(settings.batch_size, math.ceil(images_in_round / shares) * shares)
     if batch_size < settings.batch_size:
-        console.warning(
-            "batch_size=%d is more than the %d images that a round shows: it is %d",
-            settings.batch_size,
-            images_in_round,
-            batch_size,
-        )
+        fault = "batch_size=%d is more than the %d images that a round shows: it is %d"
+        console.warning(fault, settings.batch_size, images_in_round, batch_size)
     at_once = batch_size // shares
     needed = at_once * activation_bytes(deepcopy(model), size)
     device = next(model.parameters()).device

@@ -29,7 +29,7 @@ from tests.train.own_networks import (
 from train.__main__ import main as train_command
 from train.checkpoints import load_run
 from train.networks import build_network
-from train.training.initial import load_initial
+from train.training.inputs import load_initial
 from train.training.run import _network_shape
 
 OWN = [

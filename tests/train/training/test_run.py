@@ -29,8 +29,7 @@ from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
 from train.training import loop
-from train.training.initial import choose_validation, load_initial
-from train.training.inputs import load_data
+from train.training.inputs import choose_validation, load_data, load_initial
 from train.user_errors import user_message
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
